@@ -1,0 +1,268 @@
+"""Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
+
+Law: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
+names the key, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.errors import ConfigError
+
+BROADCAST = 255
+MIN_PACKET_LEN, MAX_PACKET_LEN = 14, 4095
+SINGLE_ENTRY_OVERHEAD = 13
+"""Bytes of a packet with one entry that are not payload: header 5, topic ids 1, entry header 5, CRC 2."""
+
+_STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
+_T = TypeVar("_T")
+
+PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
+RobotId = Annotated[int, Field(ge=-1, le=254)]
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+QosClass = Literal["default", "latency", "bulk"]
+
+
+@dataclass(frozen=True, config=_STRICT)
+class TopicOptions:
+    """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
+
+    :param qos: class of its packets, the two QoS bits of the header
+    :param reliability: None adapts the subscription to the publishers found
+    :param durability: None adapts likewise; the sink publishes volatile unless this says transient_local
+    :param depth: QoS depth of subscription and publisher, None takes ``subscriber_depth``/``publisher_depth``
+    :param queue_depth: messages waiting at the source, 0 unbounded, None takes the source's ``queue_depth``
+    :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
+    """
+
+    qos: QosClass = "default"
+    reliability: Literal["reliable", "best_effort"] | None = None
+    durability: Literal["volatile", "transient_local"] | None = None
+    depth: Count | None = None
+    queue_depth: Count | None = None
+    publish_as: str = ""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SourceConfig:
+    """ROS Source (the paper, section 4.3; ``../docs/parameters.md``).
+
+    :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
+    :param topics: subset of the registry, with or without leading slash; [] = all
+    :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
+    :param robot_id: source id 0..254; -1 takes the last run of digits of the namespace
+    :param dst_id: destination id, 255 broadcast
+    :param packet_len: bytes on the wire, 14..4095
+    :param min_fragment: k_min, lower bound on an entry's payload, bytes
+    :param greedy: several entries of one topic in a packet, back to back
+    :param flush_timeout: s a partly filled packet waits for company; 0 = goes at once
+    :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
+    :param hop: initial hop count (TTL) 0..15
+    :param packet_rate: packets/s offered to the flowgraph, 0 unpaced
+    :param queue_depth: messages waiting per topic, oldest dropped and counted; 0 unbounded
+    :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
+    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only)
+    :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
+    :param repeat_s: s between repeats of a transient-local topic, 0 off
+    :param topic_options: per topic name, over the registry's columns
+    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
+    :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
+    :param debug: readable log of headers, topic ids and entries
+    """
+
+    registry: str = ""
+    topics: tuple[str, ...] = ()
+    namespace: str = ""
+    robot_id: RobotId = -1
+    dst_id: Annotated[int, Field(ge=0, le=255)] = BROADCAST
+    packet_len: PacketLen = 220
+    min_fragment: Annotated[int, Field(ge=1)] = 16
+    greedy: bool = False
+    flush_timeout: Seconds = 0.0
+    subscriber_depth: Count = 10
+    hop: Annotated[int, Field(ge=0, le=15)] = 1
+    packet_rate: Seconds = 0.0
+    queue_depth: Count = 100
+    backpressure: bool = False
+    entry_ids: Literal["sequential", "random"] = "sequential"
+    scheduler: str = "paper"
+    repeat_s: Seconds = 10.0
+    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
+    middleware: str = "dds"
+    domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
+    debug: bool = False
+
+    @model_validator(mode="after")
+    def _fits(self) -> SourceConfig:
+        if self.min_fragment > self.packet_len - SINGLE_ENTRY_OVERHEAD:
+            raise ValueError(
+                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; "
+                f"at most {self.packet_len - SINGLE_ENTRY_OVERHEAD}"
+            )
+        return self
+
+    def src_id(self) -> int:
+        """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
+
+        :raises ConfigError: when -1 finds no digits or a number of 255 or more
+        """
+        if self.robot_id >= 0:
+            return self.robot_id
+        runs = re.findall(r"[0-9]+", self.namespace)
+        if not runs:
+            raise ConfigError(f"robot_id = -1: namespace {self.namespace!r} has no digits; set robot_id to 0..254")
+        if int(runs[-1]) >= BROADCAST:
+            raise ConfigError(
+                f"robot_id = -1: {int(runs[-1])} from namespace {self.namespace!r} is not below 255; "
+                "set robot_id to 0..254"
+            )
+        return int(runs[-1])
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SinkConfig:
+    """ROS Sink (the paper, section 4.4).
+
+    :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
+    :param packet_len: bytes on the wire, 14..4095, the same on both ends
+    :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
+    :param publisher_depth: QoS depth of the publishers, 0 unbounded
+    :param reassembly_timeout: s an incomplete message is kept
+    :param robot_id: own id: its packets and those for others are dropped and counted; -1 takes everything
+    :param max_sources: senders served at a time; packets of further ones are counted and dropped
+    :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
+    :param max_bytes: fragments held in all
+    :param topic_options: per topic name, over the registry's columns
+    :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
+    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
+    :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
+    :param debug: readable log of headers, topic ids and entries
+    """
+
+    registry: str = ""
+    packet_len: PacketLen = 220
+    namespace_format: str = "/rx_robot_{src_id}"
+    publisher_depth: Count = 10
+    reassembly_timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    robot_id: RobotId = -1
+    max_sources: Annotated[int, Field(ge=1, le=256)] = 16
+    max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000
+    max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
+    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
+    use_sim_time: bool = False
+    middleware: str = "dds"
+    domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
+    debug: bool = False
+
+    @model_validator(mode="after")
+    def _formats(self) -> SinkConfig:
+        try:
+            self.namespace_format.format(src_id=0)
+        except (KeyError, IndexError, ValueError) as error:
+            raise ValueError(
+                f"namespace_format = {self.namespace_format!r}: only {{src_id}} may stand in braces"
+            ) from error
+        return self
+
+
+@dataclass(frozen=True, config=_STRICT)
+class ChannelConfig:
+    """The simulated channel between transmitter and receiver (GNU Radio's channel model, plus packet loss).
+
+    :param snr_db: mean burst power over noise power in the sampled band, dB; None = no noise
+    :param frequency_offset: carrier frequency offset, fraction of the sample rate, -0.5..0.5
+    :param epsilon: sample clock ratio, 1.0 = none, 0.99..1.01
+    :param taps: complex impulse response at the sample rate
+    :param packet_loss: probability that a packet is dropped between PHY and sink, 0..1
+    :param seed: of noise and packet loss
+    """
+
+    snr_db: Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None = None
+    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
+    taps: tuple[complex, ...] = (1.0 + 0.0j,)
+    packet_loss: Annotated[float, Field(ge=0, le=1)] = 0.0
+    seed: Count = 0
+
+
+@dataclass(frozen=True, config=_STRICT)
+class PhyConfig:
+    """Which physical layer, and how fast.
+
+    :param name: a name of ``gr_ros2.phy.PHY``
+    :param sample_rate: samples/s; 0 = chosen by the experiment to carry ``headroom`` times the offered load
+    :param headroom: capacity over offered load where sample_rate is 0
+    :param options: settings of that PHY, by its constructor's parameter names
+    """
+
+    name: str = "ofdm"
+    sample_rate: Seconds = 0.0
+    headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
+    """Make a configuration object from a mapping.
+
+    :param cls: one of the dataclasses above, or one made of them
+    :param where: what to call it in errors, for instance the file name
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where or cls.__name__}: expected keys and values, found {values!r}")
+    try:
+        return TypeAdapter(cls).validate_python(dict(values))
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(cls, item, where) for item in error.errors())) from error
+
+
+def _explain(cls: type[Any], item: Any, where: str) -> str:
+    prefix = f"{where}: " if where else ""
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        known = _keys_at(cls, item["loc"][:-1])
+        return f"{prefix}unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
+    message = item["msg"].removeprefix("Value error, ")
+    if not key:
+        return f"{prefix}{message}"
+    if item["type"] in ("missing", "missing_argument"):
+        return f"{prefix}{key} is missing"
+    return f"{prefix}{key} = {item['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def _keys_at(cls: Any, loc: tuple[Any, ...]) -> list[str]:
+    """Names of the settings at a place in the tree, [] where it is not one of our dataclasses."""
+    for part in loc:
+        known = {field.name: field.type for field in fields(cls)} if hasattr(cls, "__dataclass_fields__") else {}
+        annotation = known.get(part)
+        cls = getattr(cls, "__pydantic_fields__", {}).get(part)
+        cls = getattr(cls, "annotation", None) or annotation
+    return [field.name for field in fields(cls)] if hasattr(cls, "__dataclass_fields__") else []
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """One YAML file as a mapping.
+
+    :raises ConfigError: when it cannot be read or is no mapping; names file and line
+    """
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: no YAML ({' '.join(str(error).split())})") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}")
+    return values

@@ -1,0 +1,130 @@
+"""Every error gr-ros2 raises, in one tree.
+
+    GrRos2Error
+    ├── ConfigError (ValueError)        a setting, file or argument is wrong: exit status 2
+    │   └── RegistryError               the same, with file and line of a registry CSV
+    ├── WireError (ValueError)          bytes that are no packet of ours, or a packet that has no bytes
+    │   ├── LengthError · CrcError · VersionError · NoEntriesError
+    │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
+    │   └── EncodeError
+    ├── MessageTooLargeError (ValueError)  a message no packet sequence of this size can carry
+    ├── MiddlewareError (RuntimeError)  the ROS side failed
+    │   └── BagError                    a bag cannot be read or written
+    ├── PhyError (RuntimeError)         the flowgraph or radio failed
+    ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
+    └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
+
+Law: messages name the thing, its value and the remedy, in one line.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class GrRos2Error(Exception):
+    """Root of the tree: catch this to catch everything gr-ros2 raises on purpose."""
+
+
+class ConfigError(GrRos2Error, ValueError):
+    """A setting, file or argument is wrong."""
+
+
+class RegistryError(ConfigError):
+    """A registry CSV is wrong.
+
+    :param path: the file, or None where the registry was built in code
+    :param line: line number from 1, or None where the file as a whole is meant
+    """
+
+    def __init__(self, problem: str, path: str | Path | None = None, line: int | None = None) -> None:
+        where = "registry" if path is None else str(path)
+        if line is not None:
+            where += f":{line}"
+        super().__init__(f"{where}: {problem}")
+        self.path = path
+        self.line = line
+
+
+class WireError(GrRos2Error, ValueError):
+    """Bytes that are no version-0 packet. ``kind`` is the name its counter carries."""
+
+    kind = "wire"
+
+
+class LengthError(WireError):
+    """Not exactly ``packet_len`` bytes."""
+
+    kind = "length"
+
+
+class CrcError(WireError):
+    """The CRC-16 does not match."""
+
+    kind = "crc"
+
+
+class VersionError(WireError):
+    """A version nibble this decoder does not know."""
+
+    kind = "version"
+
+
+class NoEntriesError(WireError):
+    """E = 0."""
+
+    kind = "no_entries"
+
+
+class EntryBoundsError(WireError):
+    """An entry header or payload runs past the space before the CRC."""
+
+    kind = "entry_bounds"
+
+
+class PadError(WireError):
+    """PAD bytes that are not zero."""
+
+    kind = "pad"
+
+
+class TotalError(WireError):
+    """An entry that says its message has no fragments (total = 0)."""
+
+    kind = "total"
+
+
+class IndexRangeError(WireError):
+    """An entry whose index is not below its total."""
+
+    kind = "index"
+
+
+class EncodeError(WireError):
+    """A packet whose fields or size cannot be put on the wire."""
+
+    kind = "encode"
+
+
+class MessageTooLargeError(GrRos2Error, ValueError):
+    """A message that needs more than 255 entries at this packet_len."""
+
+
+class MiddlewareError(GrRos2Error, RuntimeError):
+    """The ROS side failed."""
+
+
+class BagError(MiddlewareError):
+    """A bag cannot be read or written."""
+
+
+class PhyError(GrRos2Error, RuntimeError):
+    """The flowgraph, channel or radio failed."""
+
+
+class BackendMissingError(GrRos2Error, ImportError):
+    """A back-end was chosen whose package is not installed; the message names the package."""
+
+
+class RunError(GrRos2Error, RuntimeError):
+    """An experiment could not be completed."""

@@ -1,0 +1,84 @@
+"""What the engines tell their shells: values only, no behaviour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gr_ros2.errors import WireError
+
+
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """A message is complete. ``qos`` is the class of the packet that completed it; ``entry_id`` names it on the air."""
+
+    src_id: int
+    topic_id: int
+    payload: bytes
+    qos: int
+    entry_id: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A message of which at least one fragment came will never be complete.
+
+    ``reason`` is a ledger row: ``lost_fragments`` (overtaken, contradicted, or behind an outage), ``expired``
+    (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E).
+    """
+
+    src_id: int
+    topic_id: int
+    reason: str
+    entry_id: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Bytes from the PHY that are no packet of ours."""
+
+    error: WireError
+
+
+ReceiverEvent = Delivered | Lost | Rejected
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The sender took a message into its queue. ``serial`` counts submitted messages of this sender from 0."""
+
+    serial: int
+    topic_id: int
+    payload: bytes
+    now: float
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A submitted message will not be sent. ``reason`` is a ledger row: ``too_large`` or ``queue_bound``."""
+
+    serial: int
+    topic_id: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class SentEntry:
+    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial`` (-1: a repeat)."""
+
+    serial: int
+    topic_id: int
+    entry_id: int
+    index: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True)
+class SentPacket:
+    """A packet that left the sender."""
+
+    data: bytes
+    entries: tuple[SentEntry, ...]
+    now: float
+
+
+SenderEvent = Accepted | Refused | SentPacket

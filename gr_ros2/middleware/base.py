@@ -1,0 +1,121 @@
+"""The one interface between the adapter and any ROS graph: serialized bytes in, serialized bytes out.
+
+Laws: payloads are whole CDR messages including the 4-byte encapsulation header and are never looked into;
+callbacks run in a thread of the back-end and must not block it for long, except that a back-end which plays
+recorded data at link speed is meant to be held back by a blocking callback; ``close`` is idempotent, and no
+callback runs after it has returned.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import ClassVar, Literal
+
+Reliability = Literal["reliable", "best_effort"]
+Durability = Literal["volatile", "transient_local"]
+MessageCallback = Callable[[bytes], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """The QoS of one subscription or publisher.
+
+    :param reliability: None adapts a subscription to the publishers found (reliable only if all offer it);
+        a publisher with None is reliable
+    :param durability: None adapts likewise; a publisher with None is volatile
+    :param depth: history depth in messages, 0 = unbounded (KeepAll)
+    """
+
+    reliability: Reliability | None = None
+    durability: Durability | None = None
+    depth: int = 10
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """One topic as discovery sees it, without our own endpoints.
+
+    :param topic: absolute name with leading slash
+    :param type_name: ``package/msg/Type``
+    :param publishers: what each publisher offers
+    :param subscribers: what each subscriber asks for
+    """
+
+    topic: str
+    type_name: str
+    publishers: tuple[Qos, ...] = ()
+    subscribers: tuple[Qos, ...] = ()
+
+
+class Publisher(ABC):
+    """A topic we publish on."""
+
+    @abstractmethod
+    def publish(self, payload: bytes) -> None:
+        """Publish one serialized message (raises MiddlewareError once closed)."""
+
+    @abstractmethod
+    def matched(self) -> int:
+        """Number of subscriptions currently matched."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class Subscription(ABC):
+    """A topic we listen to."""
+
+    @abstractmethod
+    def matched(self) -> int:
+        """Number of publishers currently matched."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class Middleware(ABC):
+    """One participant of a ROS graph (or of something that stands in for it).
+
+    ``counters`` names what went wrong, for statistics: ``samples_lost:/topic`` and
+    ``incompatible_qos:/topic:policy``. The first of each is also logged once.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+
+    @abstractmethod
+    def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
+        """Call ``callback(payload)`` for each message on an absolute topic name."""
+
+    @abstractmethod
+    def advertise(self, topic: str, type_name: str, qos: Qos) -> Publisher:
+        """Announce a publisher on an absolute topic name."""
+
+    @abstractmethod
+    def discover(self) -> list[TopicInfo]:
+        """The topics of the graph other than our own endpoints, sorted by name."""
+
+    def start(self) -> None:  # noqa: B027 - most back-ends deliver from subscribe() on
+        """Begin to deliver. Only finite sources (bags) wait for this; others deliver from subscribe() on."""
+
+    @property
+    def finished(self) -> bool:
+        """True once a finite source has delivered everything."""
+        return False
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+    def __enter__(self) -> Middleware:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,42 @@
+"""What the adapter asks of a physical layer: packets in, packets out, and how long one is on the air.
+
+A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
+and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
+on the message port itself. Law: one packet takes the same number of samples always (fixed packet_len).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+
+class Phy(ABC):
+    """One physical layer at one packet length and sample rate.
+
+    :param packet_len: bytes per packet, 14..4095
+    :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
+    """
+
+    name: ClassVar[str]
+    has_samples: ClassVar[bool]
+
+    def __init__(self, packet_len: int, sample_rate: float) -> None:
+        self.packet_len = packet_len
+        self.sample_rate = sample_rate
+
+    @abstractmethod
+    def airtime_samples(self) -> int:
+        """Samples one packet occupies on the air, gap included; 0 for a PHY without samples."""
+
+    def airtime(self) -> float:
+        """Seconds one packet occupies on the air, gap included."""
+        return self.airtime_samples() / self.sample_rate if self.has_samples else 0.0
+
+    @abstractmethod
+    def transmitter(self) -> Any:
+        """A fresh hier block: message port `pdus` in, one complex stream out."""
+
+    @abstractmethod
+    def receiver(self) -> Any:
+        """A fresh hier block: one complex stream in, message port `pdus` out."""

@@ -1,0 +1,209 @@
+"""The registry: which topics cross the link and which nibble stands for each (the paper, section 4.3).
+
+Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from gr_ros2.config import TopicOptions, build
+from gr_ros2.errors import ConfigError, RegistryError
+
+MAX_TOPICS = 16
+
+_NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
+_LATCHED = frozenset({"tf_static", "map", "robot_description"})
+"""Topics that ROS programs publish transient-local by convention."""
+
+
+def normalize_type(text: str) -> str:
+    """``nav_msgs/Odometry`` or ``nav_msgs/msg/Odometry`` as ``nav_msgs/msg/Odometry``.
+
+    :raises ConfigError: when it is neither
+    """
+    match = _TYPE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"malformed type {text!r}; write package/Type or package/msg/Type")
+    return f"{match[1]}/msg/{match[2]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row.
+
+    :param topic_id: nibble on the wire, 0..15
+    :param name: as registered, relative to the robot's namespace or absolute with leading slash
+    :param type_name: ``package/msg/Type``
+    """
+
+    topic_id: int
+    name: str
+    type_name: str
+    options: TopicOptions = TopicOptions()
+
+    def on_graph(self, namespace: str) -> str:
+        """Absolute topic name of this row at a source in a namespace."""
+        if self.name.startswith("/"):
+            return self.name
+        namespace = namespace.strip("/")
+        return f"/{namespace}/{self.name}" if namespace else f"/{self.name}"
+
+    def republished(self, namespace_format: str, src_id: int) -> str:
+        """Absolute topic name of this row at a sink, for one sender."""
+        if self.options.publish_as:
+            name = self.options.publish_as.format(src_id=src_id)
+        else:
+            name = f"{namespace_format.format(src_id=src_id).rstrip('/')}/{self.name.lstrip('/')}"
+        return name if name.startswith("/") else f"/{name}"
+
+    @property
+    def latched(self) -> bool:
+        """Whether late joiners are to get the last message: registered so, or so by ROS convention."""
+        if self.options.durability is not None:
+            return self.options.durability == "transient_local"
+        return self.name.rsplit("/", 1)[-1] in _LATCHED
+
+
+class Registry(Sequence[Topic]):
+    """At most 16 topics, indexed by topic id.
+
+    :raises RegistryError: too many, none, or duplicate names
+    """
+
+    def __init__(self, topics: Sequence[Topic], path: str | Path | None = None) -> None:
+        if not topics:
+            raise RegistryError("no topics; add rows of the form name,type", path)
+        if len(topics) > MAX_TOPICS:
+            raise RegistryError(f"{len(topics)} topics; a topic id is 4 bits, so at most {MAX_TOPICS}", path)
+        names: dict[str, Topic] = {}
+        for topic in topics:
+            same = names.setdefault(topic.name.lstrip("/"), topic)
+            if same is not topic:
+                raise RegistryError(f"duplicate topic {topic.name!r}", path)
+        self._topics = tuple(topics)
+        self._by_name = names
+
+    @classmethod
+    def from_rows(cls, rows: Mapping[str, str] | Sequence[tuple[str, str]]) -> Registry:
+        """A registry written in code: ``Registry.from_rows({"odom": "nav_msgs/Odometry"})``."""
+        pairs = list(rows.items()) if isinstance(rows, Mapping) else list(rows)
+        return cls([_topic(i, name, kind, {}, None, None) for i, (name, kind) in enumerate(pairs)])
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> Registry:
+        """Read the paper's form: rows ``name,type``.
+
+        A header row ``topic,type`` (or ``name,type``), blank lines and ``#`` comments are allowed; with a header,
+        further columns are options of that topic (see :class:`gr_ros2.config.TopicOptions`), empty = default.
+
+        :raises RegistryError: file, line, what is wrong
+        """
+        try:
+            with open(path, newline="", encoding="utf-8-sig") as file:
+                reader = csv.reader(file, skipinitialspace=True, strict=True)
+                rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+        except (OSError, UnicodeDecodeError) as error:
+            raise RegistryError(f"cannot be read ({error})", path) from error
+        except csv.Error as error:
+            raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
+        return cls(list(_topics(rows, path)), path)
+
+    def __len__(self) -> int:
+        return len(self._topics)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        return self._topics[index]
+
+    def __iter__(self) -> Iterator[Topic]:
+        return iter(self._topics)
+
+    def named(self, name: str) -> Topic:
+        """The row of that name, with or without leading slash.
+
+        :raises ConfigError: when there is none
+        """
+        try:
+            return self._by_name[name.lstrip("/")]
+        except KeyError:
+            raise ConfigError(
+                f"topic {name!r} is not in the registry; it has {', '.join(topic.name for topic in self)}"
+            ) from None
+
+    def with_options(self, options: Mapping[str, TopicOptions]) -> Registry:
+        """The same rows with configured options over the registry's own; only settings that differ from the
+        default override.
+
+        :raises ConfigError: for a topic that is not registered
+        """
+        topics = list(self._topics)
+        for name, override in options.items():
+            topic = self.named(name)
+            changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
+            changed = {key: value for key, value in changed.items() if value != getattr(TopicOptions(), key)}
+            merged = build(TopicOptions, {**asdict(topic.options), **changed})
+            topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
+        return Registry(topics)
+
+    @property
+    def digest(self) -> str:
+        """16 hex digits over what both ends must agree on: ids, names and types."""
+        text = "\n".join(f"{topic.topic_id},{topic.name.lstrip('/')},{topic.type_name}" for topic in self)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator[Topic]:
+    columns = ["name", "type"]
+    first = True
+    topic_id = 0
+    for line, row in rows:
+        if not any(row) or row[0].startswith("#"):
+            continue
+        if first and [cell.lower() for cell in row[:2]] in (["topic", "type"], ["name", "type"]):
+            columns = [cell.lower() for cell in row]
+            _check_columns(columns, path, line)
+            first = False
+            continue
+        first = False
+        if len(row) > len(columns) or len(row) < 2:
+            raise RegistryError(f"{len(row)} columns where {len(columns)} were expected: {','.join(row)!r}", path, line)
+        if topic_id >= MAX_TOPICS:
+            raise RegistryError(f"topic 17, {row[0]!r}: a topic id is 4 bits, so at most {MAX_TOPICS}", path, line)
+        options = {key: cell for key, cell in zip(columns[2:], row[2:], strict=False) if cell}
+        yield _topic(topic_id, row[0], row[1], options, path, line)
+        topic_id += 1
+
+
+def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
+    known = [field.name for field in fields(TopicOptions)]
+    for column in columns[2:]:
+        if column not in known:
+            raise RegistryError(f"unknown column {column!r}; known are {', '.join(known)}", path, line)
+        if columns.count(column) > 1:
+            raise RegistryError(f"column {column!r} stands twice", path, line)
+
+
+def _topic(
+    topic_id: int, name: str, kind: str, options: Mapping[str, str], path: str | Path | None, line: int | None
+) -> Topic:
+    if not _NAME.fullmatch(name):
+        raise RegistryError(
+            f"malformed topic name {name!r}; letters, digits and _ in parts joined by /, none starting with a digit",
+            path,
+            line,
+        )
+    try:
+        type_name = normalize_type(kind)
+        topic_options = build(TopicOptions, options)
+        topic_options.publish_as.format(src_id=0)
+    except ConfigError as error:
+        raise RegistryError(f"topic {name!r}: {error}", path, line) from error
+    except (KeyError, IndexError, ValueError) as error:
+        raise RegistryError(f"topic {name!r}: publish_as may hold only {{src_id}} in braces", path, line) from error
+    return Topic(topic_id, name, type_name, topic_options)
