@@ -237,7 +237,8 @@ def _explain(cls: type[Any], item: Any, where: str) -> str:
         return f"{prefix}{message}"
     if item["type"] in ("missing", "missing_argument"):
         return f"{prefix}{key} is missing"
-    return f"{prefix}{key} = {item['input']!r}: {message[0].lower()}{message[1:]}"
+    value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
+    return f"{prefix}{key}{value}: {message[0].lower()}{message[1:]}"
 
 
 def _keys_at(cls: Any, loc: tuple[Any, ...]) -> list[str]:

@@ -11,11 +11,13 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import overload
 
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 
 MAX_TOPICS = 16
+DEFAULT_OPTIONS = TopicOptions()
 
 _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
@@ -46,7 +48,7 @@ class Topic:
     topic_id: int
     name: str
     type_name: str
-    options: TopicOptions = TopicOptions()
+    options: TopicOptions = DEFAULT_OPTIONS
 
     def on_graph(self, namespace: str) -> str:
         """Absolute topic name of this row at a source in a namespace."""
@@ -94,7 +96,12 @@ class Registry(Sequence[Topic]):
     def from_rows(cls, rows: Mapping[str, str] | Sequence[tuple[str, str]]) -> Registry:
         """A registry written in code: ``Registry.from_rows({"odom": "nav_msgs/Odometry"})``."""
         pairs = list(rows.items()) if isinstance(rows, Mapping) else list(rows)
-        return cls([_topic(i, name, kind, {}, None, None) for i, (name, kind) in enumerate(pairs)])
+        try:
+            return cls([_topic(number, name, kind, {}) for number, (name, kind) in enumerate(pairs)])
+        except RegistryError:
+            raise
+        except ConfigError as error:
+            raise RegistryError(str(error)) from error
 
     @classmethod
     def from_csv(cls, path: str | Path) -> Registry:
@@ -118,7 +125,11 @@ class Registry(Sequence[Topic]):
     def __len__(self) -> int:
         return len(self._topics)
 
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+    @overload
+    def __getitem__(self, index: int) -> Topic: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Topic]: ...
+    def __getitem__(self, index: int | slice) -> Topic | Sequence[Topic]:
         return self._topics[index]
 
     def __iter__(self) -> Iterator[Topic]:
@@ -146,7 +157,7 @@ class Registry(Sequence[Topic]):
         for name, override in options.items():
             topic = self.named(name)
             changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
-            changed = {key: value for key, value in changed.items() if value != getattr(TopicOptions(), key)}
+            changed = {key: value for key, value in changed.items() if value != getattr(DEFAULT_OPTIONS, key)}
             merged = build(TopicOptions, {**asdict(topic.options), **changed})
             topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
         return Registry(topics)
@@ -162,6 +173,7 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
     columns = ["name", "type"]
     first = True
     topic_id = 0
+    seen: dict[str, int] = {}
     for line, row in rows:
         if not any(row) or row[0].startswith("#"):
             continue
@@ -175,8 +187,16 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
             raise RegistryError(f"{len(row)} columns where {len(columns)} were expected: {','.join(row)!r}", path, line)
         if topic_id >= MAX_TOPICS:
             raise RegistryError(f"topic 17, {row[0]!r}: a topic id is 4 bits, so at most {MAX_TOPICS}", path, line)
+        if row[0].lstrip("/") in seen:
+            raise RegistryError(
+                f"duplicate topic {row[0]!r}; it stands first in line {seen[row[0].lstrip('/')]}", path, line
+            )
+        seen[row[0].lstrip("/")] = line
         options = {key: cell for key, cell in zip(columns[2:], row[2:], strict=False) if cell}
-        yield _topic(topic_id, row[0], row[1], options, path, line)
+        try:
+            yield _topic(topic_id, row[0], row[1], options)
+        except ConfigError as error:
+            raise RegistryError(str(error), path, line) from error
         topic_id += 1
 
 
@@ -189,21 +209,17 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
             raise RegistryError(f"column {column!r} stands twice", path, line)
 
 
-def _topic(
-    topic_id: int, name: str, kind: str, options: Mapping[str, str], path: str | Path | None, line: int | None
-) -> Topic:
+def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:
     if not _NAME.fullmatch(name):
-        raise RegistryError(
-            f"malformed topic name {name!r}; letters, digits and _ in parts joined by /, none starting with a digit",
-            path,
-            line,
+        raise ConfigError(
+            f"malformed topic name {name!r}; letters, digits and _ in parts joined by /, none starting with a digit"
         )
     try:
         type_name = normalize_type(kind)
         topic_options = build(TopicOptions, options)
         topic_options.publish_as.format(src_id=0)
     except ConfigError as error:
-        raise RegistryError(f"topic {name!r}: {error}", path, line) from error
+        raise ConfigError(f"topic {name!r}: {error}") from error
     except (KeyError, IndexError, ValueError) as error:
-        raise RegistryError(f"topic {name!r}: publish_as may hold only {{src_id}} in braces", path, line) from error
+        raise ConfigError(f"topic {name!r}: publish_as may hold only {{src_id}} in braces") from error
     return Topic(topic_id, name, type_name, topic_options)

@@ -44,7 +44,7 @@ ReceiverEvent = Delivered | Lost | Rejected
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The sender took a message into its queue. ``serial`` counts submitted messages of this sender from 0."""
+    """A message was submitted. ``serial`` counts the submitted messages of this sender from 0."""
 
     serial: int
     topic_id: int
@@ -59,6 +59,7 @@ class Refused:
     serial: int
     topic_id: int
     reason: str
+    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,35 @@
+"""The link engines: messages to packets and back. No IO, no clock, no threads; ``now`` is seconds, monotonic."""
+
+from __future__ import annotations
+
+from gr_ros2.link.events import (
+    Accepted,
+    Delivered,
+    Lost,
+    ReceiverEvent,
+    Refused,
+    Rejected,
+    SenderEvent,
+    SentEntry,
+    SentPacket,
+)
+from gr_ros2.link.receiver import Receiver, ReceiverStats
+from gr_ros2.link.schedule import SCHEDULER
+from gr_ros2.link.sender import Sender, SenderStats
+
+__all__ = [
+    "SCHEDULER",
+    "Accepted",
+    "Delivered",
+    "Lost",
+    "Receiver",
+    "ReceiverEvent",
+    "ReceiverStats",
+    "Refused",
+    "Rejected",
+    "Sender",
+    "SenderEvent",
+    "SenderStats",
+    "SentEntry",
+    "SentPacket",
+]

@@ -1,0 +1,188 @@
+"""Fragments of one source and topic back to messages, and never to a message made of two.
+
+The 8-bit entry id comes round after 256 messages, a restarted sender starts anywhere, and a sender of random ids (the
+paper's) repeats itself soon. What protects a message, besides its id:
+
+- *Contradiction*: another ``total``, other flags, or the same index with other bytes begins a new message.
+- *Overtaking*: 64 newer ids seen, or 64 that would have passed unseen at the topic's recent rate, end a message.
+- *Order*: a sender sends a topic's messages one after the other, each in index order. Once packets have been missed,
+  an entry whose place among the topic's recent ones does not agree with its packet's sequence number is of another
+  time: held messages end and it begins a new one. While no packet has been missed this is not asked, so messages of
+  a topic may interleave on a clean link.
+- *Reset* (see ``sequence``): a restart or outage seen in the packet numbers ends everything held of the source.
+
+Laws: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from gr_ros2.link.sequence import Pace
+from gr_ros2.wire import Entry
+
+OVERTAKEN = 64
+_PATIENT = 192
+"""Ids that must have passed unseen where the packet numbers show no loss: a sender that paused, most likely."""
+_HISTORY = 128
+_RESTART_JUMP = 4096
+_NOWHERE = (-1, -1)
+_FRAGMENT_COST = 64
+"""Bytes of bookkeeping counted per held fragment."""
+
+
+@dataclass(slots=True, eq=False)
+class Partial:
+    """A message of which not all fragments are here. ``number`` is its entry id unwrapped."""
+
+    topic_id: int
+    entry_id: int
+    number: int
+    total: int
+    flags: int
+    last: float
+    fragments: dict[int, bytes] = field(default_factory=dict)
+    size: int = 0
+
+    def contradicts(self, entry: Entry, flags: int) -> bool:
+        """Whether an entry of the same id cannot be of this message."""
+        held = self.fragments.get(entry.index)
+        return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
+
+    def add(self, entry: Entry, now: float) -> int:
+        """Hold a fragment; returns by how many bytes the memory in use grew."""
+        self.last = now
+        if entry.index in self.fragments:
+            return 0
+        self.fragments[entry.index] = entry.payload
+        cost = len(entry.payload) + _FRAGMENT_COST
+        self.size += cost
+        return cost
+
+    @property
+    def complete(self) -> bool:
+        return len(self.fragments) == self.total
+
+    def payload(self) -> bytes:
+        """The message, once complete."""
+        return b"".join(self.fragments[index] for index in range(self.total))
+
+
+@dataclass(slots=True)
+class Context:
+    """What the packet of an entry says about it.
+
+    :param position: unwrapped sequence number
+    :param epoch: counts the packets of this source that were missed, late or reset so far
+    :param steady: the packet directly follows the one before
+    :param flags: C and E bits, the same for all fragments of a message
+    """
+
+    position: int
+    epoch: int
+    steady: bool
+    flags: int
+    now: float
+
+
+class TopicReassembler:
+    """Everything held of one source and topic."""
+
+    def __init__(self, topic_id: int) -> None:
+        self.topic_id = topic_id
+        self.partials: dict[int, Partial] = {}
+        self.missed_ids = 0
+        self._newest: int | None = None
+        self._history: deque[tuple[int, int, int, int]] = deque(maxlen=_HISTORY)
+        """(packet position, message number, index, epoch) of the last entries."""
+        self._latest = self._settled = _NOWHERE
+        """The furthest (message number, index) seen at all, and before the last packet that was missed."""
+        self._epoch = 0
+        self._top = -1
+        """The furthest packet position that had an entry of this topic."""
+        self._pace = Pace(window=16, least=8)
+
+    def accept(self, entry: Entry, context: Context) -> tuple[bytes | Partial, list[Partial]]:
+        """Take one entry.
+
+        :returns: the completed message's bytes or the message it went to, and the messages it ended
+        """
+        ended: list[Partial] = []
+        number = self._number(entry.entry_id)
+        if self._out_of_order(number, entry.index, context):
+            ended += self.clear()
+            self._history.clear()
+            number += _RESTART_JUMP
+            self._latest = self._settled = _NOWHERE
+        self._advance(number, entry.index, context.now)
+        self._history.append((context.position, number, entry.index, context.epoch))
+        self._latest = max(self._latest, (number, entry.index))
+        self._top = max(self._top, context.position)
+        if self.partials:
+            ended += self._overtaken(context)
+            held = self.partials.get(entry.entry_id)
+            if held is not None and held.contradicts(entry, context.flags):
+                ended.append(self.partials.pop(entry.entry_id))
+        if entry.total == 1:
+            return entry.payload, ended
+        partial = self.partials.get(entry.entry_id)
+        if partial is None:
+            partial = Partial(self.topic_id, entry.entry_id, number, entry.total, context.flags, context.now)
+            self.partials[entry.entry_id] = partial
+        return partial, ended
+
+    def clear(self) -> list[Partial]:
+        """End everything held."""
+        ended = list(self.partials.values())
+        self.partials.clear()
+        return ended
+
+    def reset(self) -> list[Partial]:
+        """End everything held and forget ids, order and pace: what follows is of another time."""
+        self._newest = None
+        self._latest = self._settled = _NOWHERE
+        self._history.clear()
+        self._pace = Pace(window=16, least=8)
+        return self.clear()
+
+    def _number(self, entry_id: int) -> int:
+        """An entry id unwrapped: up to 64 behind the newest it is an older message, otherwise a newer one."""
+        if self._newest is None:
+            return entry_id
+        return self._newest + (entry_id - self._newest + OVERTAKEN & 255) - OVERTAKEN
+
+    def _out_of_order(self, number: int, index: int, context: Context) -> bool:
+        """Whether an entry's place in its topic disagrees with its packet's, other than on a link without loss."""
+        if context.epoch != self._epoch:
+            self._epoch = context.epoch
+            self._settled = max(self._settled, self._latest)
+        if context.position > self._top:
+            return (number, index) < self._settled
+        for position, other, other_index, epoch in self._history:
+            if epoch != context.epoch and position != context.position:
+                ahead = number - other or index - other_index
+                if (ahead < 0) == (position < context.position) and ahead:
+                    return True
+        return False
+
+    def _advance(self, number: int, index: int, now: float) -> None:
+        """Follow the newest message, and count those never seen."""
+        if self._newest is None or number - self._newest >= _RESTART_JUMP // 2:
+            self._newest = number
+            self._pace.observe(now, 1)
+        elif number > self._newest:
+            self.missed_ids += number - self._newest - 1
+            self._pace.observe(now, number - self._newest)
+            self._newest = number
+        elif number < self._newest and index == 0 and self.missed_ids and number & 255 not in self.partials:
+            self.missed_ids -= 1
+
+    def _overtaken(self, context: Context) -> Iterator[Partial]:
+        newest = self._newest
+        assert newest is not None
+        patience = self._pace.duration(_PATIENT if context.steady else OVERTAKEN)
+        for entry_id, partial in list(self.partials.items()):
+            if newest - partial.number >= OVERTAKEN or context.now - partial.last > patience:
+                yield self.partials.pop(entry_id)

@@ -1,0 +1,101 @@
+"""Which fragments go into the next packet: the paper's policy (section 5.2), one class per policy.
+
+Law: a scheduler plans, and changes nothing but its own order of topics and the still open cut of waiting messages; the
+sender carries the plan out or makes another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from gr_ros2.backends import Backend, BackendTable
+from gr_ros2.config import SourceConfig
+from gr_ros2.link.fragment import Outgoing, fragment_len
+from gr_ros2.wire import ENTRY_HEADER_LEN, MAX_ENTRIES, overhead
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The next packet: from each message, in this order, one further fragment.
+
+    :param picks: messages to take one fragment of; a message may stand several times
+    :param full: no further entry of ``min_fragment`` bytes would fit, so waiting for company is no use
+    """
+
+    picks: tuple[Outgoing, ...]
+    full: bool
+
+
+class Scheduler(Protocol):
+    """Chooses what goes into the next packet."""
+
+    config: SourceConfig
+
+    def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
+        """The next packet's content from the messages waiting per topic id, or None where nothing is waiting."""
+
+    def sent(self, plan: Plan) -> None:
+        """The plan was carried out."""
+
+
+class PaperScheduler:
+    """Round robin over topics: one entry per topic and packet, or with ``greedy`` several back to back.
+
+    A topic that got an entry goes to the end of the line; one whose next fragment did not fit keeps its place.
+    """
+
+    def __init__(self, config: SourceConfig) -> None:
+        self.config = config
+        self._line: list[int] = []
+
+    def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
+        pending = [topic_id for topic_id, queue in queues.items() if queue]
+        if not pending:
+            return None
+        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        config = self.config
+        picks: list[Outgoing] = []
+        payload = 0
+        for topic_id in self._line:
+            for message in queues.get(topic_id, ()):
+                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
+                lengths = self._fitting(message, cut, len(picks), payload)
+                picks += [message] * len(lengths)
+                payload += sum(lengths)
+                whole = message.index + len(lengths) == message.total
+                if not (config.greedy and lengths and whole):
+                    break
+            if len(picks) == MAX_ENTRIES:
+                break
+        room = config.packet_len - overhead(len(picks) + 1) - (len(picks) + 1) * ENTRY_HEADER_LEN - payload
+        return Plan(tuple(picks), len(picks) == MAX_ENTRIES or room < config.min_fragment)
+
+    def _fitting(self, message: Outgoing, cut: int, entries: int, payload: int) -> list[int]:
+        """Lengths of the next fragments of a message that fit beside ``entries`` with ``payload`` bytes."""
+        lengths: list[int] = []
+        length = message.plan(cut)
+        index, remaining = message.index, message.remaining
+        most = MAX_ENTRIES - entries if self.config.greedy else min(1, MAX_ENTRIES - entries)
+        while len(lengths) < most and index < message.total:
+            count = entries + len(lengths) + 1
+            if overhead(count) + count * ENTRY_HEADER_LEN + payload + length > self.config.packet_len:
+                break
+            lengths.append(length)
+            payload += length
+            index += 1
+            remaining -= length
+            length = min(message.cut, remaining)
+        return lengths
+
+    def sent(self, plan: Plan) -> None:
+        for topic_id in dict.fromkeys(message.topic_id for message in plan.picks):
+            self._line.remove(topic_id)
+            self._line.append(topic_id)
+
+
+SCHEDULER = BackendTable(
+    "scheduler",
+    {"paper": Backend("gr_ros2.link.schedule", "PaperScheduler", "round robin over topics, as in the paper")},
+)

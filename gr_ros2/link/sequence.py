@@ -1,0 +1,116 @@
+"""Sequence numbers of one source: their order, their gaps, and the signs that a new sender counts from elsewhere.
+
+Laws: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only 8 bits;
+after a reset positions start so far ahead that nothing earlier compares as near.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from enum import Enum
+from math import inf
+
+RECENT_PACKETS = 64
+"""How far back a packet with the same number and bytes is a duplicate."""
+_REMEMBERED = 128
+"""How far back packets are remembered: a step is read as -128..127, so further back nothing can be met again."""
+LATEST_S = 0.5
+"""How late, in seconds at the recent pace, a packet may come and still be one of this numbering."""
+_RESET_JUMP = 4096
+
+
+class Arrival(Enum):
+    """What a packet's sequence number says."""
+
+    DUPLICATE = "same number and same bytes as a recent packet"
+    NEXT = "follows the newest packet"
+    GAP = "newer than the newest packet, others are missing"
+    LATE = "older than the newest packet"
+    RESET = "cannot belong to the numbering so far: a restarted sender, or an outage too long to bridge"
+
+
+class Pace:
+    """How long a count takes at its recent rate.
+
+    :param window: counts remembered
+    :param least: counts that must have been seen before a rate is believed
+    """
+
+    def __init__(self, window: int, least: int) -> None:
+        self._seen: deque[tuple[float, int]] = deque(maxlen=window)
+        self._least = least
+        self._count = 0
+        self._elapsed = 0.0
+        self._now: float | None = None
+
+    def observe(self, now: float, count: int) -> None:
+        """``count`` further ones have passed by ``now``."""
+        self._elapsed += 0.0 if self._now is None else now - self._now
+        self._now = now
+        self._count += count
+        self._seen.append((self._elapsed, self._count))
+
+    def skip(self, now: float) -> None:
+        """The time since the last observation says nothing about the rate."""
+        self._now = now
+
+    def duration(self, count: int) -> float:
+        """Seconds that ``count`` take; infinite while the rate is not known."""
+        if len(self._seen) < self._least:
+            return inf
+        (first_time, first), (last_time, last) = self._seen[0], self._seen[-1]
+        return count * (last_time - first_time) / max(last - first, 1)
+
+
+@dataclass(slots=True)
+class Placed:
+    """A packet's place: its arrival kind, its position, and how many packets are newly missing before it."""
+
+    arrival: Arrival
+    position: int
+    missing: int = 0
+
+
+class SequenceTracker:
+    """Places each packet of one source."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+        self._last_time = 0.0
+        self._recent: OrderedDict[int, bytes] = OrderedDict()
+        self._pace = Pace(RECENT_PACKETS, RECENT_PACKETS)
+
+    def place(self, seq: int, data: bytes, now: float) -> Placed:
+        """Place a packet by its sequence number and bytes."""
+        if self._newest is None:
+            return self._accept(Placed(Arrival.NEXT, seq), data, now, 1)
+        newest = self._newest
+        step = (seq - newest + 128 & 255) - 128
+        position = newest + step
+        seen = self._recent.get(position)
+        if seen == data and newest - position < RECENT_PACKETS:
+            return Placed(Arrival.DUPLICATE, position)
+        # Another packet under a number of the last few; a silence in which the numbers may have come round; or a
+        # packet that would have been under way for longer than any link holds one back.
+        collision = seen is not None and seen != data and step != 0
+        silence = step != 1 and now - self._last_time > self._pace.duration(RECENT_PACKETS)
+        reset = collision or silence or (step < 0 and LATEST_S < self._pace.duration(-step) < inf)
+        if reset:
+            self._recent.clear()
+            self._pace.skip(now)
+            return self._accept(Placed(Arrival.RESET, newest + _RESET_JUMP + step, (step - 1) % 256), data, now, 1)
+        if step <= 0:
+            return self._accept(Placed(Arrival.LATE if step else Arrival.NEXT, position), data, now, 0)
+        kind = Arrival.NEXT if step == 1 else Arrival.GAP
+        return self._accept(Placed(kind, position, step - 1), data, now, step)
+
+    def _accept(self, placed: Placed, data: bytes, now: float, advance: int) -> Placed:
+        if self._newest is None or placed.position > self._newest:
+            self._newest = placed.position
+        self._recent[placed.position] = data
+        if len(self._recent) > _REMEMBERED:
+            self._recent.popitem(last=False)
+        self._pace.observe(now, advance)
+        self._last_time = now
+        return placed

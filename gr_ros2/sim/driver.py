@@ -1,0 +1,150 @@
+"""Drives one robot from place to place: pure pursuit along the roadmap, behind a guard that cannot be overruled.
+
+Law: a robot takes a command only if, after it, braking at once would bring it to rest without touching anything.
+The points it would then pass are its ``reserved`` path; robots decide one after the other and stay clear of what
+the others have reserved. Braking along the reserved path is therefore always left as a safe choice, so no robot
+ever touches a wall, an obstacle or another robot, whatever the route.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TICK, TURN_ACCELERATION, State, stopping_paths
+from gr_ros2.sim.roadmap import Roadmap
+from gr_ros2.sim.world import Floats, World
+
+_LOOKAHEAD_M = 1.2
+_ARRIVED_M = 0.5
+_TRIP_M = 7.0
+_PATIENCE = 15
+"""Ticks without moving before the driver backs out and goes elsewhere."""
+_RETREAT = 25
+"""Ticks that it then spends on getting away from what is nearest."""
+_COMFORT_M = 1.0
+"""Gap to another robot that the driver likes to keep beyond what safety asks."""
+_COMFORT_WALL_M = 0.15
+"""The same to walls and obstacles."""
+
+
+class Driver:
+    """Decides the commands of one robot.
+
+    :param node: place of the roadmap it starts at
+    :param rng: of destinations and of the small irregularity of its commands
+    """
+
+    def __init__(self, world: World, roadmap: Roadmap, node: int, max_speed: float, rng: np.random.Generator) -> None:
+        self._world, self._roadmap, self._rng = world, roadmap, rng
+        self._max_speed = max_speed
+        self._brake_ticks = math.ceil(max_speed / (ACCELERATION * TICK))
+        # Paths are checked at points at most max_speed * TICK apart, so in between half of that may be missing.
+        self._wall_gap = RADIUS + max_speed * TICK / 2 + 0.03
+        self._robot_gap = 2 * RADIUS + max_speed * TICK + 0.05
+        self._stuck = self._retreat = 0
+        self._route: list[int] = [node]
+        x, y = roadmap.nodes[node]
+        self.state = State(float(x), float(y), float(rng.uniform(-math.pi, math.pi)), 0.0, 0.0)
+        """At the latest tick."""
+        self.reserved: Floats = np.array([[x, y]], dtype=np.float64)
+        """Points (n, 2) the robot would pass if it braked now."""
+
+    def drive(self, others: Sequence[Driver]) -> State:
+        """Choose the command for the next period.
+
+        :returns: the state now, with the accelerations of that period; ``state`` is then one period later
+        """
+        target = self._target(others)
+        speeds, turns = self._commands()
+        paths = stopping_paths(self.state, speeds, turns, self._brake_ticks)
+        cost = self._cost(target, speeds, turns)
+        gap = self._world.clearance(paths).min(axis=1) - self._wall_gap
+        safe = gap >= 0
+        cost = cost + np.maximum(0.0, 1.0 - gap / _COMFORT_WALL_M)
+        for other in others:
+            dx = paths[:, :, 0, None] - other.reserved[:, 0]
+            dy = paths[:, :, 1, None] - other.reserved[:, 1]
+            gap = np.sqrt((dx * dx + dy * dy).reshape(len(paths), -1).min(axis=1)) - self._robot_gap
+            safe &= gap >= 0
+            cost = cost + np.maximum(0.0, 1.0 - gap / _COMFORT_M)
+        if safe.any():
+            best = int(np.where(safe, cost, np.inf).argmin())
+            now = self.state.towards(float(speeds[best]), float(turns[best]))
+            self.reserved = paths[best]
+        else:
+            # The rest of the path reserved before: clear of everything since the tick that chose it.
+            now = self.state.towards(*self.state.braking())
+        self.state = now.after(TICK)
+        self._stuck = self._stuck + 1 if self.state.speed < 0.05 else 0
+        return now
+
+    def _commands(self) -> tuple[Floats, Floats]:
+        """Speeds and turn rates that can be reached within one period, slightly irregular, full braking included."""
+        state, reach, turn_reach = self.state, ACCELERATION * TICK, TURN_ACCELERATION * TICK
+        low, high = max(0.0, state.speed - reach), min(self._max_speed, state.speed + reach)
+        left, right = max(-MAX_TURN, state.turn - turn_reach), min(MAX_TURN, state.turn + turn_reach)
+        speed, turn = np.meshgrid(np.linspace(low, high, 5), np.linspace(left, right, 11))
+        speeds = speed.ravel() + self._rng.normal(0.0, 0.01, speed.size)
+        turns = turn.ravel() + self._rng.normal(0.0, 0.02, turn.size)
+        brake = state.braking()
+        return (
+            np.append(np.clip(speeds, low, high), brake[0]),
+            np.append(np.clip(turns, left, right), brake[1]),
+        )
+
+    def _cost(self, target: Floats, speeds: Floats, turns: Floats) -> Floats:
+        """How far each command is from what pure pursuit wants: turn to the target, slow down in sharp turns."""
+        state = self.state
+        bearing = math.atan2(target[1] - state.y, target[0] - state.x) - state.heading
+        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        wanted_turn = max(-MAX_TURN, min(MAX_TURN, 1.8 * bearing))
+        wanted_speed = self._max_speed * max(0.0, math.cos(bearing)) ** 2
+        return ((speeds - wanted_speed) / self._max_speed) ** 2 + ((turns - wanted_turn) / MAX_TURN) ** 2
+
+    def _target(self, others: Sequence[Driver]) -> Floats:
+        """The point to steer for: ahead on the line to the farthest place of the route that is in sight."""
+        here = np.array([self.state.x, self.state.y])
+        nodes = self._roadmap.nodes
+        if self._stuck > _PATIENCE:
+            self._stuck, self._retreat = 0, _RETREAT
+        if self._retreat:
+            self._retreat -= 1
+            if not self._retreat:
+                self._new_route(self._roadmap.nearest(here), others)
+            return here + self._away(here, others)
+        if len(self._route) == 1 and math.hypot(*(nodes[self._route[0]] - here)) < _ARRIVED_M:
+            self._new_route(self._route[0], others)
+        while len(self._route) > 1 and self._world.clear_line(
+            here, nodes[self._route[1]], self._roadmap.clearance * 0.85
+        ):
+            del self._route[0]
+        way = nodes[self._route[0]] - here
+        length = math.hypot(*way)
+        if len(self._route) > 1 and length < _ARRIVED_M:
+            del self._route[0]
+        return np.asarray(here + way * min(1.0, _LOOKAHEAD_M / max(length, 1e-9)))
+
+    def _away(self, here: Floats, others: Sequence[Driver]) -> Floats:
+        """A metre away from whatever is near, the nearer the more."""
+        probes = here + 0.01 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+        middle, right, left, up, down = self._world.clearance(probes).tolist()
+        away = np.array([right - left, up - down]) / (0.02 * max(0.01, middle - RADIUS))
+        for other in others:
+            apart = here - other.reserved[0]
+            distance = math.hypot(*apart)
+            away += apart / (distance * max(0.01, distance - 2 * RADIUS))
+        return np.asarray(away / max(1e-9, math.hypot(*away)))
+
+    def _new_route(self, start: int, others: Sequence[Driver]) -> None:
+        """Off to a far place; of a few, the one whose first step leads farthest from the other robots."""
+        far = self._roadmap.far_from(start, _TRIP_M)
+        routes = [self._roadmap.route(start, int(goal)) for goal in self._rng.choice(far, 3)]
+
+        def room(route: list[int]) -> float:
+            first = self._roadmap.nodes[route[min(1, len(route) - 1)]]
+            return min((math.hypot(*(first - other.reserved[0])) for other in others), default=0.0)
+
+        self._route = max(routes, key=room)

@@ -1,0 +1,132 @@
+"""The robots together: their true motion, and the messages of all of them in time order.
+
+Laws: no clock, no thread, no global generator: time is simulated, t = 0 at the start; the same settings give the
+same bytes, and a second call of ``messages`` gives them again; a topic at ``rate`` sends exactly rate * duration
+messages where that is a whole number, each robot's topic at a phase of its own, as sensors do.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.sim.driver import Driver
+from gr_ros2.sim.motion import RADIUS, TICK, State
+from gr_ros2.sim.roadmap import Roadmap
+from gr_ros2.sim.sensors import TYPES, Sensors
+from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.world import Floats, World
+
+_START_GAP_M = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class SimMessage:
+    """One message of one robot.
+
+    :param t: simulated time, s
+    :param topic: absolute name, ``/robot_1/odom``
+    :param type_name: ``nav_msgs/msg/Odometry``
+    :param payload: serialized message with its encapsulation header
+    """
+
+    t: float
+    robot_id: int
+    topic: str
+    type_name: str
+    payload: bytes
+
+
+class Fleet:
+    """Robots 1, 2, ... driving in one world.
+
+    :ivar world: what they drive in
+    :ivar robot_ids: 1, 2, ...
+    """
+
+    def __init__(self, settings: SimSettings | None = None) -> None:
+        self.settings = settings = settings or SimSettings()
+        self.robot_ids = tuple(range(1, settings.robots + 1))
+        rng = np.random.default_rng([settings.seed, 0])
+        self.world = World(settings.size_m, settings.obstacles, rng)
+        roadmap = Roadmap(self.world, RADIUS + 0.25, rng)
+        self._drivers = [
+            Driver(self.world, roadmap, node, settings.max_speed, np.random.default_rng([settings.seed, 1, robot_id]))
+            for robot_id, node in zip(self.robot_ids, self._places(roadmap, rng), strict=True)
+        ]
+        self._log: list[list[State]] = [[] for _ in self._drivers]
+
+    def _places(self, roadmap: Roadmap, rng: np.random.Generator) -> Sequence[int]:
+        """Where the robots start, well apart."""
+        places: list[int] = []
+        for node in rng.permutation(roadmap.reachable).tolist():
+            away = [math.hypot(*(roadmap.nodes[node] - roadmap.nodes[other])) for other in places]
+            if min(away, default=math.inf) >= _START_GAP_M:
+                places.append(node)
+            if len(places) == len(self.robot_ids):
+                return places
+        raise ConfigError(
+            f"robots = {self.settings.robots}: no room to start in size_m = {self.settings.size_m:g}; "
+            "use fewer robots or a larger room"
+        )
+
+    def topics(self) -> dict[str, str]:
+        """Topic name without namespace -> type, in the order of the paper's table 4."""
+        return dict(TYPES)
+
+    def rates(self) -> dict[str, float]:
+        """Topic name without namespace -> Hz; 0 = once."""
+        return {name: getattr(self.settings, f"{name}_rate") for name in TYPES}
+
+    def state(self, robot_id: int, t: float) -> State:
+        """The truth: where a robot is at simulated time ``t`` >= 0 and how it moves."""
+        tick = int(t / TICK)
+        while len(self._log[0]) <= tick:
+            for driver, log in zip(self._drivers, self._log, strict=True):
+                log.append(driver.drive([other for other in self._drivers if other is not driver]))
+        return self._log[self.robot_ids.index(robot_id)][tick].after(min(TICK, max(0.0, t - tick * TICK)))
+
+    def true_pose(self, robot_id: int, t: float) -> tuple[float, float, float]:
+        """x and y, m, and heading, rad (not wrapped), in the map frame."""
+        state = self.state(robot_id, t)
+        return state.x, state.y, state.heading
+
+    def true_path(self, robot_id: int, times: Sequence[float] | Floats) -> Floats:
+        """Rows x, y at those times."""
+        return np.array([self.true_pose(robot_id, float(t))[:2] for t in times]).reshape(-1, 2)
+
+    def messages(self, duration_s: float, start_time: float | None = None) -> Iterator[SimMessage]:
+        """All messages with 0 <= t < duration_s, in time order, made as they are asked for.
+
+        :param duration_s: s, may be infinite
+        :param start_time: stamps are this + t; None takes ``settings.start_time``
+        """
+        start_ns = round((self.settings.start_time if start_time is None else start_time) * 1e9)
+        sensors = {i: Sensors(self.settings, self.world, i, self.state(i, 0.0), start_ns) for i in self.robot_ids}
+        schedule = [event for i in self.robot_ids for event in self._first_events(i)]
+        heapq.heapify(schedule)
+        while schedule and schedule[0][0] < duration_s:
+            t, order, robot_id, count, topic, rate, phase = schedule[0]
+            if rate:
+                following = (count + 1 + phase) / rate
+                heapq.heapreplace(schedule, (following, order, robot_id, count + 1, topic, rate, phase))
+            else:
+                heapq.heappop(schedule)
+            state = self.state(robot_id, t)
+            if topic == "cmd_vel":  # the command of this period is the motion at its end
+                tick = int(t / TICK)
+                state = self._log[robot_id - 1][tick].after(TICK)
+            others = [self.state(i, t) for i in self.robot_ids if i != robot_id] if topic == "scan" else ()
+            payload = sensors[robot_id].read(topic, t, state, others)
+            yield SimMessage(t, robot_id, f"/robot_{robot_id}/{topic}", TYPES[topic], payload)
+
+    def _first_events(self, robot_id: int) -> Iterator[tuple[float, int, int, int, str, float, float]]:
+        phases = np.random.default_rng([self.settings.seed, 3, robot_id]).uniform(size=len(TYPES)).tolist()
+        for order, ((topic, rate), phase) in enumerate(zip(self.rates().items(), phases, strict=True)):
+            offset = 0.0 if topic == "map" else phase
+            yield (offset / rate if rate else 0.0, order, robot_id, 0, topic, rate, offset)

@@ -1,0 +1,127 @@
+"""Plays simulated robots on ROS graphs in real time.
+
+Laws: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
+moves no later one; ``stop`` takes effect before the next message; an error of the graph ends the play and is
+raised by ``stop``, never lost.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware.base import Middleware, Publisher, Qos
+from gr_ros2.registry import Registry
+from gr_ros2.sim.fleet import Fleet
+
+_DEPTH = 100
+_JOIN_S = 1.0
+
+
+class SimPublisher:
+    """A fleet on ROS graphs, in a thread of its own.
+
+    Publishers are announced at construction, so subscribers can be found before ``start``. They stay until
+    ``close``, so that a late joiner still gets the map.
+
+    :param middleware: one graph for all robots, or one per robot id; robots left out do not publish
+    :param duration_s: of play, s; may be infinite
+    :param start_time: called at ``start`` for the stamp of t = 0; None takes the fleet's ``start_time`` setting
+    :param clock: monotonic, s
+    :ivar published: messages published, per topic
+    :ivar worst_lag_s: the longest that a message left after its time
+    :raises MiddlewareError: when a topic cannot be announced
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        middleware: Middleware | Mapping[int, Middleware],
+        duration_s: float,
+        start_time: Callable[[], float] | None = time.time,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._fleet, self._duration_s = fleet, duration_s
+        self._start_time, self._clock = start_time, clock
+        self.published: Counter[str] = Counter()
+        self.worst_lag_s = 0.0
+        self._error: Exception | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sim-publisher", daemon=True)
+        graphs = middleware if isinstance(middleware, Mapping) else dict.fromkeys(fleet.robot_ids, middleware)
+        self._publishers: dict[str, Publisher] = {
+            f"/robot_{robot_id}/{topic.name}": graphs[robot_id].advertise(
+                f"/robot_{robot_id}/{topic.name}",
+                topic.type_name,
+                Qos("reliable", "transient_local" if topic.latched else "volatile", _DEPTH),
+            )
+            for robot_id in fleet.robot_ids
+            if robot_id in graphs
+            for topic in Registry.from_rows(fleet.topics())
+        }
+
+    @property
+    def publishers(self) -> Mapping[str, Publisher]:
+        """By absolute topic name, for instance to wait until they are matched."""
+        return self._publishers
+
+    @property
+    def finished(self) -> bool:
+        """True once the play has begun and is over: all published, stopped, or failed."""
+        return self._thread.ident is not None and not self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin to play; t = 0 is now. Once only."""
+        self._thread.start()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Block until finished; whether it is."""
+        self._thread.join(timeout_s)
+        return self.finished
+
+    def stop(self) -> None:
+        """End the play; the publishers stay. Idempotent.
+
+        :raises Exception: what ended the play early, for instance a MiddlewareError
+        """
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
+            if self._thread.is_alive():
+                raise MiddlewareError(f"simulator: publishing blocks for more than {_JOIN_S:g} s; is the graph stuck?")
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def close(self) -> None:
+        """Stop, and take the publishers off the graph."""
+        try:
+            self.stop()
+        finally:
+            for publisher in self._publishers.values():
+                publisher.close()
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:  # noqa: BLE001 - kept for stop(), which raises it in the caller's thread
+            self._error = error
+
+    def _play(self) -> None:
+        start_time = None if self._start_time is None else self._start_time()
+        begin = self._clock()
+        for message in self._fleet.messages(self._duration_s, start_time):
+            publisher = self._publishers.get(message.topic)
+            if publisher is None:
+                continue
+            while (ahead := begin + message.t - self._clock()) > 0:
+                if self._stop.wait(min(ahead, _JOIN_S)):
+                    return
+            if self._stop.is_set():
+                return
+            publisher.publish(message.payload)
+            self.worst_lag_s = max(self.worst_lag_s, -ahead)
+            self.published[message.topic] += 1

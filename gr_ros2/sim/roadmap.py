@@ -1,0 +1,79 @@
+"""Ways through the room: places, straight lines between them that a robot can drive, and the shortest routes.
+
+Law: every place keeps ``clearance`` from walls and obstacles, and so does every line between neighbours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gr_ros2.sim.world import Floats, World
+
+_NEIGHBOUR_M = 6.0
+_SPACING_M = 1.1
+_SAMPLES = 400
+
+
+class Roadmap:
+    """Random places no nearer to each other than a metre, joined where the line between them is clear.
+
+    :param clearance: m from the centre of a robot to anything
+    """
+
+    def __init__(self, world: World, clearance: float, rng: np.random.Generator) -> None:
+        self._world = world
+        self.clearance = clearance
+        samples = rng.uniform(clearance, world.size - clearance, (_SAMPLES, 2))
+        places: list[Floats] = []
+        for sample in samples[world.clearance(samples) >= clearance]:
+            if not places or np.hypot(*(np.array(places) - sample).T).min() >= _SPACING_M:
+                places.append(sample)
+        nodes = np.array(places)
+        distance, step = self._routes(nodes)
+        # Gaps are wide enough that nearly everything is one piece; a place that is not is left out.
+        hub = int(np.isfinite(distance).sum(axis=1).argmax())
+        self._distance, self._step = distance, step
+        self.nodes = nodes
+        """Rows x, y."""
+        self.reachable = np.flatnonzero(np.isfinite(distance[hub]))
+        """Indices of the places that can reach each other."""
+
+    def _routes(self, nodes: Floats) -> tuple[Floats, np.ndarray]:  # type: ignore[type-arg]
+        """Shortest distances and next steps between all places (Floyd and Warshall)."""
+        count = len(nodes)
+        lengths = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
+        distance = np.full((count, count), np.inf)
+        np.fill_diagonal(distance, 0.0)
+        for one in range(count):
+            for two in range(one + 1, count):
+                if lengths[one, two] <= _NEIGHBOUR_M and self._world.clear_line(nodes[one], nodes[two], self.clearance):
+                    distance[one, two] = distance[two, one] = lengths[one, two]
+        step = np.where(np.isfinite(distance), np.arange(count)[None], -1)
+        for middle in range(count):
+            through = distance[:, middle, None] + distance[None, middle]
+            better = through < distance
+            distance = np.where(better, through, distance)
+            step = np.where(better, step[:, middle, None], step)
+        return distance, step
+
+    def nearest(self, point: Floats) -> int:
+        """The nearest place that can be reached in a straight line, or just the nearest if none can."""
+        away = np.hypot(*(self.nodes[self.reachable] - point).T)
+        order = self.reachable[np.argsort(away)]
+        for node in order[:10]:
+            if self._world.clear_line(point, self.nodes[node], self.clearance * 0.8):
+                return int(node)
+        return int(order[0])
+
+    def far_from(self, node: int, least_m: float) -> np.ndarray:  # type: ignore[type-arg]
+        """Places at least that far to drive, or the farthest one if none is."""
+        distance = self._distance[node, self.reachable]
+        far = self.reachable[distance >= least_m]
+        return far if len(far) else self.reachable[[int(distance.argmax())]]
+
+    def route(self, start: int, goal: int) -> list[int]:
+        """The places from start to goal, both included."""
+        route = [start]
+        while route[-1] != goal:
+            route.append(int(self._step[route[-1], goal]))
+        return route

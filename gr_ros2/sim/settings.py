@@ -1,0 +1,68 @@
+"""Settings of the simulator.
+
+Law: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SimSettings:
+    """Robots, world, rates and noise.
+
+    :param seed: of the world, the routes and all noise
+    :param robots: number of robots; they are called robot_1, robot_2, ...
+    :param size_m: side of the square room, m
+    :param obstacles: boxes and pillars in it; fewer where the room has no place for all
+    :param max_speed: m/s
+    :param odom_rate: Hz, as all rates
+    :param map_rate: 0 = once at the start
+    :param beams: of a laser scan, over the full turn
+    :param scan_range: farthest range the scanner measures, m; beyond it a beam reads +inf (REP 117)
+    :param map_cells: cells along each side of the map
+    :param scan_noise: standard deviation of a range, m
+    :param odom_linear_noise: of the measured forward speed, m/s; the odometry pose integrates it, so it drifts
+    :param odom_angular_noise: of the measured turn rate, rad/s; integrated likewise
+    :param imu_gyro_noise: rad/s
+    :param imu_accel_noise: m/s^2
+    :param imu_orientation_noise: rad, about each axis
+    :param start_time: stamps are start_time + t, s
+    :param prefix_frames: frame ids carry the robot's name (robot_1/odom), for robots that share one graph
+    """
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    robots: Annotated[int, Field(ge=1, le=8)] = 2
+    size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
+    obstacles: Annotated[int, Field(ge=0, le=100)] = 12
+    max_speed: Annotated[float, Field(ge=0.1, le=2)] = 1.0
+    scan_rate: Rate = 5.0
+    odom_rate: Rate = 30.0
+    imu_rate: Rate = 50.0
+    cmd_vel_rate: Rate = 10.0
+    clock_rate: Rate = 10.0
+    map_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    beams: Annotated[int, Field(ge=1, le=10_000)] = 360
+    scan_range: Annotated[float, Field(ge=1, le=1000)] = 12.0
+    map_cells: Annotated[int, Field(ge=10, le=2000)] = 100
+    scan_noise: Noise = 0.01
+    odom_linear_noise: Noise = 0.02
+    odom_angular_noise: Noise = 0.01
+    imu_gyro_noise: Noise = 0.01
+    imu_accel_noise: Noise = 0.1
+    imu_orientation_noise: Noise = 0.01
+    start_time: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
+    prefix_frames: bool = False
+
+    @model_validator(mode="after")
+    def _room(self) -> SimSettings:
+        if self.robots > 2 and self.size_m < 15:
+            raise ValueError(f"size_m = {self.size_m}: {self.robots} robots need a room of 15 m or more")
+        return self

@@ -1,0 +1,132 @@
+"""The room the robots drive in: four walls, boxes at any angle, round pillars.
+
+Laws: lengths in m, angles in rad, the room's lower left corner is the origin of the map frame; between any two
+obstacles, and between an obstacle and a wall, there is a gap of ``GAP`` or more, so every free place can be
+reached; nothing here changes after construction.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+GAP = 1.7
+"""m between obstacles: a robot of 0.7 m passes with half a metre to each side."""
+BORDER = 0.4
+"""m of wall that the map shows around the room."""
+_TRIES = 200
+
+
+class World:
+    """A room with obstacles, drawn from a generator.
+
+    :param size: side of the square room, m
+    :param count: obstacles wished for; places that leave no ``GAP`` are not used, so there may be fewer
+    :param rng: where the places come from
+    """
+
+    def __init__(self, size: float, count: int, rng: np.random.Generator) -> None:
+        self.size = size
+        boxes: list[tuple[float, float, float, float, float]] = []
+        circles: list[tuple[float, float, float]] = []
+        taken: list[tuple[float, float, float]] = []
+        for number in range(count):
+            half_x, half_y = rng.uniform(0.3, 1.2), rng.uniform(0.3, 0.9)
+            reach = math.hypot(half_x, half_y) if number % 2 == 0 else half_y
+            for _ in range(_TRIES):
+                x, y = rng.uniform(reach + GAP, size - reach - GAP, 2)
+                if all(math.hypot(x - cx, y - cy) >= reach + other + GAP for cx, cy, other in taken):
+                    taken.append((x, y, reach))
+                    if number % 2 == 0:
+                        boxes.append((x, y, half_x, half_y, rng.uniform(-math.pi, math.pi)))
+                    else:
+                        circles.append((x, y, reach))
+                    break
+        self.boxes: Floats = np.array(boxes, dtype=np.float64).reshape(-1, 5)
+        """Rows x, y, half length, half width, angle."""
+        self.circles: Floats = np.array(circles, dtype=np.float64).reshape(-1, 3)
+        """Rows x, y, radius."""
+        self._cos, self._sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
+
+    def clearance(self, points: Floats) -> Floats:
+        """Distance from each point to the nearest wall or obstacle, negative inside one.
+
+        :param points: array of shape (..., 2)
+        :returns: array of shape (...)
+        """
+        x, y = points[..., 0].ravel(), points[..., 1].ravel()
+        nearest = np.minimum(np.minimum(x, self.size - x), np.minimum(y, self.size - y))
+        if len(self.circles):
+            centre_x, centre_y, radius = self.circles.T[:, :, None]
+            dx, dy = x - centre_x, y - centre_y
+            nearest = np.minimum(nearest, (np.sqrt(dx * dx + dy * dy) - radius).min(axis=0))
+        if len(self.boxes):
+            centre_x, centre_y, half_x, half_y, _ = self.boxes.T[:, :, None]
+            cos, sin = self._cos[:, None], self._sin[:, None]
+            dx, dy = x - centre_x, y - centre_y
+            out_x = np.abs(dx * cos + dy * sin) - half_x
+            out_y = np.abs(dy * cos - dx * sin) - half_y
+            far_x, far_y = np.maximum(out_x, 0), np.maximum(out_y, 0)
+            outside = np.sqrt(far_x * far_x + far_y * far_y)
+            nearest = np.minimum(nearest, (outside + np.minimum(np.maximum(out_x, out_y), 0)).min(axis=0))
+        return np.asarray(nearest.reshape(points.shape[:-1]))
+
+    def clear_line(self, start: Floats, end: Floats, clearance: float, step: float = 0.15) -> bool:
+        """Whether a straight line keeps ``clearance`` from everything, checked every ``step`` metres."""
+        count = max(2, math.ceil(math.hypot(*(end - start)) / step) + 1)
+        line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+        return bool(self.clearance(line).min() >= clearance)
+
+    def cast(self, x: float, y: float, angles: Floats, others: Floats | None = None) -> Floats:
+        """Distance along each ray to the first wall, obstacle or other robot.
+
+        :param angles: of the rays, in the map frame
+        :param others: rows x, y, radius of round things that move
+        """
+        dir_x, dir_y = np.cos(angles)[:, None], np.sin(angles)[:, None]
+        with np.errstate(divide="ignore"):  # a ray along a wall: +-inf is what the slabs need
+            room = np.maximum((0.0 - x) / dir_x, (self.size - x) / dir_x)
+            room = np.minimum(room, np.maximum((0.0 - y) / dir_y, (self.size - y) / dir_y))
+            hits = [room]
+            if len(self.boxes):
+                hits.append(self._cast_boxes(x, y, dir_x, dir_y))
+        circles = self.circles if others is None else np.concatenate([self.circles, others])
+        if len(circles):
+            off_x, off_y = circles[:, 0] - x, circles[:, 1] - y
+            along = dir_x * off_x + dir_y * off_y
+            across = dir_x * off_y - dir_y * off_x
+            depth = circles[:, 2] ** 2 - across**2
+            near = along - np.sqrt(np.maximum(depth, 0.0))
+            hits.append(np.where((depth >= 0) & (near >= 0), near, np.inf))
+        return np.asarray(np.concatenate(hits, axis=1).min(axis=1))
+
+    def _cast_boxes(self, x: float, y: float, dir_x: Floats, dir_y: Floats) -> Floats:
+        """The slab method in each box's own frame."""
+        off_x, off_y = x - self.boxes[:, 0], y - self.boxes[:, 1]
+        enter = np.full((len(dir_x), len(self.boxes)), -np.inf)
+        leave = np.full_like(enter, np.inf)
+        for offset, direction, half in (
+            (off_x * self._cos + off_y * self._sin, dir_x * self._cos + dir_y * self._sin, self.boxes[:, 2]),
+            (off_y * self._cos - off_x * self._sin, dir_y * self._cos - dir_x * self._sin, self.boxes[:, 3]),
+        ):
+            one, two = (-half - offset) / direction, (half - offset) / direction
+            enter = np.maximum(enter, np.minimum(one, two))
+            leave = np.minimum(leave, np.maximum(one, two))
+        return np.where((leave >= enter) & (enter >= 0), enter, np.inf)
+
+    def map_origin_resolution(self, cells: int) -> tuple[float, float]:
+        """Map frame coordinate (the same for x and y) of the first cell's corner, and the cell's side, m."""
+        return -BORDER, (self.size + 2 * BORDER) / cells
+
+    def occupancy(self, cells: int) -> NDArray[np.int8]:
+        """The map of nav_msgs/OccupancyGrid: rows of growing y, 100 where a cell's centre is in a wall or an
+        obstacle or within half a cell of its edge, else 0."""
+        origin, resolution = self.map_origin_resolution(cells)
+        centres = origin + (np.arange(cells) + 0.5) * resolution
+        grid = np.stack(np.meshgrid(centres, centres), axis=-1)
+        clearance = np.stack([self.clearance(row) for row in grid])  # row by row: a large map stays small in memory
+        return np.where(clearance < resolution / 2, 100, 0).astype(np.int8)

@@ -1,0 +1,46 @@
+"""What tests of the engines share."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from gr_ros2.config import SinkConfig, SourceConfig, build
+from gr_ros2.link import Delivered, Receiver, ReceiverEvent, Sender
+from gr_ros2.registry import Registry
+from gr_ros2.wire import Packet, decode
+
+
+def registry(topics: int = 3) -> Registry:
+    names = {f"t{number}": "std_msgs/String" for number in range(topics)}
+    return Registry.from_rows(names)
+
+
+def sender(topics: int = 3, seed: int = 0, **settings: Any) -> Sender:
+    config = build(SourceConfig, {"robot_id": 1, **settings})
+    return Sender(registry(topics), config, rng=random.Random(seed))
+
+
+def receiver(topics: int = 3, **settings: Any) -> Receiver:
+    return Receiver(registry(topics), build(SinkConfig, settings))
+
+
+def drain(engine: Sender, now: float = 0.0) -> list[bytes]:
+    """All packets that may leave at ``now``."""
+    packets = []
+    while (data := engine.next_packet(now)) is not None:
+        packets.append(data)
+    return packets
+
+
+def trace(packets: list[bytes]) -> list[list[tuple[int, int, int]]]:
+    """Per packet its entries as (topic_id, index, total)."""
+    return [[(e.topic_id, e.index, e.total) for e in read(data).entries] for data in packets]
+
+
+def read(data: bytes) -> Packet:
+    return decode(data, len(data))
+
+
+def delivered(events: list[ReceiverEvent]) -> list[bytes]:
+    return [event.payload for event in events if isinstance(event, Delivered)]
