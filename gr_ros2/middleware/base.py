@@ -8,6 +8,8 @@ callback runs after it has returned.
 
 from __future__ import annotations
 
+import logging
+import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
@@ -18,6 +20,8 @@ from typing import ClassVar, Literal
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
 MessageCallback = Callable[[bytes], None]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +84,15 @@ class Subscription(ABC):
 class Middleware(ABC):
     """One participant of a ROS graph (or of something that stands in for it).
 
-    ``counters`` names what went wrong, for statistics: ``samples_lost:/topic`` and
-    ``incompatible_qos:/topic:policy``. The first of each is also logged once.
+    ``counters`` names what went wrong, for statistics: ``samples_lost:/topic``, ``incompatible_qos:/topic:policy``,
+    ``incompatible_type:/topic`` and ``callback_failed:/topic``. The first of each is also logged.
     """
 
     name: ClassVar[str]
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
+        self._counting = threading.Lock()
 
     @abstractmethod
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
@@ -111,6 +116,22 @@ class Middleware(ABC):
 
     @abstractmethod
     def close(self) -> None: ...
+
+    def count(self, key: str, text: str, n: int = 1) -> None:
+        """Add to a counter, from any thread; log the text at its first occurrence."""
+        with self._counting:
+            first = key not in self.counters
+            self.counters[key] += n
+        if first:
+            _log.warning("%s (counted as %s, not logged again)", text, key)
+
+    def deliver(self, topic: str, callback: MessageCallback, payload: bytes) -> None:
+        """Call back with one message; a callback that raises is counted and logged, and the thread lives on."""
+        try:
+            callback(payload)
+        except Exception as error:  # noqa: BLE001 - user code: whatever it raises must not stop the other topics
+            self.count(f"callback_failed:{topic}", f"the callback of {topic} failed: {type(error).__name__}: {error}")
+            _log.debug("callback of %s", topic, exc_info=True)
 
     def __enter__(self) -> Middleware:
         return self

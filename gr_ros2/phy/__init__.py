@@ -9,7 +9,9 @@ PHY = BackendTable(
     "phy",
     {
         "direct": Backend("gr_ros2.phy.direct", "DirectPhy", "message loopback, no samples"),
-        "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "GNU Radio's stock OFDM", "GNU Radio 3.10 (apt install gnuradio)"),
+        "ofdm": Backend(
+            "gr_ros2.phy.ofdm", "OfdmPhy", "GNU Radio's stock OFDM", "GNU Radio 3.10 (apt install gnuradio)"
+        ),
     },
 )
 

@@ -10,18 +10,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+from gr_ros2.errors import ConfigError
+
 
 class Phy(ABC):
     """One physical layer at one packet length and sample rate.
 
     :param packet_len: bytes per packet, 14..4095
     :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
+    :raises ConfigError: for a sample rate that is not above 0 where one is needed
     """
 
     name: ClassVar[str]
     has_samples: ClassVar[bool]
 
     def __init__(self, packet_len: int, sample_rate: float) -> None:
+        if self.has_samples and not sample_rate > 0:
+            raise ConfigError(f"phy {self.name}: sample_rate = {sample_rate}: must be above 0 samples/s")
         self.packet_len = packet_len
         self.sample_rate = sample_rate
 
@@ -34,9 +39,21 @@ class Phy(ABC):
         return self.airtime_samples() / self.sample_rate if self.has_samples else 0.0
 
     @abstractmethod
+    def burst_power(self) -> float:
+        """Mean of the squared magnitude of one packet's samples, gap excluded; 0 for a PHY without samples."""
+
+    @abstractmethod
     def transmitter(self) -> Any:
-        """A fresh hier block: message port `pdus` in, one complex stream out."""
+        """A fresh hier block: message port `pdus` in, one complex stream out.
+
+        Its method ``packets_sent() -> int`` tells how many packets have left it as samples.
+
+        :raises PhyError: for a PHY without samples
+        """
 
     @abstractmethod
     def receiver(self) -> Any:
-        """A fresh hier block: one complex stream in, message port `pdus` out."""
+        """A fresh hier block: one complex stream in, message port `pdus` out.
+
+        :raises PhyError: for a PHY without samples
+        """

@@ -1,0 +1,116 @@
+"""The command `gr-ros2`: finds a sub-command, runs it, and turns errors into one line and an exit status.
+
+Laws: nothing but this package prints, exits or reads argv; a sub-command's module is imported only when it is
+chosen, so `--help` is quick and works without GNU Radio, DDS and ROS; exit status 2 means bad input, 1 a failed run,
+130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+
+import click
+
+from gr_ros2 import __version__
+from gr_ros2.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+_BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
+
+Commands = Mapping[str, tuple[str, str]]
+"""name -> (``module:attribute``, the line that help shows), in the order in which help lists them."""
+
+PACKET_COMMANDS: Commands = {
+    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
+    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "decode": ("gr_ros2.cli.packet:decode_packets", "Packets (hex, binary or pcap) to readable fields."),
+}
+REGISTRY_COMMANDS: Commands = {
+    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
+    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "check": ("gr_ros2.cli.registry:check", "Validate a registry CSV; print its rows and digest."),
+    "from-graph": ("gr_ros2.cli.registry:from_graph", "Write a registry from the topics on the ROS graph."),
+}
+COMMANDS: Commands = {
+    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
+    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "scenarios": ("gr_ros2.cli.scenarios:scenarios", "List the built-in scenarios."),
+    "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
+    "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
+    "grc-path": ("gr_ros2.cli.grc:grc_path", "The folder of block descriptions for GRC."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported when called."""
+
+    def __init__(self, commands: Commands, name: str, help: str) -> None:
+        super().__init__(name=name, help=help, context_settings={"help_option_names": ["-h", "--help"]})
+        self._lazy = commands
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args or ["--help"])
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        return list(self._lazy)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        if cmd_name not in self._lazy:
+            return None
+        module, _, attribute = self._lazy[cmd_name][0].partition(":")
+        command = getattr(import_module(module), attribute)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in self._lazy.items()])
+
+
+packet = LazyGroup(PACKET_COMMANDS, "packet", "Look into packets.")
+registry = LazyGroup(REGISTRY_COMMANDS, "registry", "Check and write topic registries.")
+cli = click.version_option(__version__, prog_name="gr-ros2")(
+    LazyGroup(COMMANDS, "gr-ros2", "Native ROS 2 topics over any GNU Radio physical layer, without IP.")
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the command; always ends in SystemExit.
+
+    :param arguments: the command line without the program's name, None for the process's own
+    """
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit status; errors go to stderr as one line."""
+    try:
+        status = cli.main(args=arguments, prog_name="gr-ros2", standalone_mode=False)
+        sys.stdout.flush()
+    except click.UsageError as error:
+        command = error.ctx.command_path if error.ctx is not None else "gr-ros2"
+        return _fail(f"{error.format_message().rstrip('.')}; see {command} --help", BAD_INPUT)
+    except click.ClickException as error:
+        return _fail(error.format_message(), BAD_INPUT)
+    except (click.Abort, KeyboardInterrupt):
+        return _fail("interrupted", INTERRUPTED)
+    except GrRos2Error as error:
+        return _fail(str(error), BAD_INPUT if isinstance(error, _BAD_INPUT_ERRORS) else FAILED)
+    except BrokenPipeError:
+        # Whoever read our output (`| head`) has gone: not an error, but Python must not flush into it at exit.
+        sys.stdout = open(os.devnull, "w")
+        return 0
+    return status if isinstance(status, int) else 0
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"gr-ros2: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    main()

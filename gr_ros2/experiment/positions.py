@@ -1,0 +1,57 @@
+"""Positions out of serialized messages: which types carry one, and where.
+
+Law: only types of ROS 2 Humble whose position is one point in metres count (no latitude and longitude); a payload
+that does not deserialize has no position and is counted by who asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from operator import attrgetter
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+_POSITION_AT = {
+    "geometry_msgs/msg/Point": "",
+    "geometry_msgs/msg/PointStamped": "point",
+    "geometry_msgs/msg/Pose": "position",
+    "geometry_msgs/msg/PoseStamped": "pose.position",
+    "geometry_msgs/msg/PoseWithCovariance": "pose.position",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose.position",
+    "geometry_msgs/msg/TransformStamped": "transform.translation",
+    "nav_msgs/msg/Odometry": "pose.pose.position",
+}
+
+PositionReader = Callable[[bytes], tuple[float, float] | None]
+
+
+@cache
+def humble_types() -> Typestore:
+    """The message definitions of ROS 2 Humble."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def position_reader(type_name: str) -> PositionReader | None:
+    """A function from a serialized message to its (x, y) in metres, or to None where the bytes are no such message.
+
+    :param type_name: ``package/msg/Type``
+    :return: None where the type has no position
+    """
+    if type_name not in _POSITION_AT:
+        return None
+    where = _POSITION_AT[type_name]
+    point_of: Callable[[Any], Any] = attrgetter(where) if where else lambda message: message
+    deserialize = humble_types().deserialize_cdr
+
+    def read(payload: bytes) -> tuple[float, float] | None:
+        try:
+            point = point_of(deserialize(payload, type_name))
+        except (SerdeError, UnicodeDecodeError):
+            return None
+        return float(point.x), float(point.y)
+
+    return read

@@ -1,0 +1,157 @@
+"""What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
+
+Law: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever; every
+block of this process is checked against every other when it is made.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import weakref
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from gr_ros2.config import SinkConfig, build
+from gr_ros2.errors import ConfigError
+from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.middleware.ros_graph import resolve_domain_id
+from gr_ros2.registry import Registry
+
+SWITCH_INTERVAL_S = 5e-5
+"""Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
+default of 5 ms (two hops), 0.2 ms with this."""
+
+_MAX_SRC_ID = 255
+_T = TypeVar("_T")
+
+
+def settings(
+    cls: type[_T], values: Mapping[str, Any], registry: str | Registry, middleware: str | Middleware | None
+) -> _T:
+    """The configuration of a block from its keyword arguments.
+
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    named = dict(values)
+    if isinstance(registry, str):
+        named["registry"] = registry
+    if middleware is not None:
+        named["middleware"] = middleware if isinstance(middleware, str) else middleware.name
+    return build(cls, named)
+
+
+def replaced(config: _T, **changes: Any) -> _T:
+    """A configuration with some settings changed, validated again.
+
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
+    return build(type(config), {**current, **changes})
+
+
+def read_registry(registry: str | Registry) -> Registry:
+    """The registry itself, or the one in a CSV file.
+
+    :raises ConfigError: when there is none, or the file is wrong
+    """
+    if isinstance(registry, Registry):
+        return registry
+    if not registry:
+        raise ConfigError("registry is missing; give the path of a CSV with rows of the form name,type")
+    return Registry.from_csv(registry)
+
+
+class Graph:
+    """A block's participant on a ROS graph: handed over open, or opened by name and then closed by us.
+
+    :param middleware: an open one, or None to open ``name``
+    :raises ConfigError: for a name that is not in the table, or a back-end that must be opened by hand
+    :raises BackendMissingError: when its package is not installed
+    """
+
+    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int, node_name: str) -> None:
+        if isinstance(middleware, Middleware):
+            self.middleware = middleware
+            self.owned = False
+        elif name == "bag":
+            raise ConfigError("middleware = 'bag': a bag needs a path; open BagMiddleware and hand it over")
+        else:
+            self.middleware = MIDDLEWARE.load(name)(domain_id=domain_id, node_name=node_name)
+            self.owned = True
+        self._domain_id = getattr(self.middleware, "domain_id", resolve_domain_id(domain_id))
+
+    def same_as(self, other: Graph) -> bool:
+        """Whether what one publishes the other can hear."""
+        if self.middleware is other.middleware:
+            return True
+        if "bag" in (self.middleware.name, other.middleware.name):
+            return False
+        # DDS and rclpy meet on the wire; memory meets memory only.
+        in_memory = {self.middleware.name == "memory", other.middleware.name == "memory"}
+        return self._domain_id == other._domain_id and len(in_memory) == 1
+
+    def close(self) -> None:
+        """Leave the graph, if we joined it."""
+        if self.owned:
+            self.middleware.close()
+
+
+def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry) -> None:
+    """Refuse a sink that publishes a topic which a source of the same graph subscribes.
+
+    :param subscribed: absolute topic names the source listens to
+    :param registry: the sink's, topic options applied
+    :raises ConfigError: naming the topic
+    """
+    names = set(subscribed)
+    for topic in registry:
+        for src_id in range(_MAX_SRC_ID + 1):
+            name = topic.republished(config.namespace_format, src_id)
+            if name in names:
+                raise ConfigError(
+                    f"loop: the sink publishes {name} (sender {src_id}), which a source on the same graph "
+                    "subscribes; change namespace_format, publish_as or domain_id"
+                )
+
+
+class LoopGuard:
+    """The blocks of this process, as far as loops go."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sources: weakref.WeakKeyDictionary[Any, tuple[Graph, frozenset[str]]] = weakref.WeakKeyDictionary()
+        self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
+
+    def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
+        """:raises ConfigError: for a loop with a sink that is there"""
+        names = frozenset(subscribed)
+        with self._lock:
+            for other, config, registry in self._sinks.values():
+                if graph.same_as(other):
+                    check_loop(names, config, registry)
+            self._sources[block] = (graph, names)
+
+    def add_sink(self, block: Any, graph: Graph, config: SinkConfig, registry: Registry) -> None:
+        """:raises ConfigError: for a loop with a source that is there"""
+        with self._lock:
+            for other, names in self._sources.values():
+                if graph.same_as(other):
+                    check_loop(names, config, registry)
+            self._sinks[block] = (graph, config, registry)
+
+    def remove(self, block: Any) -> None:
+        """A block has left its graph."""
+        with self._lock:
+            self._sources.pop(block, None)
+            self._sinks.pop(block, None)
+
+
+LOOP_GUARD = LoopGuard()
+
+
+def quicken_threads() -> None:
+    """Let Python threads hand over quickly; for the whole process, since there is only one such setting."""
+    if sys.getswitchinterval() > SWITCH_INTERVAL_S:
+        sys.setswitchinterval(SWITCH_INTERVAL_S)

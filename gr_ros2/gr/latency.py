@@ -1,0 +1,74 @@
+"""The sink's live latency: from a message's own stamp to its publication.
+
+Laws: only types whose first field is a std_msgs/Header have one; a stamp of zero is unset, as ROS has it; negative
+values (clocks that disagree) are kept and counted; memory is bounded by a window of the newest values.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from rosbags.typesys import Stores, get_typestore
+
+WINDOW = 10_000
+"""Newest values the percentiles are taken over."""
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+
+_TIME = (struct.Struct(">iI"), struct.Struct("<iI"))
+_CDR_HEAD = 4
+_LITTLE_ENDIAN = 1
+
+
+def has_header(type_name: str) -> bool:
+    """Whether messages of a type begin with a std_msgs/Header; False where the type is not known."""
+    _, members = _fields().get(type_name, ([], []))
+    return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
+
+
+def leading_time(payload: bytes) -> float | None:
+    """The time a serialized message begins with (a Header's stamp, or a Clock), s; None if unset or too short."""
+    if len(payload) < _CDR_HEAD + 8 or payload[0] != 0:
+        return None
+    seconds, nanoseconds = _TIME[payload[1] & _LITTLE_ENDIAN].unpack_from(payload, _CDR_HEAD)
+    return None if seconds == nanoseconds == 0 else seconds + nanoseconds * 1e-9
+
+
+class Latency(NamedTuple):
+    """Over the window, s; None where nothing was measured. ``measured`` and ``negative`` are since the start."""
+
+    p50: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
+    measured: int
+    negative: int
+
+
+class LatencyWindow:
+    """The newest latencies of one topic."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=WINDOW)
+        self._count = 0
+        self._negative = 0
+
+    def add(self, seconds: float) -> None:
+        self._values.append(seconds)
+        self._count += 1
+        self._negative += seconds < 0
+
+    def summary(self) -> Latency:
+        """Percentiles by nearest rank."""
+        values = sorted(self._values)
+        if not values:
+            return Latency(None, None, None, None, 0, 0)
+        p50, p95, p99 = (values[-(-len(values) * percent // 100) - 1] for percent in (50, 95, 99))
+        return Latency(p50, p95, p99, values[-1], self._count, self._negative)
+
+
+@lru_cache(maxsize=1)
+def _fields() -> dict[str, Any]:
+    return dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)

@@ -1,0 +1,264 @@
+"""ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
+
+Laws: a thin shell, all behaviour is in ``link.Receiver``, which one lock guards; only the bytes of a PDU are trusted;
+the message handler never raises, since that would end the block's thread while the flowgraph seems alive; messages
+are published in completion order; everything not published is counted by name.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from gnuradio import gr
+
+from gr_ros2.config import SinkConfig
+from gr_ros2.errors import GrRos2Error, MiddlewareError
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, quicken_threads, read_registry, replaced, settings
+from gr_ros2.gr.latency import CLOCK_TYPE, LatencyWindow, has_header, leading_time
+from gr_ros2.gr.pmts import PDUS, packet_of
+from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
+from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.registry import Registry
+
+_JOIN_S = 1.0
+_SHORTEST_WAIT_S = 1e-3
+_CLOCK_DEPTH = 1
+
+
+class RosSink(gr.basic_block):  # type: ignore[misc]
+    """Reassembles packets into messages and publishes them on a ROS graph.
+
+    Message port: `pdus` in (PMT pair of anything and a u8vector). A publisher appears with the first message of a
+    sender and topic. ``close`` leaves the graph; the end of the process does it too. A middleware handed over open is
+    closed by who opened it.
+
+    :param registry: CSV path or Registry, the same as at the source
+    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
+    :param observer: called with every ReceiverEvent, in order; with Delivered after it was published
+    :param packet_observer: called with the bytes of every PDU before they are read
+    :param clock: s, monotonic
+    :param values: the fields of :class:`gr_ros2.config.SinkConfig`
+    :raises ConfigError: naming key, value and what is allowed
+    """
+
+    def __init__(
+        self,
+        registry: str | Registry = "",
+        *,
+        middleware: str | Middleware | None = None,
+        observer: Callable[[ReceiverEvent], None] | None = None,
+        packet_observer: Callable[[bytes], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        **values: Any,
+    ) -> None:
+        super().__init__("ros2_sink", None, None)
+        self.config = settings(SinkConfig, values, registry, middleware)
+        self._receiver = Receiver(read_registry(registry), self.config)
+        self.registry = self._receiver.registry
+        self._observer = observer
+        self._packet_observer = packet_observer
+        self._clock = clock
+        self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
+        self._lock = threading.Lock()
+        self._timer_due = threading.Condition(self._lock)
+        self._timer_idle = False
+        self._running = False
+        self._thread: threading.Thread | None = None
+        self._counters: Counter[str] = Counter()
+        self._publishers: dict[tuple[int, int], Publisher] = {}
+        self._latency: dict[tuple[int, int], LatencyWindow] = {}
+        self._stamped = [has_header(topic.type_name) for topic in self.registry]
+        self._sim_time: float | None = None
+        self._clock_subscription: Subscription | None = None
+        self.handled = 0
+        """PDUs this block is done with, whatever became of them."""
+        self.message_port_register_in(PDUS)
+        self.set_msg_handler(PDUS, self._handle)
+        self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, "gr_ros2_sink")
+        self._finalizer = weakref.finalize(self, self._graph.close)
+        try:
+            LOOP_GUARD.add_sink(self, self._graph, self.config, self.registry)
+            if self.config.use_sim_time:
+                qos = Qos("best_effort", "volatile", _CLOCK_DEPTH)
+                self._clock_subscription = self.middleware.subscribe("/clock", CLOCK_TYPE, qos, self._set_sim_time)
+        except GrRos2Error:
+            self.close()
+            raise
+
+    @property
+    def middleware(self) -> Middleware:
+        """Our participant on the ROS graph."""
+        return self._graph.middleware
+
+    def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
+        """Make the publishers of a sender that is expected, so that subscribers find them before its first message.
+
+        :raises MiddlewareError: when a topic cannot be announced
+        """
+        for topic_id in topic_ids:
+            if (src_id, topic_id) not in self._publishers:
+                self._advertise((src_id, topic_id))
+
+    def start(self) -> bool:
+        quicken_threads()
+        with self._lock:
+            self._running = True
+        self._thread = threading.Thread(target=self._watch_timeouts, name="gr-ros2-sink", daemon=True)
+        self._thread.start()
+        return True
+
+    def stop(self) -> bool:
+        with self._lock:
+            self._running = False
+            self._timer_due.notify_all()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        return True
+
+    def close(self) -> None:
+        """Leave the ROS graph. Idempotent."""
+        if self._clock_subscription is not None:
+            self._clock_subscription.close()
+            self._clock_subscription = None
+        for publisher in list(self._publishers.values()):
+            publisher.close()
+        LOOP_GUARD.remove(self)
+        self._finalizer()
+
+    def stats(self) -> dict[str, Any]:
+        """A snapshot. ``packet_loss_est`` and ``message_loss_est`` are estimates from gaps in numbers."""
+        with self._lock:
+            stats = self._receiver.stats
+            keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
+            return {
+                "packets": stats.packets,
+                "handled": self.handled,
+                "rejected": dict(stats.rejected),
+                "dropped": dict(stats.dropped),
+                **{name: self._counters[name] for name in ("not_a_pair", "not_u8", "publish_failed", "handler_failed")},
+                "repeats": stats.repeats,
+                "packet_loss_est": stats.packet_loss_est,
+                "message_loss_est": stats.message_loss_est,
+                "held_bytes": self._receiver.held_bytes,
+                "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
+                "topics": {self._name(key): self._topic_stats(key) for key in keys},
+                "middleware": dict(self.middleware.counters),
+            }
+
+    def set_reassembly_timeout(self, reassembly_timeout: float) -> None:
+        """s an incomplete message is kept (raises ConfigError out of range)."""
+        with self._lock:
+            self.config = self._receiver.config = replaced(self.config, reassembly_timeout=reassembly_timeout)
+            self._timer_due.notify_all()
+
+    def set_debug(self, debug: bool) -> None:
+        """Readable log of headers, topic ids and entries."""
+        with self._lock:
+            self.config = replaced(self.config, debug=debug)
+        self._log = debug_logger(self._log.name, self.config.debug)
+
+    def _name(self, key: tuple[int, int]) -> str:
+        return self.registry[key[1]].republished(self.config.namespace_format, key[0])
+
+    def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
+        stats = self._receiver.stats
+        window = self._latency.get(key)
+        return {
+            "src_id": key[0],
+            "topic_id": key[1],
+            "delivered": stats.delivered[key],
+            "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
+            "latency_s": None if window is None else window.summary()._asdict(),
+        }
+
+    def _handle(self, pdu: Any) -> None:
+        try:
+            self._take(pdu)
+        except Exception as error:  # noqa: BLE001 - raised here, it would end the block's thread and all reception
+            with self._lock:
+                self._counters["handler_failed"] += 1
+                first = self._counters["handler_failed"] == 1
+            if first:
+                self._log.exception("ros2_sink: %s", error)
+        self.handled += 1
+
+    def _take(self, pdu: Any) -> None:
+        data, problem = packet_of(pdu)
+        if problem:
+            with self._lock:
+                self._counters[problem] += 1
+                first = self._counters[problem] == 1
+            if first:
+                self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
+            return
+        if self._packet_observer is not None:
+            self._packet_observer(data)
+        if self.config.debug:
+            self._log.debug("rx %s", describe_bytes(data, self.config.packet_len, self.registry))
+        with self._lock:
+            events = self._receiver.receive(data, self._clock())
+            if self._timer_idle and self._receiver.next_timeout() is not None:
+                self._timer_due.notify_all()
+        for event in events:
+            self._settle(event)
+
+    def _settle(self, event: ReceiverEvent) -> None:
+        """Do what an event asks for, then tell the observer."""
+        if isinstance(event, Delivered):
+            event = self._publish(event)
+        if self._observer is not None:
+            self._observer(event)
+
+    def _publish(self, event: Delivered) -> ReceiverEvent:
+        key = (event.src_id, event.topic_id)
+        try:
+            publisher = self._publishers.get(key) or self._advertise(key)
+            publisher.publish(event.payload)
+        except MiddlewareError as error:
+            with self._lock:
+                self._counters["publish_failed"] += 1
+                first = self._counters["publish_failed"] == 1
+            if first:
+                self._log.warning("ros2_sink: a message was not published: %s", error)
+            return Lost(event.src_id, event.topic_id, "publish_failed", event.entry_id)
+        if self._stamped[event.topic_id]:
+            self._measure(key, event.payload)
+        return event
+
+    def _advertise(self, key: tuple[int, int]) -> Publisher:
+        topic = self.registry[key[1]]
+        depth = self.config.publisher_depth if topic.options.depth is None else topic.options.depth
+        qos = Qos(topic.options.reliability, "transient_local" if topic.latched else "volatile", depth)
+        publisher = self._publishers[key] = self.middleware.advertise(self._name(key), topic.type_name, qos)
+        return publisher
+
+    def _measure(self, key: tuple[int, int], payload: bytes) -> None:
+        now = self._sim_time if self.config.use_sim_time else time.time()
+        stamp = leading_time(payload)
+        if now is not None and stamp is not None:
+            with self._lock:
+                self._latency.setdefault(key, LatencyWindow()).add(now - stamp)
+
+    def _set_sim_time(self, payload: bytes) -> None:
+        self._sim_time = leading_time(payload)
+
+    def _watch_timeouts(self) -> None:
+        while True:
+            with self._lock:
+                if not self._running:
+                    return
+                events = self._receiver.handle_timeout(self._clock())
+                if not events:
+                    at = self._receiver.next_timeout()
+                    self._timer_idle = at is None
+                    self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                    self._timer_idle = False
+            for event in events:
+                self._settle(event)

@@ -1,0 +1,293 @@
+"""ROS Source: ROS topics in, packets out on message port `pdus` (the paper, section 4.1 and 4.3).
+
+Laws: a thin shell, all behaviour is in ``link.Sender``, which one lock guards; packets are composed just before they
+go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped unnamed.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pmt
+from gnuradio import gr
+
+from gr_ros2.config import SourceConfig
+from gr_ros2.errors import GrRos2Error
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, quicken_threads, read_registry, replaced, settings
+from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
+from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.link import Refused, Sender, SenderEvent
+from gr_ros2.middleware import Middleware, Qos, Subscription
+from gr_ros2.registry import Registry
+
+_BATCH = 16
+"""Packets composed before the lock is given up, so that callbacks do not wait."""
+_JOIN_S = 1.0
+_SHORTEST_WAIT_S = 2e-4
+
+
+class RosSource(gr.basic_block):  # type: ignore[misc]
+    """Subscribes topics of a ROS graph and emits them as packets.
+
+    Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit`
+    in, optional: from its first message on, one packet leaves per message.
+
+    Messages are taken from construction on; packets leave while the flowgraph runs. ``close`` leaves the graph; the
+    end of the process does it too. A middleware handed over open is started and closed by who opened it.
+
+    :param registry: CSV path or Registry
+    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
+    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back
+    :param clock: s, monotonic
+    :param seed: of sequence number and entry ids; None is random
+    :param settings: the fields of :class:`gr_ros2.config.SourceConfig`
+    :raises ConfigError: naming key, value and what is allowed
+    """
+
+    def __init__(
+        self,
+        registry: str | Registry = "",
+        *,
+        middleware: str | Middleware | None = None,
+        observer: Callable[[SenderEvent], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        seed: int | None = None,
+        **values: Any,
+    ) -> None:
+        super().__init__("ros2_source", None, None)
+        self.config = settings(SourceConfig, values, registry, middleware)
+        self._sender = Sender(read_registry(registry), self.config, rng=random.Random(seed), observer=self._observe)
+        self.registry = self._sender.registry
+        self._observer = observer
+        self._clock = clock
+        self._pdus = PduMaker()
+        self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
+        self._lock = threading.Lock()
+        self._work = threading.Condition(self._lock)
+        self._room = threading.Condition(self._lock)
+        self._running = False
+        self._closed = False
+        self._thread: threading.Thread | None = None
+        self._unread = False
+        self._counters: Counter[str] = Counter()
+        self._said: set[tuple[int, str]] = set()
+        self._subscriptions: list[Subscription] = []
+        self.message_port_register_out(PDUS)
+        self.message_port_register_in(CREDIT)
+        self.set_msg_handler(CREDIT, self._credit)
+        chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
+        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen}
+        """Topic of the registry by its absolute name on the ROS graph."""
+        node_name = f"gr_ros2_source_{self._sender.src_id}"
+        self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
+        self._finalizer = weakref.finalize(self, self._graph.close)
+        try:
+            LOOP_GUARD.add_source(self, self._graph, self.subscribed)
+            self._subscribe()
+        except GrRos2Error:
+            self.close()
+            raise
+
+    @property
+    def src_id(self) -> int:
+        """The source id on the wire."""
+        return self._sender.src_id
+
+    @property
+    def middleware(self) -> Middleware:
+        """Our participant on the ROS graph."""
+        return self._graph.middleware
+
+    @property
+    def idle(self) -> bool:
+        """Whether no message is waiting or under way."""
+        with self._lock:
+            return self._sender.idle
+
+    @property
+    def matched(self) -> bool:
+        """Whether every subscription has found a publisher."""
+        return all(subscription.matched() for subscription in self._subscriptions)
+
+    def use_credit(self) -> None:
+        """Let no packet leave before the first `credit` message."""
+        with self._lock:
+            self._sender.use_credit()
+
+    def start(self) -> bool:
+        quicken_threads()
+        self._unread = pmt.is_null(self.message_subscribers(PDUS))
+        if self._unread:
+            self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
+        with self._lock:
+            self._running = True
+        self._thread = threading.Thread(target=self._pump, name=f"gr-ros2-source-{self.src_id}", daemon=True)
+        self._thread.start()
+        return True
+
+    def stop(self) -> bool:
+        with self._lock:
+            self._running = False
+            self._work.notify_all()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        return True
+
+    def close(self) -> None:
+        """Leave the ROS graph. A callback held back by ``backpressure`` returns without submitting. Idempotent."""
+        with self._lock:
+            self._closed = True
+            self._room.notify_all()
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._subscriptions.clear()
+        LOOP_GUARD.remove(self)
+        self._finalizer()
+
+    def stats(self) -> dict[str, Any]:
+        """A snapshot: packets and messages, per topic and in all."""
+        with self._lock:
+            stats = self._sender.stats
+            queued = self._sender.queued()
+            topics = {
+                name: {
+                    "topic_id": topic.topic_id,
+                    "submitted": stats.submitted[topic.topic_id],
+                    "sent": stats.sent[topic.topic_id],
+                    "queued": queued[topic.topic_id],
+                    "refused": {
+                        reason: count for (number, reason), count in stats.refused.items() if number == topic.topic_id
+                    },
+                }
+                for name, topic in self.subscribed.items()
+            }
+            return {
+                "src_id": self.src_id,
+                "packets": stats.packets,
+                "entries": stats.entries,
+                "payload_bytes": stats.payload_bytes,
+                "repeats": stats.repeats,
+                **{name: self._counters[name] for name in ("unread", "held_back_at_close", "pump_failed")},
+                "topics": topics,
+                "middleware": dict(self.middleware.counters),
+            }
+
+    def set_packet_rate(self, packet_rate: float) -> None:
+        """Packets/s offered to the flowgraph, 0 unpaced (raises ConfigError out of range, like all setters)."""
+        self._reconfigure(packet_rate=packet_rate)
+
+    def set_flush_timeout(self, flush_timeout: float) -> None:
+        """s a partly filled packet waits for company."""
+        self._reconfigure(flush_timeout=flush_timeout)
+
+    def set_greedy(self, greedy: bool) -> None:
+        """Several entries of one topic in a packet."""
+        self._reconfigure(greedy=greedy)
+
+    def set_dst_id(self, dst_id: int) -> None:
+        """Destination id, 255 broadcast."""
+        self._reconfigure(dst_id=dst_id)
+
+    def set_hop(self, hop: int) -> None:
+        """Initial hop count."""
+        self._reconfigure(hop=hop)
+
+    def set_queue_depth(self, queue_depth: int) -> None:
+        """Messages waiting per topic, 0 unbounded."""
+        self._reconfigure(queue_depth=queue_depth)
+
+    def set_repeat_s(self, repeat_s: float) -> None:
+        """s between repeats of a transient-local topic, 0 off."""
+        self._reconfigure(repeat_s=repeat_s)
+
+    def set_debug(self, debug: bool) -> None:
+        """Readable log of headers, topic ids and entries."""
+        with self._lock:
+            self.config = replaced(self.config, debug=debug)
+        self._log = debug_logger(self._log.name, self.config.debug)
+
+    def _reconfigure(self, **changes: Any) -> None:
+        with self._lock:
+            self._sender.reconfigure(**changes)
+            self.config = replaced(self.config, **changes)
+            self._work.notify_all()
+            self._room.notify_all()
+
+    def _subscribe(self) -> None:
+        for name, topic in self.subscribed.items():
+            options = topic.options
+            depth = self.config.subscriber_depth if options.depth is None else options.depth
+            qos = Qos(options.reliability, options.durability, depth)
+            callback = partial(self._take, topic.topic_id)
+            self._subscriptions.append(self.middleware.subscribe(name, topic.type_name, qos, callback))
+        if self._graph.owned:
+            self.middleware.start()
+
+    def _take(self, topic_id: int, payload: bytes) -> None:
+        """A message of the ROS graph, in a thread of the middleware."""
+        with self._lock:
+            while self.config.backpressure and not self._closed and not self._sender.room(topic_id):
+                self._room.wait()
+            if self._closed:
+                self._counters["held_back_at_close"] += 1
+                return
+            self._sender.submit(topic_id, payload, self._clock())
+            self._work.notify()
+
+    def _credit(self, _message: Any) -> None:
+        with self._lock:
+            self._sender.credit()
+            self._work.notify()
+
+    def _pump(self) -> None:
+        while self._running:
+            try:
+                self._emit(self._compose())
+            except Exception as error:  # noqa: BLE001 - a failing observer must not end all transmission
+                with self._lock:
+                    self._counters["pump_failed"] += 1
+                    first = self._counters["pump_failed"] == 1
+                if first:
+                    self._log.exception("ros2_source %d: %s", self.src_id, error)
+
+    def _compose(self) -> list[bytes]:
+        """The packets that may go now; if there are none, nothing, after waiting for a reason to look again."""
+        packets: list[bytes] = []
+        with self._lock:
+            while self._running and len(packets) < _BATCH:
+                data = self._sender.next_packet(self._clock())
+                if data is None:
+                    break
+                packets.append(data)
+            if packets:
+                self._room.notify_all()
+            elif self._running:
+                at = self._sender.next_timeout()
+                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+        return packets
+
+    def _emit(self, packets: list[bytes]) -> None:
+        wall = time.time()
+        for data in packets:
+            if self.config.debug:
+                self._log.debug("tx %s", describe_bytes(data, self.config.packet_len, self.registry))
+            self.message_port_pub(PDUS, self._pdus.pdu(data, wall))
+        if self._unread:
+            with self._lock:
+                self._counters["unread"] += len(packets)
+
+    def _observe(self, event: SenderEvent) -> None:
+        if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
+            self._said.add((event.topic_id, event.reason))
+            name = self.registry[event.topic_id].name
+            self._log.warning("topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
+        if self._observer is not None:
+            self._observer(event)

@@ -1,0 +1,75 @@
+"""When packets have the air: one after the other, each for its airtime, and when the next may be asked for.
+
+Laws: a packet starts at the later of its arrival and the end of the one before, and leaves when its airtime is
+over, never earlier; idle time is not saved up; the air is promised ahead (packets here plus credits not yet used)
+for less than ``lead`` before another credit is granted, so with an airtime above ``lead`` one packet is under way
+and at most one more is due. No IO, no clock: ``now`` is seconds, monotonic.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Generic, TypeVar
+
+from gr_ros2.errors import ConfigError
+
+T = TypeVar("T")
+
+LEAD_S = 0.005
+"""s before the air is free that a source needs to compose and hand over the next packet."""
+
+
+class AirtimeClock(Generic[T]):
+    """A queue that lets packets through at the pace of the air.
+
+    :param airtime: s each packet occupies, gap included, above 0
+    :param lead: s ahead of the air being free at which the next packet is asked for
+    :raises ConfigError: for an airtime that is not above 0 or a negative lead
+    """
+
+    def __init__(self, airtime: float, lead: float = LEAD_S) -> None:
+        if not airtime > 0:
+            raise ConfigError(f"airtime = {airtime} s: must be above 0")
+        if not lead >= 0:
+            raise ConfigError(f"lead = {lead} s: must be 0 or more")
+        self._airtime = airtime
+        self._lead = lead
+        self._free = float("-inf")
+        self._queue: deque[tuple[float, T]] = deque()
+        self._unused = 0
+
+    def offer(self, packet: T, now: float) -> None:
+        """A packet arrives; it uses up a credit where one is open."""
+        self._free = max(now, self._free) + self._airtime
+        self._queue.append((self._free, packet))
+        self._unused = max(0, self._unused - 1)
+
+    def due(self, now: float) -> list[T]:
+        """The packets whose airtime is over, in order of arrival."""
+        over: list[T] = []
+        while self._queue and self._queue[0][0] <= now:
+            over.append(self._queue.popleft()[1])
+        return over
+
+    def grants(self, now: float) -> int:
+        """Credits to give out at ``now``; they count as given."""
+        given = 0
+        while self._promised_until(now) <= now + self._lead:
+            self._unused += 1
+            given += 1
+        return given
+
+    def next_timeout(self, now: float) -> float | None:
+        """When ``due`` or ``grants`` next has something, None if only an arrival can change that."""
+        times = [self._queue[0][0]] if self._queue else []
+        if self._free > now:
+            times.append(max(now, self._promised_until(now) - self._lead))
+        return min(times) if times else None
+
+    @property
+    def backlog(self) -> int:
+        """Packets here, the one on the air included."""
+        return len(self._queue)
+
+    def _promised_until(self, now: float) -> float:
+        return max(now, self._free) + self._unused * self._airtime

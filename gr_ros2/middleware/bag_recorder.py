@@ -1,0 +1,183 @@
+"""Writes one ROS 2 bag.
+
+Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk only when ``BACKLOG``
+messages are behind; after an error nothing more is written, what comes is counted, and every call tells the error.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from rosbags.interfaces import Connection, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import Qos as Profile
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.middleware.bag_files import explained
+from gr_ros2.middleware.base import Qos
+from gr_ros2.middleware.type_definitions import definition
+
+BACKLOG = 10_000
+"""Messages that may wait for the disk before publishing blocks."""
+
+_STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_METADATA_VERSION: Final = 8
+"""Of metadata.yaml; 9 spells QoS in a way that Humble's rosbag2 does not read."""
+_FOREVER = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
+
+
+class BagChannel(NamedTuple):
+    """One topic of the file as one publisher offers it."""
+
+    topic: str
+    type_name: str
+    connection: Connection
+
+
+class _Message(NamedTuple):
+    channel: BagChannel
+    stamp_ns: int
+    payload: bytes
+
+
+class _Job(NamedTuple):
+    work: Callable[[], Any]
+    result: Future[Any]
+
+
+class BagRecorder:
+    """A bag being written.
+
+    :param path: folder that does not exist yet
+    :param storage: ``mcap`` or ``sqlite3``
+    :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
+    :param count: ``Middleware.count``
+    :raises ConfigError: no such storage
+    :raises BagError: exists already, or cannot be made
+    """
+
+    def __init__(
+        self, path: Path, storage: str, definitions: Mapping[str, str], count: Callable[[str, str], None]
+    ) -> None:
+        if storage not in _STORAGES:
+            raise ConfigError(f"storage = {storage!r}: {' or '.join(_STORAGES)}")
+        if path.exists():
+            raise BagError(f"bag {path}: exists already; choose another name or remove it")
+        self.path = path
+        self.error: BagError | None = None
+        self._definitions = dict(definitions)
+        self._count = count
+        self._writer = Writer(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
+        # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
+        self._writer.set_custom_data("recorded_by", "gr_ros2")
+        self._channels: dict[tuple[str, Qos], BagChannel] = {}
+        self._closed = False
+        self._lock = threading.Lock()
+        self._queue: queue.Queue[_Message | _Job | None] = queue.Queue(BACKLOG)
+        self._thread = threading.Thread(target=self._run, name=f"bag-{path.name}", daemon=True)
+        self._thread.start()
+        try:
+            self._ask(self._writer.open)
+        except BagError:
+            self._queue.put(None)
+            raise
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def channel(self, topic: str, type_name: str, qos: Qos) -> BagChannel:
+        """Where messages of a topic go; the same for the same arguments.
+
+        :raises ConfigError: the topic is being written with another type
+        """
+        text, digest = definition(type_name, self._definitions)
+        with self._lock:
+            for other in self._channels.values():
+                if other.topic == topic and other.type_name != type_name:
+                    raise ConfigError(f"bag {self.path}: {topic} is {other.type_name}, not {type_name}")
+            if (topic, qos) not in self._channels:
+                connection = self._ask(
+                    lambda: self._writer.add_connection(
+                        topic, type_name, msgdef=text, rihs01=digest, offered_qos_profiles=[_profile(qos)]
+                    )
+                )
+                self._channels[topic, qos] = BagChannel(topic, type_name, connection)
+            return self._channels[topic, qos]
+
+    def write(self, channel: BagChannel, stamp_ns: int, payload: bytes) -> None:
+        """Queue one message.
+
+        :raises MiddlewareError: closed
+        :raises BagError: the file could not be written
+        """
+        if self._closed:
+            raise MiddlewareError(f"publish on {channel.topic}: bag {self.path} is closed")
+        if self.error is not None:
+            raise self.error
+        self._queue.put(_Message(channel, stamp_ns, payload))
+
+    def close(self) -> None:
+        """Write what is queued and the index; the second call does nothing.
+
+        :raises BagError: the file could not be written
+        """
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+        self._queue.put(None)
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _ask(self, work: Callable[[], Any]) -> Any:
+        job = _Job(work, Future())
+        self._queue.put(job)
+        return job.result.result()
+
+    def _run(self) -> None:
+        while (request := self._queue.get()) is not None:
+            if isinstance(request, _Message):
+                self._write(request)
+                continue
+            try:
+                with explained(self.path, "written"):
+                    request.result.set_result(request.work())
+            except BagError as error:
+                request.result.set_exception(error)
+        try:
+            if self._writer.storage is not None:
+                with explained(self.path, "written"):
+                    self._writer.close()
+        except BagError as error:
+            self.error = self.error or error
+
+    def _write(self, message: _Message) -> None:
+        if self.error is None:
+            try:
+                with explained(self.path, "written"):
+                    self._writer.write(message.channel.connection, message.stamp_ns, message.payload)
+                return
+            except BagError as error:
+                self.error = error
+        self._count(f"not_recorded:{message.channel.topic}", str(self.error))
+
+
+def _profile(qos: Qos) -> Profile:
+    return Profile(
+        QosHistory.KEEP_ALL if qos.depth == 0 else QosHistory.KEEP_LAST,
+        qos.depth,
+        QosReliability.BEST_EFFORT if qos.reliability == "best_effort" else QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL if qos.durability == "transient_local" else QosDurability.VOLATILE,
+        deadline=_FOREVER,
+        lifespan=_FOREVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_FOREVER,
+        avoid_ros_namespace_conventions=False,
+    )

@@ -1,0 +1,465 @@
+"""The embedded middleware: a DDS participant of our own, visible to and usable by ROS 2 nodes, without a ROS install.
+
+Laws: one thread per participant receives, discovers and calls back; a subscription whose reliability or durability
+is left open asks only for what all publishers found offer, and changes readers when that changes: the old reader
+stays for ``OVERLAP_S`` while the new one is being found, and what both receive is delivered once.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.adapt import settle
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.cdr_dds import (
+    BATCH,
+    DdsError,
+    DiscoveredEndpoint,
+    EndpointWatch,
+    Entity,
+    RawReader,
+    RawWriter,
+    WaitSet,
+    create_topic,
+    guid,
+)
+from gr_ros2.middleware.dds_domains import POOL
+from gr_ros2.registry import normalize_type
+
+OVERLAP_S = 2.0
+"""s an outdated reader stays beside its successor: Fast DDS may take a second to send to a new reader."""
+JOIN_S = 1.0
+"""s that close() waits for a callback to return."""
+
+_SEEN_PER_PUBLISHER = 256
+_SEEN_PUBLISHERS = 64
+_LEAST = Qos("best_effort", "volatile")
+"""Asks for the least, and so is matched by every publisher."""
+_DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
+_PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
+
+_log = logging.getLogger(__name__)
+
+
+class DdsPublisher(Publisher):
+    """A writer. ``publish`` may be called from any thread."""
+
+    def __init__(self, middleware: DdsMiddleware, topic: str, writer: RawWriter) -> None:
+        self._middleware = middleware
+        self._topic = topic
+        self.writer = writer
+        self._closed = False
+
+    def publish(self, payload: bytes) -> None:
+        """Publish; the payload arrives with up to 3 zeros behind it.
+
+        :raises MiddlewareError: closed, no CDR (less than 5 bytes, unknown encapsulation), or a reliable subscriber
+            did not take unbounded or large messages within a second (counted as ``publish_blocked:/topic``)
+        """
+        if self._closed or self._middleware.closed:
+            raise MiddlewareError(f"publish on {self._topic}: the publisher is closed")
+        try:
+            self.writer.write(payload)
+        except DdsError as error:
+            if error.timeout:
+                explanation = "a reliable subscriber does not keep up; one message was not published"
+                self._middleware.count(f"publish_blocked:{self._topic}", f"{self._topic}: {explanation}")
+                raise MiddlewareError(f"publish on {self._topic}: {explanation}") from error
+            raise MiddlewareError(f"publish on {self._topic}: {error}") from error
+
+    def matched(self) -> int:
+        return 0 if self._closed or self._middleware.closed else self.writer.matched()
+
+    def service(self) -> None:
+        """Called by the thread when the library has something to tell about this writer."""
+        self._middleware.count_incompatible(self._topic, self.writer.incompatible(), ())
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._middleware.forget(self)
+
+
+class DdsSubscription(Subscription):
+    """A reader, and for a while its predecessors."""
+
+    def __init__(
+        self, middleware: DdsMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
+    ) -> None:
+        self.topic = topic
+        self.type_name = type_name
+        self._middleware = middleware
+        self._callback = callback
+        self._wanted = qos
+        self._open_policies = [name for name in ("reliability", "durability") if getattr(qos, name) is None]
+        self._lock = threading.RLock()  # held while readers change or deliver
+        self._closed = False
+        self._qos: Qos | None = None
+        self._reader: RawReader | None = None
+        self._outdated: list[tuple[float, RawReader]] = []
+        self._seen: dict[int, dict[int, Entity]] = {}  # publisher -> stamp -> reader that had it
+
+    @property
+    def qos(self) -> Qos | None:
+        """What the reader currently asks for."""
+        return self._qos
+
+    def adapt(self, offers: Iterable[Qos]) -> None:
+        """Ask for what all publishers offer. Without any, leave things as they are, at first the least."""
+        offers = list(offers)
+        with self._lock:
+            if self._closed or (self._reader and not offers):
+                return
+            qos = settle(self._wanted, offers or [_LEAST])
+            if qos == self._qos:
+                return
+            if self._reader:
+                _log.info("%s: asking for %s, %s from now on", self.topic, qos.reliability, qos.durability)
+                self._outdated.append((time.monotonic() + OVERLAP_S, self._reader))
+            self._reader = self._middleware.make_reader(self, qos)
+            self._qos = qos
+        self._middleware.announce()
+
+    @property
+    def outdated(self) -> float | None:
+        """When the oldest outdated reader is due (time.monotonic()), None without any."""
+        outdated = self._outdated
+        return outdated[0][0] if outdated and not self._closed else None
+
+    def retire(self, now: float) -> None:
+        """Delete readers whose time is over, with what they still hold delivered."""
+        with self._lock:
+            if self._closed:
+                return
+            over = [reader for until, reader in self._outdated if until <= now]
+            self._outdated = [(until, reader) for until, reader in self._outdated if until > now]
+            for reader in over:
+                while self.service(reader) == BATCH:
+                    pass
+                self._middleware.drop_reader(reader)
+            if over:
+                self._middleware.announce()
+
+    def service(self, reader: RawReader) -> int:
+        """Deliver what one reader holds, at most BATCH; returns how many there were."""
+        with self._lock:
+            if self._closed:
+                return 0
+            lost = reader.lost()
+            if lost:
+                self._middleware.count(f"samples_lost:{self.topic}", f"{self.topic}: the DDS lost messages", lost)
+            self._middleware.count_incompatible(self.topic, reader.incompatible(), self._open_policies)
+            samples = reader.take()
+            for payload, source, stamp in samples:
+                if self._open_policies and self._repeated(source, stamp, reader.entity):
+                    continue
+                if self._closed:
+                    break
+                self._middleware.deliver(self.topic, self._callback, payload)
+            return len(samples)
+
+    def _repeated(self, source: int, stamp: int, reader: Entity) -> bool:
+        """Whether another reader of this subscription had that message."""
+        stamps = self._seen.get(source)
+        if stamps is None:
+            if len(self._seen) >= _SEEN_PUBLISHERS:
+                del self._seen[next(iter(self._seen))]
+            stamps = self._seen[source] = {}
+        if stamps.setdefault(stamp, reader) != reader:
+            return True
+        if len(stamps) > _SEEN_PER_PUBLISHER:
+            del stamps[next(iter(stamps))]
+        return False
+
+    def matched(self) -> int:
+        reader = self._reader
+        return 0 if self._closed or self._middleware.closed or reader is None else reader.matched()
+
+    def readers(self) -> list[RawReader]:
+        return [*([self._reader] if self._reader else []), *(reader for _, reader in self._outdated)]
+
+    def mute(self) -> None:
+        """No callback begins from now on."""
+        self._closed = True
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self.mute()
+        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
+        if self._lock.acquire(timeout=JOIN_S):
+            self._lock.release()
+        self._middleware.forget(self)
+
+
+class DdsMiddleware(Middleware):
+    """A participant.
+
+    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
+    :param node_name: as ``ros2 node list`` shows it
+    :param namespace: of the node
+    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY
+    :raises ConfigError: a name, number or environment variable is malformed, or the domain is open otherwise
+    :raises MiddlewareError: the domain cannot be joined
+    """
+
+    name = "dds"
+
+    def __init__(
+        self,
+        *,
+        domain_id: int = -1,
+        node_name: str = "gr_ros2",
+        namespace: str = "/",
+        localhost_only: bool | None = None,
+    ) -> None:
+        super().__init__()
+        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.localhost_only = ros_graph.localhost_only() if localhost_only is None else localhost_only
+        self._node = ros_graph.check_node(node_name, namespace)
+        self._gid_bytes = ros_graph.gid_size(os.environ)
+        self._closed = False
+        self._closing = threading.Lock()
+        self._lock = threading.Lock()  # the tables below; held for moments only, never while calling back
+        self._announcing = threading.Lock()
+        self._topics: dict[tuple[str, str], Entity] = {}
+        self._services: dict[int, Callable[[], object]] = {}
+        self._numbers: dict[Entity, int] = {}
+        self._next_number = _FIRST_ENDPOINT
+        self._subscriptions: list[DdsSubscription] = []
+        self._advertised: list[DdsPublisher] = []
+        self._found: dict[int, dict[bytes, DiscoveredEndpoint]] = {_PUBLICATIONS: {}, _SUBSCRIPTIONS: {}}
+        self._participant = POOL.join(self.domain_id, self.localhost_only, ros_graph.PARTICIPANT_USER_DATA)
+        try:
+            self._guid = guid(self._participant)
+            self._waitset = WaitSet(self._participant)
+            self._watches = {
+                number: EndpointWatch(self._participant, publishers=number == _PUBLICATIONS)
+                for number in (_PUBLICATIONS, _SUBSCRIPTIONS)
+            }
+            for number, watch in self._watches.items():
+                self._waitset.attach(watch.condition, number)
+            topic = create_topic(self._participant, ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
+            self._discovery = RawWriter(self._participant, topic, _DISCOVERY_QOS)
+            self.announce()
+        except BaseException:
+            POOL.leave(self.domain_id, self._participant)
+            raise
+        self._thread = threading.Thread(target=self._run, name=f"dds-{self.domain_id}-{node_name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> DdsSubscription:
+        topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
+        self._check_open(f"subscribe {topic}")
+        subscription = DdsSubscription(self, topic, type_name, qos, callback)
+        with self._lock:
+            self._subscriptions.append(subscription)
+        try:
+            subscription.adapt(self._offers(topic, type_name))
+        except MiddlewareError:
+            with self._lock:
+                self._subscriptions.remove(subscription)
+            raise
+        return subscription
+
+    def advertise(self, topic: str, type_name: str, qos: Qos) -> DdsPublisher:
+        topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
+        self._check_open(f"advertise {topic}")
+        qos = Qos(qos.reliability or "reliable", qos.durability or "volatile", qos.depth)
+        writer = RawWriter(self._participant, self._topic(topic, type_name), qos, self._user_data(type_name))
+        publisher = DdsPublisher(self, topic, writer)
+        with self._lock:
+            self._advertised.append(publisher)
+        self._attach(writer.entity, (writer.entity,), publisher.service)
+        self.announce()
+        return publisher
+
+    def discover(self) -> list[TopicInfo]:
+        """The topics seen so far; a fresh participant needs a moment (tenths of a second) to see any."""
+        rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
+        with self._lock:
+            found = [(column, e) for column, n in enumerate(self._found) for e in self._found[n].values()]
+        for column, endpoint in found:
+            topic = ros_graph.ros_topic(endpoint.topic)
+            if topic is not None and endpoint.participant != self._guid:
+                rows.setdefault((topic, ros_graph.ros_type(endpoint.type_name)), ([], []))[column].append(endpoint.qos)
+        return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
+
+    def close(self) -> None:
+        worker = threading.current_thread() is self._thread
+        if worker and self._closed:
+            return
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
+            with self._lock:
+                subscriptions = list(self._subscriptions)
+            for subscription in subscriptions:
+                subscription.mute()
+            self._waitset.wake()
+            if not worker:
+                self._thread.join(JOIN_S)
+                if self._thread.is_alive():
+                    _log.warning("domain %d: a callback has not returned; closing without it", self.domain_id)
+            POOL.leave(self.domain_id, self._participant)
+
+    # What publishers and subscriptions ask of their participant.
+
+    def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:
+        topic = self._topic(subscription.topic, subscription.type_name)
+        reader = RawReader(self._participant, topic, qos, self._user_data(subscription.type_name))
+        self._attach(reader.entity, (reader.entity, reader.condition), partial(subscription.service, reader))
+        return reader
+
+    def drop_reader(self, reader: RawReader) -> None:
+        self._detach(reader.entity)
+        reader.delete()
+
+    def forget(self, endpoint: DdsSubscription | DdsPublisher) -> None:
+        if self._closed:
+            return
+        if isinstance(endpoint, DdsSubscription):
+            with self._lock:
+                self._subscriptions.remove(endpoint)
+            for reader in endpoint.readers():
+                self.drop_reader(reader)
+        else:
+            with self._lock:
+                self._advertised.remove(endpoint)
+            self._detach(endpoint.writer.entity)
+            endpoint.writer.delete()
+        self.announce()
+
+    def count_incompatible(self, topic: str, refused: tuple[int, str], ignored: Iterable[str]) -> None:
+        amount, policy = refused
+        if amount > 0 and policy not in ignored:
+            text = f"{topic}: another endpoint does not match, its {policy} does not fit ours"
+            self.count(f"incompatible_qos:{topic}:{policy}", text, amount)
+
+    def announce(self) -> None:
+        """Tell the graph which endpoints belong to our node."""
+        with self._announcing:
+            with self._lock:
+                readers = [reader.guid for subscription in self._subscriptions for reader in subscription.readers()]
+                writers = [publisher.writer.guid for publisher in self._advertised]
+            info = ros_graph.participant_entities_info(
+                self._guid, *self._node, readers, writers, gid_bytes=self._gid_bytes
+            )
+            try:
+                self._discovery.write(info)
+            except DdsError:
+                if not self._closed:
+                    raise
+
+    # The thread.
+
+    def _run(self) -> None:
+        deadline: float | None = None
+        while not self._closed:
+            try:
+                triggered = self._waitset.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
+            except DdsError as error:
+                if not self._closed:
+                    _log.error("domain %d: no message will be received any more: %s", self.domain_id, error)
+                return
+            for number in triggered:
+                self._guarded(partial(self._service, number))
+            with self._lock:
+                outdated = [subscription for subscription in self._subscriptions if subscription.outdated]
+            deadline = None
+            for subscription in outdated:
+                self._guarded(partial(subscription.retire, time.monotonic()))
+                if until := subscription.outdated:
+                    deadline = until if deadline is None else min(deadline, until)
+
+    def _service(self, number: int) -> None:
+        if number in self._watches:
+            self._graph_changed(number)
+            return
+        with self._lock:
+            service = self._services.get(number)
+        if service is not None:
+            service()
+
+    def _guarded(self, step: Callable[[], object]) -> None:
+        """An endpoint that another thread closed between trigger and service fails here: that is its normal end."""
+        try:
+            step()
+        except DdsError as error:
+            if not self._closed and not error.gone:
+                self.count("dds_failed", str(error))
+
+    def _graph_changed(self, number: int) -> None:
+        found, changed = self._found[number], set()
+        while changes := self._watches[number].take():
+            for key, endpoint in changes:
+                with self._lock:
+                    before = found.pop(key, None)
+                    if endpoint is not None:
+                        found[key] = endpoint
+                changed |= {e.topic for e in (before, endpoint) if e is not None}
+        if number == _PUBLICATIONS:
+            with self._lock:
+                affected = [s for s in self._subscriptions if ros_graph.dds_topic(s.topic) in changed]
+            for subscription in affected:
+                subscription.adapt(self._offers(subscription.topic, subscription.type_name))
+
+    def _offers(self, topic: str, type_name: str) -> list[Qos]:
+        """What the publishers of a topic offer; those of another type are counted and left out."""
+        with self._lock:
+            all_of_topic = [e for e in self._found[_PUBLICATIONS].values() if e.topic == ros_graph.dds_topic(topic)]
+        ours = ros_graph.dds_type(type_name)
+        for other in {e.type_name for e in all_of_topic} - {ours}:
+            if f"incompatible_type:{topic}" not in self.counters:
+                text = f"{topic}: a publisher sends {ros_graph.ros_type(other)}, subscribed is {type_name}"
+                self.count(f"incompatible_type:{topic}", text)
+        return [e.qos for e in all_of_topic if e.type_name == ours]
+
+    # Bookkeeping.
+
+    def _check_open(self, what: str) -> None:
+        if self._closed:
+            raise MiddlewareError(f"{what}: the middleware is closed")
+
+    def _topic(self, topic: str, type_name: str) -> Entity:
+        with self._lock:
+            entity = self._topics.get((topic, type_name))
+            if entity is None:
+                names = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
+                entity = self._topics[topic, type_name] = create_topic(self._participant, *names)
+            return entity
+
+    def _user_data(self, type_name: str) -> bytes:
+        """Since Iron an endpoint tells the hash of its type (REP-2016); where it is not known, nothing is said."""
+        if self._gid_bytes == 24:
+            return b""
+        from gr_ros2.middleware.type_definitions import type_hash
+
+        known = type_hash(type_name)
+        return f"typehash={known};".encode() if known else b""
+
+    def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
+        with self._lock:
+            number = self._next_number
+            self._next_number += 1
+            self._services[number] = service
+            self._numbers[key] = number
+        for entity in entities:
+            self._waitset.attach(entity, number)
+        self._waitset.wake()
+
+    def _detach(self, key: Entity) -> None:
+        with self._lock:
+            self._services.pop(self._numbers.pop(key, 0), None)

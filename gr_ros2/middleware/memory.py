@@ -1,0 +1,267 @@
+"""A ROS graph inside one process: what tests use where a DDS would only add noise.
+
+Laws: participants with the same domain id share a graph and behave as DDS has it: history depth, late joiners of
+transient-local publishers, requested against offered QoS; each participant calls back from one thread of its own,
+in the order of publication. Unlike a DDS it counts every message that a subscription's depth pushes out.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from weakref import WeakValueDictionary
+
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.registry import normalize_type
+
+JOIN_S = 1.0
+"""s that close() waits for a callback to return."""
+
+_log = logging.getLogger(__name__)
+
+
+def refused_policies(offered: Qos, requested: Qos) -> list[str]:
+    """Policies in which an offer falls short of a request; what a request leaves open adapts and never falls short."""
+    refused = []
+    if offered.reliability == "best_effort" and requested.reliability == "reliable":
+        refused.append("reliability")
+    if offered.durability == "volatile" and requested.durability == "transient_local":
+        refused.append("durability")
+    return refused
+
+
+class _Graph:
+    """What the participants of one domain share. Every method is called with ``lock`` held."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.publishers: list[MemoryPublisher] = []
+        self.subscriptions: list[MemorySubscription] = []
+
+    def endpoints(self) -> list[MemoryPublisher | MemorySubscription]:
+        return [*self.publishers, *self.subscriptions]
+
+    def joined(self, publisher: MemoryPublisher, subscription: MemorySubscription) -> None:
+        """A publisher and a subscription see each other for the first time."""
+        if publisher.topic != subscription.topic:
+            return
+        if publisher.type_name != subscription.type_name:
+            text = f"{publisher.topic}: published as {publisher.type_name}, subscribed as {subscription.type_name}"
+            for middleware in {publisher.middleware, subscription.middleware}:
+                middleware.count(f"incompatible_type:{publisher.topic}", text)
+            return
+        refused = refused_policies(publisher.qos, subscription.qos)
+        for policy in refused:
+            text = f"{publisher.topic}: the {policy} of publisher and subscription do not fit"
+            for middleware in {publisher.middleware, subscription.middleware}:
+                middleware.count(f"incompatible_qos:{publisher.topic}:{policy}", text)
+        if not refused:
+            publisher.matches.append(subscription)
+            subscription.matches[publisher] = publisher.published
+
+    def left(self, endpoint: MemoryPublisher | MemorySubscription) -> None:
+        if isinstance(endpoint, MemoryPublisher):
+            self.publishers.remove(endpoint)
+            for subscription in endpoint.matches:
+                subscription.matches.pop(endpoint, None)
+                self.replay(subscription)
+        else:
+            self.subscriptions.remove(endpoint)
+            for publisher in endpoint.matches:
+                publisher.matches.remove(endpoint)
+        endpoint.matches.clear()
+
+    def replay(self, subscription: MemorySubscription) -> None:
+        """Hand over what was published before the match, where transient-local holds for all publishers."""
+        wanted = subscription.qos.durability
+        latched = all(publisher.qos.durability == "transient_local" for publisher in subscription.matches)
+        if wanted == "transient_local" or (wanted is None and latched):
+            for publisher, matched_at in subscription.matches.items():
+                for serial, payload in publisher.history:
+                    if serial < matched_at:
+                        subscription.push(payload)
+                subscription.matches[publisher] = 0
+
+
+_graphs: WeakValueDictionary[int, _Graph] = WeakValueDictionary()
+"""Graphs in use; one that no participant refers to any more is gone."""
+_graphs_lock = threading.Lock()
+
+
+class MemoryPublisher(Publisher):
+    """See :class:`gr_ros2.middleware.base.Publisher`."""
+
+    def __init__(self, middleware: MemoryMiddleware, topic: str, type_name: str, qos: Qos) -> None:
+        self.middleware = middleware
+        self.topic = topic
+        self.type_name = type_name
+        self.qos = qos
+        self.matches: list[MemorySubscription] = []
+        self.published = 0
+        latched = qos.durability == "transient_local"
+        self.history: deque[tuple[int, bytes]] = deque(maxlen=(qos.depth or None) if latched else 0)
+        self.closed = False
+
+    def publish(self, payload: bytes) -> None:
+        """Hand a message to every matched subscription; never blocks.
+
+        :raises MiddlewareError: once closed
+        """
+        payload = bytes(payload)
+        with self.middleware.graph.lock:
+            if self.closed:
+                raise MiddlewareError(f"publish on {self.topic}: the publisher is closed")
+            self.history.append((self.published, payload))
+            self.published += 1
+            for subscription in self.matches:
+                subscription.push(payload)
+
+    def matched(self) -> int:
+        return len(self.matches)
+
+    def close(self) -> None:
+        with self.middleware.graph.lock:
+            if not self.closed:
+                self.closed = True
+                self.middleware.graph.left(self)
+
+
+class MemorySubscription(Subscription):
+    """See :class:`gr_ros2.middleware.base.Subscription`."""
+
+    def __init__(
+        self, middleware: MemoryMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
+    ) -> None:
+        self.middleware = middleware
+        self.topic = topic
+        self.type_name = type_name
+        self.qos = qos
+        self.callback = callback
+        self.matches: dict[MemoryPublisher, int] = {}  # messages published before that are yet to be replayed
+        self.waiting: deque[bytes] = deque()
+        self.closed = False
+        self.calling = threading.RLock()  # held while calling back
+
+    def push(self, payload: bytes) -> None:
+        """Queue a message, the oldest going where the depth is reached. Called with the graph's lock held."""
+        if self.closed:
+            return
+        if self.qos.depth and len(self.waiting) >= self.qos.depth:
+            self.waiting.popleft()
+            self.waiting.append(payload)
+            text = f"{self.topic}: depth {self.qos.depth} is full, the oldest message goes"
+            self.middleware.count(f"samples_lost:{self.topic}", text)
+        else:
+            self.waiting.append(payload)
+            self.middleware.wake(self)
+
+    def matched(self) -> int:
+        return len(self.matches)
+
+    def close(self) -> None:
+        with self.middleware.graph.lock:
+            if self.closed:
+                return
+            self.closed = True
+            self.waiting.clear()
+            self.middleware.graph.left(self)
+        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
+        if self.calling.acquire(timeout=JOIN_S):
+            self.calling.release()
+
+
+class MemoryMiddleware(Middleware):
+    """A participant of a graph in this process.
+
+    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID; participants of equal domain share a graph
+    :param node_name: checked, otherwise unused; likewise the namespace
+    :raises ConfigError: a name or number is malformed
+    """
+
+    name = "memory"
+
+    def __init__(self, *, domain_id: int = 0, node_name: str = "gr_ros2", namespace: str = "/") -> None:
+        super().__init__()
+        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        ros_graph.check_node(node_name, namespace)
+        with _graphs_lock:
+            self.graph = _graphs.setdefault(self.domain_id, _Graph())
+        self.closed = False
+        self._pending: deque[MemorySubscription] = deque()  # one token per queued message
+        self._wake = threading.Condition(self.graph.lock)
+        self._thread = threading.Thread(target=self._run, name=f"memory-{self.domain_id}-{node_name}", daemon=True)
+        self._thread.start()
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> MemorySubscription:
+        topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
+        subscription = MemorySubscription(self, topic, type_name, qos, callback)
+        with self.graph.lock:
+            self._check_open(f"subscribe {topic}")
+            self.graph.subscriptions.append(subscription)
+            for publisher in self.graph.publishers:
+                self.graph.joined(publisher, subscription)
+            self.graph.replay(subscription)
+        return subscription
+
+    def advertise(self, topic: str, type_name: str, qos: Qos) -> MemoryPublisher:
+        topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
+        qos = Qos(qos.reliability or "reliable", qos.durability or "volatile", qos.depth)
+        publisher = MemoryPublisher(self, topic, type_name, qos)
+        with self.graph.lock:
+            self._check_open(f"advertise {topic}")
+            self.graph.publishers.append(publisher)
+            for subscription in self.graph.subscriptions:
+                self.graph.joined(publisher, subscription)
+                self.graph.replay(subscription)
+        return publisher
+
+    def discover(self) -> list[TopicInfo]:
+        rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
+        with self.graph.lock:
+            for endpoint in self.graph.endpoints():
+                if endpoint.middleware is not self:
+                    row = rows.setdefault((endpoint.topic, endpoint.type_name), ([], []))
+                    row[isinstance(endpoint, MemorySubscription)].append(endpoint.qos)
+        return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
+
+    def wake(self, subscription: MemorySubscription) -> None:
+        """One more message waits. Called with the graph's lock held."""
+        self._pending.append(subscription)
+        self._wake.notify()
+
+    def close(self) -> None:
+        with self.graph.lock:
+            if self.closed:
+                return
+            self.closed = True
+            for endpoint in self.graph.endpoints():
+                if endpoint.middleware is self:
+                    endpoint.closed = True
+                    self.graph.left(endpoint)
+            self._wake.notify_all()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_S)
+            if self._thread.is_alive():
+                _log.warning("memory domain %d: a callback has not returned; closing without it", self.domain_id)
+
+    def _run(self) -> None:
+        while True:
+            with self.graph.lock:
+                while not self._pending and not self.closed:
+                    self._wake.wait()
+                if self.closed:
+                    return
+                subscription = self._pending.popleft()
+                if not subscription.waiting:
+                    continue
+                payload = subscription.waiting.popleft()
+            with subscription.calling:
+                if not subscription.closed:
+                    self.deliver(subscription.topic, subscription.callback, payload)
+
+    def _check_open(self, what: str) -> None:
+        if self.closed:
+            raise MiddlewareError(f"{what}: the middleware is closed")

@@ -1,0 +1,460 @@
+"""A ROS graph through rclpy, for people with a sourced ROS 2 (Humble or later).
+
+Laws: this is the only module of the package that imports rclpy; context, node and executor are our own, so a host
+application keeps its own node, arguments and signal handlers; endpoints are destroyed, and callbacks run, in the
+executor's thread only, hence a subscription is silent once ``close`` has returned; no exception of a callback or of
+rclpy ends that thread, each is counted and its first logged.
+
+Adaptive subscriptions follow adapt.Adaptation; samples under way while one joins anew may be missed.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle, NameValidationException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+
+from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.middleware.adapt import Adaptation, compatible
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
+from gr_ros2.registry import normalize_type
+
+try:  # its name since Iron
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
+except ImportError:  # Humble
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
+
+_log = logging.getLogger(__name__)
+
+ADAPT_PERIOD_S = 0.1
+"""How often adaptive subscriptions look for publishers; rclpy has no callback for changes of the graph."""
+
+JOIN_S = 1.0
+"""s that close() waits for a callback to return."""
+
+ENCAPSULATION = 4
+"""Bytes of the header every serialized message starts with."""
+
+
+def message_class(type_name: str) -> Any:
+    """The Python class of ``package/msg/Type`` (or ``package/Type``), its C type support loaded.
+
+    :raises ConfigError: malformed, or not in the sourced workspaces
+    """
+    package, _, name = normalize_type(type_name).partition("/msg/")
+    try:
+        kind = getattr(import_module(f"{package}.msg"), name)
+        if kind.__class__._TYPE_SUPPORT is None:
+            kind.__class__.__import_type_support__()
+    # The import runs generated code and loads C libraries, which fail in more ways than ImportError.
+    except Exception as error:
+        raise ConfigError(
+            f"type {package}/msg/{name} cannot be imported ({error}); source the workspace that has it "
+            f"(. install/setup.bash) before starting, or use middleware 'dds', which needs no definitions"
+        ) from error
+    return kind
+
+
+def _to_profile(qos: Qos) -> QoSProfile:
+    """A publisher's None are the defaults of base.Qos; a subscription is settled before."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST if qos.depth else HistoryPolicy.KEEP_ALL,
+        depth=qos.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT if qos.reliability == "best_effort" else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if qos.durability == "transient_local"
+        else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _policies(profile: Any) -> tuple[object, object]:
+    return profile.reliability, profile.durability
+
+
+def _from_profile(profile: Any) -> Qos:
+    """Discovery of some RMWs does not carry the history; its depth is then the default."""
+    if profile.history == HistoryPolicy.KEEP_LAST:
+        depth = int(profile.depth)
+    else:
+        depth = 0 if profile.history == HistoryPolicy.KEEP_ALL else Qos().depth
+    return Qos(
+        "reliable" if profile.reliability == ReliabilityPolicy.RELIABLE else "best_effort",
+        "transient_local" if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL else "volatile",
+        depth,
+    )
+
+
+def _policy_name(event: Any) -> str:
+    """``reliability``, ``durability``, … of an incompatible-QoS event."""
+    try:
+        return str(QoSPolicyKind(event.last_policy_kind).name).lower()
+    except ValueError:
+        return str(event.last_policy_kind)
+
+
+class RclpyMiddleware(Middleware):
+    """One ROS 2 node in a context of its own, spinning in a thread of its own.
+
+    ``counters`` also has ``executor_failed``: errors of rclpy itself, a message it could not take, say.
+
+    :param domain_id: 0..232; -1 takes ROS_DOMAIN_ID
+    :param node_name: base name of the node
+    :param namespace: its namespace
+    :raises ConfigError: for a domain id or name ROS does not allow
+    :raises MiddlewareError: when ROS cannot start, e.g. no RMW installed
+    """
+
+    name = "rclpy"
+
+    def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
+        super().__init__()
+        domain_id = resolve_domain_id(domain_id)
+        node_name, namespace = check_node(node_name, namespace)
+        self._context = Context()
+        try:
+            # Context.init, not rclpy.init: it leaves signals alone; args=[]: or it would parse our own command line.
+            self._context.init(args=[], domain_id=domain_id)
+            self._node = Node(
+                node_name,
+                context=self._context,
+                namespace=namespace,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
+        except (RuntimeError, NameValidationException) as error:
+            self._context.try_shutdown()
+            raise MiddlewareError(f"rclpy cannot start a node on domain {domain_id}: {error}") from error
+        self._lock = threading.Lock()
+        self._open = True  # guarded by _lock: the node and its guard condition exist
+        self._work: deque[tuple[Callable[[], None], threading.Event]] = deque()
+        self._subscriptions: list[_RclpySubscription] = []
+        self._closing = threading.Event()
+        self._failed = False
+        # Reentrant, or an error of rclpy while it takes a message would block the whole group for good.
+        self._group = ReentrantCallbackGroup()
+        self._wake = self._node.create_guard_condition(self._tend, callback_group=self._group)
+        # Steady, so that a paused simulation clock does not stop it.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._node.create_timer(ADAPT_PERIOD_S, self._tend, callback_group=self._group, clock=steady)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._spin, name="gr_ros2-rclpy", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)  # a daemon thread inside rcl must not outlive the interpreter
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
+        """See base.
+
+        :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
+        """
+        self._check_open()
+        subscription = _RclpySubscription(self, topic, type_name, qos, callback)
+        subscription.adapt()
+        self._subscriptions.append(subscription)
+        return subscription
+
+    def advertise(self, topic: str, type_name: str, qos: Qos) -> Publisher:
+        """See base.
+
+        :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
+        """
+        self._check_open()
+        return _RclpyPublisher(self, topic, type_name, qos)
+
+    def discover(self) -> list[TopicInfo]:
+        """See base. One row per type where a topic has several; depths only where the RMW announces them."""
+        self._check_open()
+        node = self._node
+        found = []
+        with _translated("the graph cannot be read"):
+            for topic, type_names in node.get_topic_names_and_types():
+                publishers = self._foreign(node.get_publishers_info_by_topic(topic), topic, node.publishers)
+                subscribers = self._foreign(node.get_subscriptions_info_by_topic(topic), topic, node.subscriptions)
+                for type_name in type_names:
+                    offers = tuple(_from_profile(i.qos_profile) for i in publishers if i.topic_type == type_name)
+                    requests = tuple(_from_profile(i.qos_profile) for i in subscribers if i.topic_type == type_name)
+                    if offers or requests:
+                        found.append(TopicInfo(topic, type_name, offers, requests))
+        return sorted(found, key=lambda info: (info.topic, info.type_name))
+
+    def close(self) -> None:
+        """Leave the graph; waits ``JOIN_S`` for a callback that is running, unless called from it."""
+        atexit.unregister(self.close)
+        self._closing.set()
+        self._trigger()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_S)
+            if self._thread.is_alive():
+                _log.warning("rclpy: a callback has not returned; closing without it")
+
+    # For our endpoints
+
+    @property
+    def closing(self) -> bool:
+        """No callback begins from now on."""
+        return self._closing.is_set()
+
+    def publishers_of(self, topic: str, type_name: str) -> dict[bytes, Qos]:
+        """What the publishers of a topic and type offer, our own included, by their ids; others are counted."""
+        with _translated(f"publishers of {topic} cannot be read"):
+            infos = self._node.get_publishers_info_by_topic(topic)
+        strangers = {i.topic_type for i in infos} - {type_name}
+        if strangers and f"incompatible_type:{topic}" not in self.counters:
+            text = f"{topic}: a publisher sends {', '.join(sorted(strangers))}, subscribed is {type_name}"
+            self.count(f"incompatible_type:{topic}", text)
+        return {bytes(i.endpoint_gid): _from_profile(i.qos_profile) for i in infos if i.topic_type == type_name}
+
+    def create(self, kind: str, events: type, handlers: dict[str, Callable[[Any], None]], **arguments: Any) -> Any:
+        """Make an endpoint with the event callbacks that this RMW supports."""
+        make = getattr(self._node, f"create_{kind}")
+        names = list(handlers)
+        while True:
+            supported = events(use_default_callbacks=False, **{name: handlers[name] for name in names})
+            try:
+                return make(event_callbacks=supported, callback_group=self._group, **arguments)
+            except UnsupportedEventTypeError:
+                if not names:
+                    raise
+                _log.info("%s: this RMW does not report %s", arguments["topic"], names.pop())
+            except (RuntimeError, NameValidationException) as error:
+                raise MiddlewareError(f"{kind} of {arguments['topic']} failed: {error}") from error
+
+    def destroy(self, kind: str, endpoint: Any) -> None:
+        """Destroy an endpoint, in the executor's thread."""
+        with contextlib.suppress(InvalidHandle):  # gone with its node already
+            getattr(self._node, f"destroy_{kind}")(endpoint)
+
+    def in_executor(self, work: Callable[[], None]) -> None:
+        """Run it in the executor's thread, waiting ``JOIN_S`` at most; once closed all is destroyed and it is not run."""
+        if threading.current_thread() is self._thread:
+            work()
+            return
+        done = threading.Event()
+        self._work.append((work, done))
+        if self._trigger():
+            done.wait(JOIN_S)
+
+    def forget(self, subscription: _RclpySubscription) -> None:
+        """No longer adapt it."""
+        with contextlib.suppress(ValueError):
+            self._subscriptions.remove(subscription)
+
+    # Internals
+
+    def _check_open(self) -> None:
+        if not self._open or self._closing.is_set():
+            raise MiddlewareError("rclpy: the middleware is closed")
+
+    def _trigger(self) -> bool:
+        """Wake the executor; False when it has ended."""
+        with self._lock:
+            if self._open:
+                self._wake.trigger()
+            return self._open
+
+    def _foreign(self, infos: Iterable[Any], topic: str, own_endpoints: Iterable[Any]) -> list[Any]:
+        """Without our own: of the endpoints under our node's name, as many as we have, for another node may bear it."""
+        name = self._node.get_name(), self._node.get_namespace()
+        others = list(infos)
+        for endpoint in own_endpoints:
+            if endpoint.topic != topic:
+                continue
+            own = (*name, *_policies(endpoint.qos_profile))
+            for info in others:
+                if (info.node_name, info.node_namespace, *_policies(info.qos_profile)) == own:
+                    others.remove(info)
+                    break
+        return others
+
+    def _tend(self) -> None:
+        """In the executor's thread: work that was handed in, then adaptive subscriptions."""
+        while self._work:
+            work, done = self._work.popleft()
+            try:
+                work()
+            finally:
+                done.set()
+        failed, self._failed = self._failed, False
+        for subscription in tuple(self._subscriptions):
+            if failed:
+                subscription.revive()
+            subscription.adapt()
+
+    def _spin(self) -> None:
+        try:
+            while not self._closing.is_set():
+                try:
+                    self._executor.spin_once()
+                except ExternalShutdownException:
+                    _log.warning("rclpy: the context was shut down from outside; the middleware closes")
+                    break
+                except Exception as error:  # noqa: BLE001 - the thread must live on
+                    self.count("executor_failed", f"rclpy failed in the executor: {type(error).__name__}: {error}")
+                    _log.debug("in the executor", exc_info=True)
+                    self._failed = True
+                    self._closing.wait(0.01)  # a lasting error must not take the whole core
+        finally:
+            self._tear_down()
+
+    def _tear_down(self) -> None:
+        with self._lock:
+            self._open = False
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        while self._work:
+            self._work.popleft()[1].set()
+
+
+class _RclpySubscription(Subscription):
+    """Made, adapted and destroyed in the executor's thread once ``subscribe`` has returned."""
+
+    def __init__(
+        self, middleware: RclpyMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
+    ) -> None:
+        self._middleware = middleware
+        self._topic = check_topic(topic)
+        self._type_name = normalize_type(type_name)
+        self._class = message_class(type_name)
+        self._callback = callback
+        self._adaptation = Adaptation(qos)
+        self._endpoint: Any = None
+        self._closed = False
+        self._lock = threading.RLock()  # the first join is in the caller's thread, with the executor's already at work
+
+    def adapt(self) -> None:
+        """Join the graph, or join it anew, where the publishers call for it."""
+        with self._lock:
+            if not self._closed:
+                qos = self._adaptation.consider(self._middleware.publishers_of(self._topic, self._type_name))
+                if qos is not None:
+                    _log.info("%s: joining as %s, %s", self._topic, qos.reliability, qos.durability)
+                    self._join()
+
+    def revive(self) -> None:
+        """Join anew where rclpy failed to take a message (an empty one, say): it never listens there again."""
+        if self._endpoint is not None and not self._closed and getattr(self._endpoint, "_executor_event", True):
+            self._join()
+
+    def _join(self) -> None:
+        self._leave()
+        assert self._adaptation.settled is not None
+        self._endpoint = self._middleware.create(
+            "subscription",
+            SubscriptionEventCallbacks,
+            {"incompatible_qos": self._on_incompatible, "message_lost": self._on_lost},
+            msg_type=self._class,
+            topic=self._topic,
+            callback=self._deliver,
+            qos_profile=_to_profile(self._adaptation.settled),
+            raw=True,
+        )
+
+    def _leave(self) -> None:
+        endpoint, self._endpoint = self._endpoint, None
+        if endpoint is not None:
+            self._middleware.destroy("subscription", endpoint)
+
+    def matched(self) -> int:
+        endpoint, qos = self._endpoint, self._adaptation.settled
+        if endpoint is None or qos is None or self._closed or self._middleware.closing:
+            return 0
+        with _translated(f"{self._topic} is closed"):
+            if hasattr(endpoint, "get_publisher_count"):  # since Jazzy
+                return int(endpoint.get_publisher_count())
+            offers = self._middleware.publishers_of(self._topic, self._type_name).values()
+            return sum(compatible(offer, qos) for offer in offers)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._middleware.forget(self)
+            self._middleware.in_executor(self._leave)
+
+    def _deliver(self, payload: bytes) -> None:
+        if not self._closed and not self._middleware.closing:
+            self._middleware.deliver(self._topic, self._callback, payload)
+
+    def _on_incompatible(self, event: Any) -> None:
+        policy = _policy_name(event)
+        if self._adaptation.adapts(policy):  # about to be put right
+            self.adapt()
+            return
+        self._middleware.count(
+            f"incompatible_qos:{self._topic}:{policy}",
+            f"{self._topic}: a publisher does not offer the {policy} this subscription asks for; nothing comes from it",
+            event.total_count_change,
+        )
+
+    def _on_lost(self, event: Any) -> None:
+        self._middleware.count(
+            f"samples_lost:{self._topic}", f"{self._topic}: the RMW lost messages", event.total_count_change
+        )
+
+
+class _RclpyPublisher(Publisher):
+    def __init__(self, middleware: RclpyMiddleware, topic: str, type_name: str, qos: Qos) -> None:
+        self._middleware = middleware
+        self._topic = check_topic(topic)
+        self._closed = False
+        self._endpoint: Any = middleware.create(
+            "publisher",
+            PublisherEventCallbacks,
+            {"incompatible_qos": self._on_incompatible},
+            msg_type=message_class(type_name),
+            topic=topic,
+            qos_profile=_to_profile(qos),
+        )
+
+    def publish(self, payload: bytes) -> None:
+        if self._closed:
+            raise MiddlewareError(f"{self._topic}: the publisher is closed")
+        if len(payload) < ENCAPSULATION:  # an empty one makes rclpy's subscribers deaf
+            raise MiddlewareError(f"{self._topic}: {len(payload)} bytes are no serialized message")
+        with _translated(f"{self._topic}: publishing {len(payload)} bytes failed"):
+            self._endpoint.publish(payload)
+
+    def matched(self) -> int:
+        if self._closed or self._middleware.closing:
+            return 0
+        with _translated(f"{self._topic} is closed"):
+            return int(self._endpoint.get_subscription_count())
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._middleware.in_executor(lambda: self._middleware.destroy("publisher", self._endpoint))
+
+    def _on_incompatible(self, event: Any) -> None:
+        policy = _policy_name(event)
+        self._middleware.count(
+            f"incompatible_qos:{self._topic}:{policy}",
+            f"{self._topic}: a subscriber asks for another {policy} than this publisher offers; it gets nothing",
+            event.total_count_change,
+        )
+
+
+class _translated(contextlib.AbstractContextManager[None]):
+    """RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, RuntimeError) and not isinstance(error, MiddlewareError):
+            raise MiddlewareError(f"{self._what}: {error}") from error

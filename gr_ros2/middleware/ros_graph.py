@@ -1,0 +1,130 @@
+"""How ROS 2 names appear on DDS, and what a participant says to be listed as a ROS node.
+
+Laws: pure functions of their arguments and, where said, of the environment; nothing here touches a DDS.
+Sources: the ROS 2 design articles "Topic and Service name mapping to DDS" and "Node to Participant mapping";
+rmw_dds_common/msg/ParticipantEntitiesInfo of Humble (24-byte Gid) and of Iron (16-byte Gid).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Mapping, Sequence
+
+from gr_ros2.errors import ConfigError
+
+MAX_DOMAIN_ID = 232
+"""Highest domain whose UDP ports fit 16 bits (RTPS 2.2, section 9.6.1)."""
+
+DISCOVERY_TOPIC = "ros_discovery_info"
+DISCOVERY_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
+PARTICIPANT_USER_DATA = b"enclave=/;"
+
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
+_CDR_LE = b"\x00\x01\x00\x00"
+_24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
+
+
+def check_topic(topic: str) -> str:
+    """An absolute ROS topic name, unchanged.
+
+    :raises ConfigError: when it is none
+    """
+    if not _TOPIC.fullmatch(topic):
+        raise ConfigError(
+            f"topic {topic!r}: not an absolute topic name; write /name or /namespace/name of letters, digits and _, "
+            "no part starting with a digit"
+        )
+    return topic
+
+
+def check_node(node_name: str, namespace: str) -> tuple[str, str]:
+    """Node name and absolute namespace ('' is the root).
+
+    :raises ConfigError: when either is malformed
+    """
+    namespace = "/" + namespace.strip("/")
+    if not _NODE.fullmatch(node_name):
+        raise ConfigError(f"node_name {node_name!r}: letters, digits and _, not starting with a digit")
+    if namespace != "/":
+        check_topic(namespace)
+    return node_name, namespace
+
+
+def dds_topic(topic: str) -> str:
+    """``/robot_1/odom`` as ``rt/robot_1/odom``."""
+    return "rt" + topic
+
+
+def ros_topic(name: str) -> str | None:
+    """The inverse of :func:`dds_topic`; None for what is no ROS topic (services, plain DDS)."""
+    return name[2:] if name.startswith("rt/") else None
+
+
+def dds_type(type_name: str) -> str:
+    """``nav_msgs/msg/Odometry`` as ``nav_msgs::msg::dds_::Odometry_``."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def ros_type(name: str) -> str:
+    """The inverse of :func:`dds_type`; a name that is no ROS type stays as it is."""
+    match = _DDS_TYPE.fullmatch(name)
+    return f"{match[1]}/{match[2]}/{match[3]}" if match else name
+
+
+def resolve_domain_id(domain_id: int, environment: Mapping[str, str] = os.environ) -> int:
+    """The DDS domain, 0..232; -1 takes ROS_DOMAIN_ID, default 0.
+
+    :raises ConfigError: out of range, or ROS_DOMAIN_ID is no number
+    """
+    origin, text = "domain_id", str(domain_id)
+    if domain_id == -1:
+        origin, text = "ROS_DOMAIN_ID", environment.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if not re.fullmatch(r"[0-9]{1,3}", text) or int(text) > MAX_DOMAIN_ID:
+        raise ConfigError(f"{origin} = {text!r}: a DDS domain is 0..{MAX_DOMAIN_ID}")
+    return int(text)
+
+
+def localhost_only(environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether ROS_LOCALHOST_ONLY asks for the loopback interface.
+
+    :raises ConfigError: when it is neither 0 nor 1
+    """
+    text = environment.get("ROS_LOCALHOST_ONLY", "").strip() or "0"
+    if text not in ("0", "1"):
+        raise ConfigError(f"ROS_LOCALHOST_ONLY = {text!r}: write 0 or 1")
+    return text == "1"
+
+
+def gid_size(environment: Mapping[str, str] = os.environ) -> int:
+    """Bytes of a Gid in ros_discovery_info: 24 up to Humble (assumed where ROS_DISTRO is not set), 16 since Iron."""
+    return 24 if environment.get("ROS_DISTRO", "").strip().lower() in _24_BYTE_GID_DISTROS else 16
+
+
+def participant_entities_info(
+    participant: bytes,
+    node_name: str,
+    namespace: str,
+    readers: Sequence[bytes],
+    writers: Sequence[bytes],
+    *,
+    gid_bytes: int = 24,
+) -> bytes:
+    """ros_discovery_info's message for one node, CDR little endian.
+
+    :param participant: GUID, 16 bytes; likewise those of readers and writers
+    """
+    body = bytearray(participant.ljust(gid_bytes, b"\0"))
+    body += struct.pack("<I", 1)
+    for text in (namespace, node_name):
+        data = text.encode() + b"\0"
+        body += struct.pack("<I", len(data)) + data
+        body += bytes(-len(body) % 4)
+    for guids in (readers, writers):
+        body += struct.pack("<I", len(guids))
+        body += b"".join(guid.ljust(gid_bytes, b"\0") for guid in guids)
+    return _CDR_LE + bytes(body)

@@ -1,0 +1,43 @@
+"""The `direct` PHY: a message port from source to sink, no samples, no airtime, no loss of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.config import build
+from gr_ros2.errors import PhyError
+from gr_ros2.phy.base import Phy
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class DirectOptions:
+    """The `direct` PHY has no settings beside packet length."""
+
+
+class DirectPhy(Phy):
+    """Packets cross on the message port itself (the paper's direct loopback).
+
+    :raises ConfigError: for any option, since there are none
+    """
+
+    name = "direct"
+    has_samples = False
+
+    def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate)
+        build(DirectOptions, options, "phy direct")
+
+    def airtime_samples(self) -> int:
+        return 0
+
+    def burst_power(self) -> float:
+        return 0.0
+
+    def transmitter(self) -> Any:
+        raise PhyError("phy direct has no transmitter; connect the source's `pdus` to the sink's")
+
+    def receiver(self) -> Any:
+        raise PhyError("phy direct has no receiver; connect the source's `pdus` to the sink's")

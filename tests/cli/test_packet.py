@@ -1,0 +1,145 @@
+"""`packet decode`: all the ways packets are handed over."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.cli.capture import packets_in
+from gr_ros2.cli.main import run
+from gr_ros2.errors import ConfigError
+from gr_ros2.wire import Entry, Packet, encode
+
+VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
+PACKETS = [
+    encode(Packet(1, 255, seq, 1, (Entry(1, seq, 0, 1, b"payload %d" % seq), Entry(2, 9, 3, 8, b""))), 64)
+    for seq in range(3)
+]
+
+
+def pcap(records: list[bytes], link_type: int = 147, order: str = "<") -> bytes:
+    head = struct.pack(order + "IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link_type)
+    return head + b"".join(struct.pack(order + "4I", 0, 0, len(data), len(data)) + data for data in records)
+
+
+def _block(kind: int, body: bytes, order: str) -> bytes:
+    body += bytes(-len(body) % 4)
+    length = struct.pack(order + "I", 12 + len(body))
+    return struct.pack(order + "I", kind) + length + body + length
+
+
+def pcapng(records: list[bytes], link_type: int = 147, order: str = "<") -> bytes:
+    data = _block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1), order)
+    data += _block(1, struct.pack(order + "HHI", link_type, 0, 65535), order)
+    for number, record in enumerate(records):
+        if number % 2:
+            data += _block(3, struct.pack(order + "I", len(record)) + record, order)
+        else:
+            data += _block(6, struct.pack(order + "5I", 0, 0, 0, len(record), len(record)) + record, order)
+    return data
+
+
+def udp(payload: bytes, ethernet: bool = True) -> bytes:
+    datagram = struct.pack(">4H", 4000, 4001, 8 + len(payload), 0) + payload
+    ip = struct.pack(">BBHHHBBH8s", 0x45, 0, 20 + len(datagram), 0, 0, 64, 17, 0, bytes(8))
+    return (bytes(12) + b"\x08\x00" if ethernet else b"") + ip + datagram + (bytes(6) if ethernet else b"")
+
+
+@pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda vector: vector["name"])
+def test_the_vectors_as_hex(vector: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["packet", "decode", "--packet-len", str(vector["packet_len"]), vector["hex"]]) == 0
+    out = capsys.readouterr().out
+    packet = vector["packet"]
+    assert f"src {packet['src_id']}, dst {packet['dst_id']}" in out
+    assert f"seq {packet['seq']}, hop {packet['hop']}, {len(packet['entries'])} entries" in out
+    for entry in packet["entries"]:
+        fields = f"topic {entry['topic_id']}, entry_id {entry['entry_id']}, index {entry['index']} of {entry['total']}"
+        assert fields in out
+
+
+@pytest.mark.parametrize("vector", VECTORS["invalid"], ids=lambda vector: vector["name"])
+def test_a_refused_packet_is_shown_with_its_reason(vector: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["packet", "decode", "--packet-len", str(vector["packet_len"]), vector["hex"]]) == 1
+    captured = capsys.readouterr()
+    assert captured.out.startswith("packet 1: rejected: ")
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"".join(PACKETS),
+        b"\n".join(packet.hex().encode() for packet in PACKETS) + b"\n",
+        b"# three packets\n\n" + b"\r\n".join(packet.hex(":").encode() + b"  # one" for packet in PACKETS),
+        pcap(PACKETS),
+        pcap(PACKETS, order=">"),
+        pcap([udp(packet) for packet in PACKETS], link_type=1),
+        pcap([udp(packet, ethernet=False) for packet in PACKETS], link_type=101),
+        pcapng(PACKETS),
+        pcapng(PACKETS, order=">"),
+        pcapng([udp(packet) for packet in PACKETS], link_type=1),
+    ],
+    ids=["binary", "hex", "colons", "pcap", "pcap-big", "pcap-udp", "pcap-ip", "pcapng", "pcapng-big", "pcapng-udp"],
+)
+def test_files(data: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(packets_in(data, 64, "file")) == [(packet, 64) for packet in PACKETS]
+    path = tmp_path / "file"
+    path.write_bytes(data)
+    assert run(["packet", "decode", "--packet-len", "64", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert [f"packet {number}: 64 bytes" in out for number in (1, 2, 3, 4)] == [True, True, True, False]
+
+
+def test_standard_input(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["packet", "decode"], ["packet", "decode", "-", PACKETS[2].hex()]):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(PACKETS[0].hex().encode())))
+        assert run(arguments) == 0
+        assert capsys.readouterr().out.count("CRC ok") == len(arguments) - 1 - (len(arguments) > 2)
+
+
+def test_a_rest_is_shown_as_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cut.bin"
+    path.write_bytes(PACKETS[0] + PACKETS[1][:30])
+    assert run(["packet", "decode", "--packet-len", "64", str(path)]) == 1
+    assert "packet 2: rejected: length: 30 bytes where packet_len is 64" in capsys.readouterr().out
+
+
+def test_topics_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "r.csv").write_text("scan,sensor_msgs/LaserScan\nodom,nav_msgs/Odometry\n")
+    assert run(["packet", "decode", "--registry", str(tmp_path / "r.csv"), PACKETS[0].hex()]) == 0
+    out = capsys.readouterr().out
+    assert "topic 1 (odom)" in out
+    assert "topic 2 (not in the registry)" in out
+
+
+@pytest.mark.parametrize("text", ["nonsense", "/nowhere/at/all", "x" * 5000])
+def test_neither_hex_nor_a_file(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["packet", "decode", text]) == 2
+    assert "neither hex digits nor a file" in capsys.readouterr().err
+
+
+def test_nothing_to_decode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").touch()
+    assert run(["packet", "decode", str(tmp_path / "empty")]) == 2
+    assert "empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("data", [pcap(PACKETS)[:-1], pcap(PACKETS) + b"1234", pcapng(PACKETS)[:-1]])
+def test_a_damaged_capture(data: bytes) -> None:
+    with pytest.raises(ConfigError, match="file: the capture"):
+        list(packets_in(data, 64, "file"))
+
+
+@given(st.binary(max_size=200), st.sampled_from([b"", pcap([])[:20], pcap([]), pcapng([]), pcapng([])[:28]]))
+def test_any_bytes_are_packets_or_a_config_error(data: bytes, start: bytes) -> None:
+    with suppress(ConfigError):
+        list(packets_in(start + data, None, "file"))

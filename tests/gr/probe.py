@@ -1,0 +1,63 @@
+"""What tests of flowgraphs share: a block that posts and collects PDUs, and waiting for a condition."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pmt
+from gnuradio import gr
+
+PATIENCE_S = 30.0
+
+
+def wait_for(condition: Callable[[], Any], what: str = "condition", patience: float = PATIENCE_S) -> None:
+    """Return once a condition holds; fail after a time that only a hang takes."""
+    deadline = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {patience} s for {what}"
+        time.sleep(0.002)
+
+
+def pdu(data: bytes) -> Any:
+    return pmt.cons(pmt.make_dict(), pmt.init_u8vector(len(data), list(data)))
+
+
+class Probe(gr.basic_block):
+    """Posts on `pdus`, collects what comes in on `pdus` and counts messages on `credit`."""
+
+    def __init__(self) -> None:
+        super().__init__("probe", None, None)
+        for name in ("pdus", "credit"):
+            self.message_port_register_in(pmt.intern(name))
+        self.message_port_register_out(pmt.intern("pdus"))
+        self.message_port_register_out(pmt.intern("credit"))
+        self.set_msg_handler(pmt.intern("pdus"), self._collect)
+        self.set_msg_handler(pmt.intern("credit"), self._count)
+        self.messages: list[Any] = []
+        self.times: list[float] = []
+        self.handled = 0
+        self.credits = 0
+        self.uses_credit = False
+
+    def use_credit(self) -> None:
+        self.uses_credit = True
+
+    def post(self, data: bytes) -> None:
+        self.post_message(pdu(data))
+
+    def post_message(self, message: Any) -> None:
+        self.message_port_pub(pmt.intern("pdus"), message)
+
+    @property
+    def packets(self) -> list[bytes]:
+        return [bytes(pmt.u8vector_elements(pmt.cdr(message))) for message in self.messages]
+
+    def _collect(self, message: Any) -> None:
+        self.times.append(time.monotonic())
+        self.messages.append(message)
+        self.handled += 1
+
+    def _count(self, _message: Any) -> None:
+        self.credits += 1

@@ -1,0 +1,93 @@
+"""The air: one packet after the other, never early, never promised far ahead."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.link.airtime import AirtimeClock
+
+
+def test_a_packet_leaves_when_its_airtime_is_over_and_not_before() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0)
+    clock.offer("a", 10.0)
+    assert clock.due(10.999) == []
+    assert clock.due(11.0) == ["a"]
+
+
+def test_packets_queue_for_the_air_and_idle_time_is_not_saved_up() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0)
+    clock.offer("a", 0.0)
+    clock.offer("b", 0.1)
+    assert clock.backlog == 2
+    assert clock.due(1.0) == ["a"]
+    assert clock.due(2.0) == ["b"]
+    clock.offer("c", 50.0)
+    clock.offer("d", 50.0)
+    assert clock.due(51.5) == ["c"]
+    assert clock.due(52.0) == ["d"]
+    assert clock.backlog == 0
+
+
+def test_one_credit_at_the_start_and_the_next_just_before_the_air_is_free() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.1, lead=0.005)
+    assert clock.grants(0.0) == 1
+    assert clock.grants(5.0) == 0, "an unused credit stays open"
+    clock.offer("a", 5.0)
+    assert clock.grants(5.0) == 0
+    assert clock.next_timeout(5.0) == pytest.approx(5.095)
+    assert clock.grants(5.09) == 0
+    assert clock.grants(5.0951) == 1
+    assert clock.grants(5.2) == 0
+
+
+def test_short_packets_get_several_credits_so_that_the_air_does_not_run_empty() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.001, lead=0.005)
+    assert clock.grants(0.0) in (5, 6)
+
+
+def test_nothing_to_wait_for_on_idle_air() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.1)
+    clock.grants(0.0)
+    assert clock.next_timeout(0.0) is None
+
+
+@pytest.mark.parametrize(("airtime", "lead"), [(0.0, 0.005), (-1.0, 0.005), (float("nan"), 0.0), (1.0, -0.1)])
+def test_senseless_times_are_refused(airtime: float, lead: float) -> None:
+    with pytest.raises(ConfigError):
+        AirtimeClock(airtime, lead)
+
+
+@given(
+    airtime=st.floats(0.0005, 0.5),
+    lead=st.floats(0, 0.02),
+    thinking=st.lists(st.floats(0, 0.3), min_size=1, max_size=40),
+)
+def test_a_source_that_obeys_credits_never_overlaps_and_never_piles_up(
+    airtime: float, lead: float, thinking: list[float]
+) -> None:
+    """Drive the clock as the gate does, a source taking some time over each packet once it has a credit."""
+    clock: AirtimeClock[float] = AirtimeClock(airtime, lead)
+    now, credits, ends = 0.0, 0, []
+    for pause in thinking:
+        deadline = now + airtime * 3 + lead + 1
+        while not credits:
+            ends += [now] * len(clock.due(now))
+            credits += clock.grants(now)
+            if not credits:
+                at = clock.next_timeout(now)
+                assert at is not None and at <= deadline
+                now = max(at, now + 1e-9)
+        now += pause
+        ends += [now] * len(clock.due(now))
+        clock.offer(now, now)
+        credits -= 1
+        assert clock.backlog <= lead / airtime + 2 + 1e-6
+    while clock.backlog:
+        at = clock.next_timeout(now)
+        assert at is not None
+        now = max(at, now + 1e-9)
+        ends += [now] * len(clock.due(now))
+    assert len(ends) == len(thinking)

@@ -1,0 +1,94 @@
+"""What the middleware tests share: waiting for conditions, domains of their own, and peers in other processes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+from gr_ros2.middleware import Qos
+
+DEADLINE_S = 20.0
+"""s after which a condition that tests wait for counts as failed; generous, since the machine may be busy."""
+
+STRING, CUSTOM = "std_msgs/msg/String", "robot_msgs/msg/WheelState"
+RELIABLE = Qos("reliable", "volatile", 0)
+BEST_EFFORT = Qos("best_effort", "volatile", 100)
+LATCHED = Qos("reliable", "transient_local", 10)
+ADAPT = Qos(depth=100)
+
+
+def domain(offset: int = 0) -> int:
+    """A DDS domain 10..99: never the default 0, differing between test processes, ports below the ephemeral range."""
+    return 10 + (os.getpid() + 7 * offset) % 90
+
+
+def wait_for(condition: Callable[[], object], what: str = "condition") -> None:
+    """Return once it holds; fail the test when it does not in time."""
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        if time.monotonic() > end:
+            raise AssertionError(f"not within {DEADLINE_S:g} s: {what}")
+        time.sleep(0.005)
+
+
+def message(number: int, size: int = 16) -> bytes:
+    """A CDR message of a size divisible by 4 that tells its number."""
+    return b"\0\1\0\0" + number.to_bytes(4, "little") + bytes((number + i) % 256 for i in range(size - 8))
+
+
+def same(received: bytes, sent: bytes, padding: int) -> bool:
+    """Byte for byte, with at most so many zeros behind."""
+    rest = received[len(sent) :]
+    return received.startswith(sent) and len(rest) <= padding and not rest.strip(b"\0")
+
+
+class Peer:
+    """A publisher or subscriber in another process: ``matched N`` and ``data HEX`` lines out, hex lines in."""
+
+    def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
+        self.matched = 0
+        self.received: list[bytes] = []
+        self.ready = False
+        self._process = subprocess.Popen(
+            list(command),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            env={**os.environ, **(environment or {})},
+        )
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            word, _, rest = line.strip().partition(" ")
+            if word == "ready":
+                self.ready = True
+            elif word == "matched":
+                self.matched = int(rest)
+            elif word == "data":
+                self.received.append(bytes.fromhex(rest))
+
+    def publish(self, payloads: Iterable[bytes]) -> None:
+        assert self._process.stdin is not None
+        for payload in payloads:
+            self._process.stdin.write(payload.hex() + "\n")
+        self._process.stdin.flush()
+
+    def close(self) -> None:
+        """End of input makes a peer leave the graph; one that does not is ended."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        if not self._process.stdin.closed:
+            self._process.stdin.close()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(5)
+        self._process.stdout.close()

@@ -1,0 +1,54 @@
+"""Adaptation of subscriptions, without any middleware."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.middleware.adapt import Adaptation, compatible, settle
+from gr_ros2.middleware.base import Qos
+
+RELIABLE = Qos("reliable", "volatile")
+BEST_EFFORT = Qos("best_effort", "volatile")
+LATCHED = Qos("reliable", "transient_local")
+
+offers = st.builds(Qos, st.sampled_from(["reliable", "best_effort"]), st.sampled_from(["volatile", "transient_local"]))
+
+
+def test_settling_takes_the_strictest_that_all_offer() -> None:
+    assert settle(Qos(depth=3), [LATCHED, LATCHED]) == Qos("reliable", "transient_local", 3)
+    assert settle(Qos(), [LATCHED, RELIABLE]) == RELIABLE
+    assert settle(Qos(), [RELIABLE, BEST_EFFORT]) == BEST_EFFORT
+    assert settle(Qos(reliability="reliable"), [BEST_EFFORT]) == RELIABLE
+
+
+def test_what_dds_does_not_match() -> None:
+    assert not compatible(BEST_EFFORT, RELIABLE)
+    assert not compatible(RELIABLE, LATCHED)
+
+
+@given(st.lists(offers, min_size=1))
+def test_a_settled_subscription_matches_every_publisher(publishers: list[Qos]) -> None:
+    assert all(compatible(offer, settle(Qos(), publishers)) for offer in publishers)
+
+
+def test_what_is_asked_in_full_joins_at_once_and_stays() -> None:
+    adaptation = Adaptation(RELIABLE)
+    assert adaptation.consider({}) == RELIABLE
+    assert adaptation.consider({b"a": BEST_EFFORT}) is None
+    assert not adaptation.adapts("reliability")
+
+
+def test_adaptive_joins_with_the_first_publisher_and_anew_only_for_one_that_appears() -> None:
+    adaptation = Adaptation(Qos())
+    assert adaptation.adapts("reliability")
+    assert adaptation.adapts("durability")
+    assert not adaptation.adapts("deadline")
+    assert adaptation.consider({}) is None
+    assert adaptation.consider({b"a": LATCHED}) == LATCHED
+    assert adaptation.consider({b"a": LATCHED, b"b": LATCHED}) is None
+    assert adaptation.consider({b"a": LATCHED, b"b": LATCHED, b"c": BEST_EFFORT}) == BEST_EFFORT
+    assert adaptation.consider({b"a": LATCHED}) is None, "a departure is no reason to join anew"
+    assert adaptation.consider({}) is None
+    assert adaptation.consider({b"d": RELIABLE}) == RELIABLE
+    assert adaptation.settled == RELIABLE

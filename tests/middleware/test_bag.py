@@ -1,0 +1,268 @@
+"""Bags: what is written can be read by others, what is damaged is one line, playing follows the clock or the link."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.middleware import Qos, TopicInfo
+from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
+from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, wait_for
+
+HUSKY = Path(__file__).parents[3] / "shared" / "data" / "husky_outdoor"
+Storage = Literal["mcap", "sqlite3"]
+both_storages = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+
+
+def string(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + len(data).to_bytes(4, "little") + data
+
+
+def write(path: Path, storage: Storage = "mcap", *, count: int = 10, period_ns: int = 1_000_000) -> Path:
+    """A bag of /a (String) and /b (custom), alternating."""
+    with BagMiddleware(path=path, mode="write", storage=storage) as bag:
+        a, b = bag.advertise("/a", STRING, LATCHED), bag.advertise("/b", CUSTOM, BEST_EFFORT)
+        for i in range(count):
+            publisher: BagPublisher = b if i % 2 else a
+            publisher.publish_at(message(i) if i % 2 else string(str(i)), 1_000 + i * period_ns)
+    return path
+
+
+@both_storages
+def test_others_can_read_what_was_written(tmp_path: Path, storage: Storage) -> None:
+    path = write(tmp_path / "bag", storage)
+    with AnyReader([path]) as reader:
+        assert {(c.topic, c.msgtype) for c in reader.connections} == {("/a", STRING), ("/b", CUSTOM)}
+        messages = list(reader.messages())
+        texts = [reader.deserialize(data, c.msgtype) for c, _, data in messages if c.topic == "/a"]
+    assert [text.data for text in texts] == ["0", "2", "4", "6", "8"]  # type: ignore[attr-defined]
+    assert [stamp for _, stamp, _ in messages] == [1_000 + i * 1_000_000 for i in range(10)]
+    assert [bytes(data) for c, _, data in messages if c.topic == "/b"] == [message(i) for i in range(1, 10, 2)]
+
+
+@both_storages
+def test_qos_is_recorded(tmp_path: Path, storage: Storage) -> None:
+    expected = [TopicInfo("/a", STRING, (LATCHED,)), TopicInfo("/b", CUSTOM, (BEST_EFFORT,))]
+    path = write(tmp_path / "bag", storage)
+    assert bag_topics(path) == expected
+    with BagMiddleware(path=path) as bag:
+        assert bag.discover() == expected
+
+
+def test_definitions_of_custom_types_travel_along(tmp_path: Path) -> None:
+    text = "std_msgs/Header header\nfloat32[4] speed\n"
+    with BagMiddleware(path=tmp_path / "one", mode="write", definitions={CUSTOM: text}) as bag:
+        bag.advertise("/wheels", CUSTOM, RELIABLE).publish(message(1))
+    definitions = bag_definitions(tmp_path / "one")
+    assert definitions[CUSTOM].startswith(text)
+    with BagMiddleware(path=tmp_path / "two", mode="write", definitions=definitions) as bag:
+        bag.advertise("/wheels", CUSTOM, RELIABLE).publish(message(1))
+    assert bag_definitions(tmp_path / "two")[CUSTOM] == definitions[CUSTOM]
+
+
+@pytest.mark.parametrize("text", ["float64", "no_such_msgs/Type value\n", "float64 = 3 = 4\n"])
+def test_a_definition_that_cannot_be_used_is_no_obstacle(tmp_path: Path, text: str) -> None:
+    with BagMiddleware(path=tmp_path / "bag", mode="write", definitions={CUSTOM: text}) as bag:
+        bag.advertise("/wheels", CUSTOM, RELIABLE).publish(message(1))
+    with AnyReader([tmp_path / "bag"]) as reader:
+        assert [bytes(data) for _, _, data in reader.messages()] == [message(1)]
+
+
+@both_storages
+def test_a_bare_file_is_a_bag_too(tmp_path: Path, storage: Storage) -> None:
+    path = write(tmp_path / "bag", storage)
+    (file,) = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3")]
+    bare = tmp_path / f"bare{file.suffix}"
+    shutil.move(file, bare)
+    assert [info.topic for info in bag_topics(bare)] == ["/a", "/b"]
+    assert len(list(read_bag(bare))) == 10
+
+
+def test_only_subscribed_topics_are_played(tmp_path: Path) -> None:
+    received: list[bytes] = []
+    with BagMiddleware(path=write(tmp_path / "bag"), speed=0) as bag:
+        bag.subscribe("/b", CUSTOM, RELIABLE, received.append)
+        bag.subscribe("/not_there", STRING, RELIABLE, received.append)
+        bag.start()
+        bag.start()
+        wait_for(lambda: bag.finished, "end")
+        with pytest.raises(MiddlewareError, match="playing"):
+            bag.subscribe("/a", STRING, RELIABLE, received.append)
+    assert received == [message(i) for i in range(1, 10, 2)]
+
+
+def test_finished_comes_after_the_last_callback(tmp_path: Path) -> None:
+    release, reached = threading.Event(), threading.Event()
+    received: list[bytes] = []
+
+    def callback(payload: bytes) -> None:
+        received.append(payload)
+        if len(received) == 10:
+            reached.set()
+            release.wait(20)
+
+    with BagMiddleware(path=write(tmp_path / "bag"), speed=0) as bag:
+        bag.subscribe("/a", STRING, RELIABLE, callback)
+        bag.subscribe("/b", CUSTOM, RELIABLE, callback)
+        bag.start()
+        wait_for(reached.is_set, "the last callback")
+        assert not bag.finished
+        release.set()
+        wait_for(lambda: bag.finished, "end")
+
+
+def test_playing_keeps_recorded_time(tmp_path: Path) -> None:
+    """At double speed a bag of 0.4 s takes 0.2 s or more, however slow the machine; never less."""
+    path = write(tmp_path / "bag", count=5, period_ns=100_000_000)
+    times: list[float] = []
+    with BagMiddleware(path=path, speed=2.0) as bag:
+        for topic, kind in (("/a", STRING), ("/b", CUSTOM)):
+            bag.subscribe(topic, kind, RELIABLE, lambda _: times.append(time.monotonic()))
+        bag.start()
+        wait_for(lambda: bag.finished, "end")
+    assert len(times) == 5
+    assert all(times[i] - times[0] >= i * 0.05 - 1e-3 for i in range(5))
+
+
+def test_close_interrupts_waiting(tmp_path: Path) -> None:
+    received: list[bytes] = []
+    path = write(tmp_path / "bag", period_ns=3600 * 10**9)
+    bag = BagMiddleware(path=path)
+    bag.subscribe("/a", STRING, RELIABLE, received.append)
+    bag.start()
+    wait_for(lambda: received, "the first message")
+    bag.close()
+    assert bag.finished and received == [string("0")]
+
+
+@both_storages
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9, 0.999])
+def test_truncated_is_one_line_naming_the_path(tmp_path: Path, storage: Storage, keep: float) -> None:
+    path = write(tmp_path / "bag", storage, count=2000)
+    (file,) = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3")]
+    data = file.read_bytes()
+    file.write_bytes(data[: int(keep * len(data))])
+    for damaged in (path, file):
+        with pytest.raises(BagError) as caught:
+            list(read_bag(damaged))
+        assert str(damaged) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_damage_found_while_playing_ends_it(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag", count=2000)
+    bag = BagMiddleware(path=path, speed=0)
+    (file,) = path.glob("*.mcap")
+    data = bytearray(file.read_bytes())
+    data[2000:9000] = bytes(7000)
+    file.write_bytes(data)
+    bag.subscribe("/a", STRING, RELIABLE, lambda _: None)
+    bag.start()
+    wait_for(lambda: bag.finished, "end")
+    bag.close()
+    assert isinstance(bag.error, BagError) and bag.counters["bag_failed"] == 1
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty folder", "text file", "wrong suffix", "bad metadata"])
+def test_no_bag_is_one_line_naming_the_path(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "no.mcap"
+    if kind == "empty folder":
+        path.mkdir()
+    elif kind == "text file":
+        path.write_text("not a bag\n" * 100)
+    elif kind == "wrong suffix":
+        path = tmp_path / "no.txt"
+        path.write_text("not a bag")
+    elif kind == "bad metadata":
+        path.mkdir()
+        (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2")
+    for attempt in (lambda: list(read_bag(path)), lambda: bag_topics(path), lambda: BagMiddleware(path=path)):
+        with pytest.raises(BagError) as caught:
+            attempt()
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_existing_path_is_not_overwritten(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag")
+    with pytest.raises(BagError, match="exists already"):
+        BagMiddleware(path=path, mode="write")
+    (tmp_path / "file").touch()
+    with pytest.raises(BagError):
+        BagMiddleware(path=tmp_path / "file" / "bag", mode="write")
+    assert len(list(read_bag(path))) == 10
+
+
+def test_writing_errors_are_told_and_counted(tmp_path: Path) -> None:
+    bag = BagMiddleware(path=tmp_path / "bag", mode="write")
+    publisher = bag.advertise("/a", STRING, RELIABLE)
+    publisher.publish_at(message(1), 2**62)
+    with pytest.raises(ConfigError):
+        publisher.publish_at(message(1), -1)
+    shutil.rmtree(tmp_path / "bag")
+    with pytest.raises(BagError, match="bag"):
+        bag.close()
+    bag.close()
+
+
+def test_reading_and_writing_exclude_each_other(tmp_path: Path) -> None:
+    with BagMiddleware(path=tmp_path / "bag", mode="write") as bag:
+        with pytest.raises(MiddlewareError, match="mode='read'"):
+            bag.subscribe("/a", STRING, RELIABLE, lambda _: None)
+        bag.advertise("/a", STRING, RELIABLE)
+        bag.advertise("/a", STRING, RELIABLE)
+        with pytest.raises(ConfigError, match="not"):
+            bag.advertise("/a", CUSTOM, RELIABLE)
+    with BagMiddleware(path=tmp_path / "bag") as bag:
+        with pytest.raises(MiddlewareError, match="mode='write'"):
+            bag.advertise("/a", STRING, RELIABLE)
+        with pytest.raises(ConfigError, match=STRING):
+            bag.subscribe("/a", CUSTOM, RELIABLE, lambda _: None)
+
+
+@pytest.mark.parametrize("settings", [{"speed": -1.0}, {"speed": float("nan")}, {"mode": "append"}])
+def test_bad_settings_are_errors(tmp_path: Path, settings: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        BagMiddleware(path=tmp_path / "bag", **settings)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError):
+        BagMiddleware(path=tmp_path / "bag", mode="write", storage="csv")  # type: ignore[arg-type]
+
+
+def test_many_threads_may_publish(tmp_path: Path) -> None:
+    with BagMiddleware(path=tmp_path / "bag", mode="write", storage="sqlite3") as bag:
+        publisher = bag.advertise("/a", STRING, Qos(depth=0))
+
+        def publish() -> None:
+            for i in range(500):
+                publisher.publish(message(i))
+
+        threads = [threading.Thread(target=publish) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(list(read_bag(tmp_path / "bag"))) == 2000
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason="the recorded Husky drive is not on this machine")
+def test_the_recorded_drive() -> None:
+    topics = {info.topic: info.type_name for info in bag_topics(HUSKY)}
+    assert topics == {
+        "/robot_1/odom": "nav_msgs/msg/Odometry",
+        "/robot_1/imu": "sensor_msgs/msg/Imu",
+        "/robot_1/fix": "sensor_msgs/msg/NavSatFix",
+    }
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    stamps: list[int] = []
+    for odom in read_bag(HUSKY, ["/robot_1/odom"]):
+        assert odom.type_name == "nav_msgs/msg/Odometry"
+        store.deserialize_cdr(odom.payload, odom.type_name)
+        stamps.append(odom.stamp_ns)
+    assert stamps == sorted(stamps) and len(stamps) > 1000

@@ -1,0 +1,385 @@
+"""The embedded DDS: processes, domains, interfaces, QoS that adapts, what the ROS graph is told."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.middleware import Qos, cdr_dds, ros_graph
+from gr_ros2.middleware.cdr_dds import RawReader
+from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.middleware.dds_domains import POOL
+from tests.middleware.support import (
+    ADAPT,
+    BEST_EFFORT,
+    CUSTOM,
+    LATCHED,
+    RELIABLE,
+    STRING,
+    Peer,
+    domain,
+    message,
+    same,
+    wait_for,
+)
+
+ROOT = Path(__file__).parents[2]
+PEER = [sys.executable, "-m", "tests.middleware.dds_peer"]
+
+
+@pytest.fixture
+def join(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., DdsMiddleware]]:
+    """Makes participants on the loopback interface that are closed at the end."""
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    made: list[DdsMiddleware] = []
+
+    def make(offset: int = 0, node_name: str = "test") -> DdsMiddleware:
+        made.append(DdsMiddleware(domain_id=domain(offset), node_name=node_name))
+        return made[-1]
+
+    yield make
+    for middleware in made:
+        middleware.close()
+
+
+@pytest.fixture
+def peer(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Peer]]:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    made: list[Peer] = []
+
+    def make(role: str, topic: str, type_name: str, qos: Qos, offset: int = 0) -> Peer:
+        words = [qos.reliability or "adapt", qos.durability or "adapt", str(qos.depth)]
+        made.append(Peer([*PEER, str(domain(offset)), topic, type_name, role, *words]))
+        wait_for(lambda: made[-1].ready, "the other process")
+        return made[-1]
+
+    yield make
+    for other in made:
+        other.close()
+
+
+@pytest.mark.parametrize("qos", [RELIABLE, BEST_EFFORT, LATCHED], ids=["reliable", "best effort", "latched"])
+def test_between_processes(join: Callable[..., DdsMiddleware], peer: Callable[..., Peer], qos: Qos) -> None:
+    received: list[bytes] = []
+    there = peer("sub", "/out", CUSTOM, qos)
+    source = peer("pub", "/in", CUSTOM, qos)
+    middleware = join()
+    publisher = middleware.advertise("/out", CUSTOM, qos)
+    subscription = middleware.subscribe("/in", CUSTOM, qos, received.append)
+    wait_for(lambda: publisher.matched() and there.matched and subscription.matched() and source.matched, "match")
+    sent = [message(i, size) for i, size in enumerate((8, 724, 5828, 1_000_000 if qos == RELIABLE else 60_000))]
+    for payload in sent:
+        publisher.publish(payload)
+    source.publish(sent)
+    wait_for(lambda: len(there.received) >= 4 and len(received) >= 4, "messages")
+    assert received == sent and there.received == sent
+
+
+def test_latched_message_reaches_an_adapting_subscription_that_comes_late(
+    join: Callable[..., DdsMiddleware], peer: Callable[..., Peer]
+) -> None:
+    source = peer("pub", "/tf_static", STRING, LATCHED)
+    source.publish([message(1), message(2)])
+    middleware = join()
+    received: list[bytes] = []
+    subscription = middleware.subscribe("/tf_static", STRING, ADAPT, received.append)
+    wait_for(lambda: len(received) == 2, "the latched messages")
+    assert subscription.qos == Qos("reliable", "transient_local", 100)
+    source.publish([message(3)])
+    wait_for(lambda: len(received) >= 3, "one more")
+    assert received == [message(1), message(2), message(3)]
+
+
+def test_a_subscription_adapts_as_publishers_come_and_go(join: Callable[..., DdsMiddleware]) -> None:
+    here, first, second = join(), join(), join()
+    received: list[bytes] = []
+    subscription = here.subscribe("/map", STRING, ADAPT, received.append)
+    assert subscription.qos == Qos("best_effort", "volatile", 100)
+
+    latched = first.advertise("/map", STRING, LATCHED)
+    latched.publish(message(1))
+    wait_for(lambda: subscription.qos == Qos("reliable", "transient_local", 100), "upgrade")
+    wait_for(lambda: received == [message(1)], "the latched message")
+
+    lossy = second.advertise("/map", STRING, BEST_EFFORT)
+    wait_for(lambda: subscription.qos == Qos("best_effort", "volatile", 100), "downgrade")
+    wait_for(lossy.matched, "match")
+    lossy.publish(message(2))
+    latched.publish(message(3))
+    wait_for(lambda: len(received) >= 3, "both publishers' messages")
+
+    second.close()
+    wait_for(lambda: subscription.qos == Qos("reliable", "transient_local", 100), "upgrade again")
+    latched.publish(message(4))
+    wait_for(lambda: message(4) in received, "the last message")
+    wait_for(lambda: len(subscription.readers()) == 1, "end of the overlap")
+    latched.publish(message(5))
+    wait_for(lambda: message(5) in received, "a message to the one reader left")
+    assert sorted(received) == [message(i) for i in range(1, 6)]
+    assert here.counters == {}
+
+
+def test_nothing_is_lost_or_repeated_while_adapting(join: Callable[..., DdsMiddleware]) -> None:
+    here, first, second = join(), join(), join()
+    received: list[bytes] = []
+    subscription = here.subscribe("/odom", STRING, Qos(depth=0), received.append)
+    steady = first.advertise("/odom", STRING, RELIABLE)
+    wait_for(lambda: subscription.matched() and steady.matched(), "match")
+    stop = threading.Event()
+    sent: list[bytes] = []
+
+    def publish() -> None:
+        while not stop.wait(0.001):
+            sent.append(message(len(sent)))
+            steady.publish(sent[-1])
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        for _ in range(3):
+            wait_for(lambda: subscription.qos == Qos("reliable", "volatile", 0), "reliable")
+            passing = second.advertise("/odom", STRING, BEST_EFFORT)
+            wait_for(lambda: subscription.qos == Qos("best_effort", "volatile", 0), "best effort")
+            passing.close()
+    finally:
+        stop.set()
+        thread.join()
+    wait_for(lambda: len(received) >= len(sent), "all messages")
+    assert received == sent
+
+
+def test_a_fixed_part_of_the_qos_stays(join: Callable[..., DdsMiddleware]) -> None:
+    here, there = join(), join()
+    subscription = here.subscribe("/a", STRING, Qos("best_effort", None, 5), lambda _: None)
+    there.advertise("/a", STRING, LATCHED)
+    wait_for(lambda: subscription.qos == Qos("best_effort", "transient_local", 5), "durability")
+
+
+@pytest.mark.parametrize(
+    ("offered", "requested", "policy"),
+    [
+        (Qos("best_effort", "volatile"), Qos("reliable", "volatile"), "reliability"),
+        (Qos("reliable", "volatile"), Qos("reliable", "transient_local"), "durability"),
+    ],
+)
+def test_incompatible_qos_is_counted_on_both_ends(
+    join: Callable[..., DdsMiddleware],
+    caplog: pytest.LogCaptureFixture,
+    offered: Qos,
+    requested: Qos,
+    policy: str,
+) -> None:
+    here, there = join(), join()
+    here.subscribe("/a", STRING, requested, lambda _: None)
+    publishers = [there.advertise("/a", STRING, offered) for _ in range(3)]
+    name = f"incompatible_qos:/a:{policy}"
+    wait_for(lambda: here.counters[name] == 3 and there.counters[name] == 3, "both counters")
+    assert not any(publisher.matched() for publisher in publishers)
+    assert sum(name in record.message for record in caplog.records) == 2  # once per participant
+
+
+def test_another_type_under_the_same_name_is_counted(join: Callable[..., DdsMiddleware]) -> None:
+    here, there = join(), join()
+    subscription = here.subscribe("/a", STRING, ADAPT, lambda _: None)
+    there.advertise("/a", CUSTOM, LATCHED)
+    wait_for(lambda: here.counters["incompatible_type:/a"] == 1, "the counter")
+    assert subscription.matched() == 0 and subscription.qos == Qos("best_effort", "volatile", 100)
+
+
+def test_domains_do_not_mix(join: Callable[..., DdsMiddleware]) -> None:
+    here, same_domain, other_domain = join(), join(), join(1)
+    received: list[bytes] = []
+    here.subscribe("/a", STRING, RELIABLE, received.append)
+    stranger = other_domain.advertise("/a", STRING, LATCHED)
+    publisher = same_domain.advertise("/a", STRING, LATCHED)
+    stranger.publish(message(1))
+    publisher.publish(message(2))
+    wait_for(publisher.matched, "match")
+    publisher.publish(message(3))
+    wait_for(lambda: message(3) in received, "the message of this domain")
+    assert message(1) not in received and stranger.matched() == 0
+    assert [info.topic for info in other_domain.discover()] == []
+
+
+def test_our_own_publisher_reaches_our_own_subscription(join: Callable[..., DdsMiddleware]) -> None:
+    middleware = join()
+    received: list[bytes] = []
+    publisher = middleware.advertise("/a", STRING, LATCHED)
+    publisher.publish(message(1))
+    middleware.subscribe("/a", STRING, ADAPT, received.append)
+    wait_for(lambda: received == [message(1)], "the latched message")
+    assert middleware.discover() == []
+
+
+def test_padding_is_zeros_up_to_three(join: Callable[..., DdsMiddleware]) -> None:
+    here, there = join(), join()
+    received: list[bytes] = []
+    subscription = here.subscribe("/a", STRING, RELIABLE, received.append)
+    publisher = there.advertise("/a", STRING, RELIABLE)
+    wait_for(lambda: publisher.matched() and subscription.matched(), "match")
+    sent = [b"\0\1\0\0" + b"\xff" * n for n in range(1, 20)]
+    for payload in sent:
+        publisher.publish(payload)
+    wait_for(lambda: len(received) >= len(sent), "messages")
+    assert all(same(got, payload, 3) for got, payload in zip(received, sent, strict=True))
+
+
+@pytest.mark.parametrize("payload", [b"", b"\0\1\0\0", b"\xff\xff\0\0\1\2\3\4"], ids=["empty", "header only", "no CDR"])
+def test_what_is_no_cdr_is_refused(join: Callable[..., DdsMiddleware], payload: bytes) -> None:
+    publisher = join().advertise("/a", STRING, RELIABLE)
+    with pytest.raises(MiddlewareError, match="no CDR"):
+        publisher.publish(payload)
+
+
+def test_ros_discovery_info_names_the_node_and_its_endpoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    watching = POOL.join(domain(), True, b"")
+    try:
+        topic = cdr_dds.create_topic(watching, ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
+        reader = RawReader(watching, topic, LATCHED)
+        node = DdsMiddleware(domain_id=domain(), node_name="radio", namespace="/robot_1")
+        try:
+            subscription = node.subscribe("/in", STRING, RELIABLE, lambda _: None)
+            publisher = node.advertise("/out", STRING, RELIABLE)
+            expected = ("/robot_1", "radio", [r.guid for r in subscription.readers()], [publisher.writer.guid])
+            seen: list[tuple[str, str, list[bytes], list[bytes]]] = []
+
+            def listed() -> bool:
+                seen.extend(parse_entities(sample.payload, 24) for sample in reader.take())
+                return bool(seen) and seen[-1] == expected
+
+            wait_for(listed, "the node with both endpoints")
+            subscription.close()
+            expected = ("/robot_1", "radio", [], [publisher.writer.guid])
+            wait_for(listed, "the node without the subscription")
+        finally:
+            node.close()
+    finally:
+        POOL.leave(domain(), watching)
+
+
+def parse_entities(data: bytes, gid_bytes: int) -> tuple[str, str, list[bytes], list[bytes]]:
+    """rmw_dds_common/msg/ParticipantEntitiesInfo of one node, read independently of our writer of it."""
+    at = 4 + gid_bytes
+    assert data[:4] == b"\0\1\0\0" and data[20:at] == bytes(gid_bytes - 16)
+
+    def number() -> int:
+        nonlocal at
+        at = 4 + -(-(at - 4) // 4) * 4
+        at += 4
+        return int(struct.unpack_from("<I", data, at - 4)[0])
+
+    def text() -> str:
+        nonlocal at
+        size = number()
+        at += size
+        assert data[at - 1] == 0
+        return data[at - size : at - 1].decode()
+
+    def gids() -> list[bytes]:
+        nonlocal at
+        count = number()
+        at += count * gid_bytes
+        return [data[at - (count - i) * gid_bytes :][:16] for i in range(count)]
+
+    assert number() == 1
+    found = text(), text(), gids(), gids()
+    assert not data[at:].strip(b"\0") and len(data) - at < 4
+    return found
+
+
+def test_a_domain_is_on_loopback_or_not_for_the_whole_process(join: Callable[..., DdsMiddleware]) -> None:
+    assert join().localhost_only
+    with pytest.raises(ConfigError, match="ROS_LOCALHOST_ONLY=1"):
+        DdsMiddleware(domain_id=domain(), localhost_only=False)
+
+
+INTERFACES = (
+    "ip link set lo up && ip link add eth9 type veth peer name eth8 && ip addr add 10.9.8.7/24 dev eth9"
+    " && ip link set eth8 up && ip link set eth9 up"
+)
+JOINED_GROUPS = """
+from gr_ros2.middleware.dds import DdsMiddleware
+with DdsMiddleware(domain_id=7):
+    for line in open("/proc/net/igmp"):
+        if line[0].isdigit():
+            device = line.split()[1]
+        elif "0100FFEF" in line:
+            print(device)
+"""
+
+
+@pytest.mark.parametrize(("setting", "device"), [("1", "lo"), ("0", "eth9")])
+def test_localhost_only_stays_on_the_loopback_interface(setting: str, device: str) -> None:
+    """In a network namespace of its own, with a second interface: where is the discovery group joined?"""
+
+    def isolated(command: str) -> subprocess.CompletedProcess[str]:
+        environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "ROS_LOCALHOST_ONLY": setting, "PYTHONPATH": str(ROOT)}
+        words = ["unshare", "-n", "sh", "-c", command]
+        return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=60)
+
+    if not shutil.which("unshare") or isolated(INTERFACES).returncode:
+        pytest.skip("needs the right to make a network namespace and a device in it")
+    result = isolated(f"{INTERFACES} && exec {sys.executable} -c '{JOINED_GROUPS}'")
+    assert result.stdout.split() == [device], result.stderr
+
+
+def test_ros_domain_id_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain(3)))
+    with DdsMiddleware() as middleware:
+        assert middleware.domain_id == domain(3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "environment"),
+    [
+        ({"domain_id": 233}, {}),
+        ({"domain_id": -2}, {}),
+        ({}, {"ROS_DOMAIN_ID": "robot"}),
+        ({}, {"ROS_DOMAIN_ID": "300"}),
+        ({"domain_id": 5}, {"ROS_LOCALHOST_ONLY": "yes"}),
+        ({"domain_id": 5, "node_name": "a node"}, {}),
+        ({"domain_id": 5, "namespace": "/1"}, {}),
+    ],
+)
+def test_bad_settings_are_errors(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, object], environment: dict[str, str]
+) -> None:
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError):
+        DdsMiddleware(**settings)  # type: ignore[arg-type]
+
+
+def test_a_thousand_opened_and_closed_endpoints_leave_nothing_behind(join: Callable[..., DdsMiddleware]) -> None:
+    here, there = join(), join()
+    for _ in range(250):
+        subscription = here.subscribe("/a", STRING, ADAPT, lambda _: None)
+        publisher = there.advertise("/a", STRING, LATCHED)
+        publisher.publish(message(1))
+        subscription.close()
+        publisher.close()
+    wait_for(lambda: there.discover() == [] and here.discover() == [], "an empty graph")
+    assert here.counters == {} and there.counters == {}
+
+
+def test_participants_open_and_close_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    for _ in range(10):
+        with DdsMiddleware(domain_id=domain()) as here, DdsMiddleware(domain_id=domain()) as there:
+            received: list[bytes] = []
+            here.subscribe("/a", STRING, LATCHED, received.append)
+            there.advertise("/a", STRING, LATCHED).publish(message(1))
+            wait_for(received.__len__, "the message")
+            assert received == [message(1)]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("dds-")]

@@ -1,0 +1,170 @@
+"""The embedded DDS against an independent one: Fast DDS from Debian, over the loopback interface, both directions."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.middleware import Qos, ros_graph
+from gr_ros2.middleware.dds import DdsMiddleware
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, domain, message, same, wait_for
+
+SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
+HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
+RELIABLE = Qos("reliable", "volatile", 100)
+
+
+@pytest.fixture(scope="session")
+def program() -> Path:
+    """The peer, compiled once per version of its source."""
+    if not HEADER.exists() or not shutil.which("g++"):
+        pytest.skip("needs g++ and Fast DDS's headers: apt install g++ libfastrtps-dev")
+    name = f"gr-ros2-fastdds-peer-{hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]}"
+    built = Path(tempfile.gettempdir()) / name
+    if not built.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            fresh = Path(folder) / name
+            command = [
+                "g++",
+                "-std=c++14",
+                "-O1",
+                "-o",
+                str(fresh),
+                str(SOURCE),
+                "-lfastrtps",
+                "-lfastcdr",
+                "-lpthread",
+            ]
+            result = subprocess.run(command, capture_output=True, text=True)
+            assert result.returncode == 0, result.stderr
+            shutil.move(fresh, built)
+    return built
+
+
+@pytest.fixture
+def peer(program: Path) -> Iterator[Callable[..., Peer]]:
+    made: list[Peer] = []
+
+    def make(role: str, topic: str, qos: Qos) -> Peer:
+        names = [ros_graph.dds_topic(topic), ros_graph.dds_type(CUSTOM)]
+        words = [qos.reliability or "", qos.durability or "", str(qos.depth)]
+        made.append(Peer([str(program), str(domain(2)), *names, role, *words]))
+        wait_for(lambda: made[-1].ready, "the Fast DDS process")
+        return made[-1]
+
+    yield make
+    for other in made:
+        other.close()
+
+
+@pytest.fixture
+def middleware(monkeypatch: pytest.MonkeyPatch) -> Iterator[DdsMiddleware]:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    with DdsMiddleware(domain_id=domain(2)) as made:
+        yield made
+
+
+def until_received(publish: Callable[[], None], received: list[bytes], payload: bytes) -> None:
+    """Publish it again and again, until it has come."""
+
+    def come() -> bool:
+        publish()
+        return any(same(got, payload, 3) for got in list(received))
+
+    wait_for(come, f"a message of {len(payload)} bytes")
+
+
+SIZES = (8, 9, 724, 1400, 5828, 60_000)
+
+
+@pytest.mark.parametrize("qos", [RELIABLE, BEST_EFFORT, LATCHED], ids=["reliable", "best effort", "latched"])
+def test_from_fast_dds(middleware: DdsMiddleware, peer: Callable[..., Peer], qos: Qos) -> None:
+    received: list[bytes] = []
+    source = peer("pub", "/in", qos)
+    subscription = middleware.subscribe("/in", CUSTOM, qos, received.append)
+    wait_for(lambda: subscription.matched() and source.matched, "match")
+    sent = [message(i, size) for i, size in enumerate(SIZES)]
+    if qos.reliability == "best_effort":
+        # Fast DDS matches in its own time, and a fragment may be lost: each is sent until it has come.
+        for payload in sent:
+            until_received(lambda p=payload: source.publish([p]), received, payload)
+    else:
+        first = message(99)
+        until_received(lambda: source.publish([first]), received, first)
+        source.publish(sent)
+        wait_for(lambda: same(received[-1], sent[-1], 3), "the last message")
+        assert all(same(got, payload, 3) for got, payload in zip(received[-len(sent) :], sent, strict=True))
+
+
+@pytest.mark.parametrize("qos", [RELIABLE, BEST_EFFORT, LATCHED], ids=["reliable", "best effort", "latched"])
+def test_to_fast_dds(middleware: DdsMiddleware, peer: Callable[..., Peer], qos: Qos) -> None:
+    there = peer("sub", "/out", qos)
+    publisher = middleware.advertise("/out", CUSTOM, qos)
+    wait_for(lambda: publisher.matched() and there.matched, "match")
+    sent = [message(i, size) for i, size in enumerate(SIZES)]
+    if qos.reliability == "best_effort":
+        for payload in sent:
+            until_received(lambda p=payload: publisher.publish(p), there.received, payload)
+    else:
+        for payload in sent:
+            publisher.publish(payload)
+        wait_for(lambda: len(there.received) >= len(sent), "messages")
+        assert all(same(got, payload, 3) for got, payload in zip(there.received, sent, strict=True))
+
+
+def test_a_megabyte_both_ways(middleware: DdsMiddleware, peer: Callable[..., Peer]) -> None:
+    received: list[bytes] = []
+    there, source = peer("sub", "/out", LATCHED), peer("pub", "/in", LATCHED)
+    sent = message(1, 1_000_000)
+    source.publish([sent])
+    middleware.subscribe("/in", CUSTOM, LATCHED, received.append)
+    middleware.advertise("/out", CUSTOM, LATCHED).publish(sent)
+    wait_for(lambda: received and there.received, "both")
+    assert received == [sent] and there.received == [sent]
+
+
+def test_latched_message_reaches_a_late_fast_dds_subscriber(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    publisher = middleware.advertise("/map", CUSTOM, LATCHED)
+    sent = [message(i) for i in range(5)]
+    for payload in sent:
+        publisher.publish(payload)
+    there = peer("sub", "/map", LATCHED)
+    wait_for(lambda: len(there.received) >= 5, "the latched messages")
+    assert there.received == sent
+
+
+def test_an_open_subscription_adapts_to_fast_dds_publishers(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    received: list[bytes] = []
+    latched = peer("pub", "/map", LATCHED)
+    latched.publish([message(1)])
+    subscription = middleware.subscribe("/map", CUSTOM, ADAPT, received.append)
+    wait_for(lambda: received == [message(1)], "the latched message")
+    assert subscription.qos == Qos("reliable", "transient_local", 100)
+    lossy = peer("pub", "/map", BEST_EFFORT)
+    wait_for(lambda: subscription.qos == Qos("best_effort", "volatile", 100), "downgrade")
+    until_received(lambda: lossy.publish([message(2)]), received, message(2))
+    lossy.close()
+    wait_for(lambda: subscription.qos == Qos("reliable", "transient_local", 100), "upgrade")
+    latched.publish([message(3)])
+    wait_for(lambda: message(3) in received, "the last message")
+    assert received.count(message(1)) == 1 and received.count(message(3)) == 1
+
+
+def test_discovery_of_fast_dds_endpoints(middleware: DdsMiddleware, peer: Callable[..., Peer]) -> None:
+    peer("pub", "/robot_1/odom", LATCHED)
+    peer("sub", "/robot_2/odom", BEST_EFFORT)
+    wait_for(lambda: len(middleware.discover()) == 2, "both topics")
+    published, subscribed = middleware.discover()
+    assert (published.topic, published.type_name) == ("/robot_1/odom", CUSTOM)
+    assert [(q.reliability, q.durability) for q in published.publishers] == [("reliable", "transient_local")]
+    assert [(q.reliability, q.durability) for q in subscribed.subscribers] == [("best_effort", "volatile")]

@@ -1,0 +1,92 @@
+"""Names, environment and ros_discovery_info."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.type_definitions import UNKNOWN, definition, type_hash
+
+NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
+
+# rmw_dds_common of Humble, in its message definition language: an independent reading of our bytes.
+HUMBLE_MSGS = {
+    "rmw_dds_common/msg/Gid": "char[24] data\n",
+    "rmw_dds_common/msg/NodeEntitiesInfo": (
+        "string<=256 node_namespace\nstring<=256 node_name\nGid[] reader_gid_seq\nGid[] writer_gid_seq\n"
+    ),
+    "rmw_dds_common/msg/ParticipantEntitiesInfo": "Gid gid\nNodeEntitiesInfo[] node_entities_info_seq\n",
+}
+
+
+@given(st.lists(NAME, min_size=1, max_size=4))
+def test_topic_names_map_there_and_back(parts: list[str]) -> None:
+    topic = "/" + "/".join(parts)
+    assert ros_graph.ros_topic(ros_graph.dds_topic(ros_graph.check_topic(topic))) == topic
+
+
+@given(NAME, st.sampled_from(["msg", "srv"]), st.from_regex(r"[A-Z][A-Za-z0-9]{0,8}(_Request)?", fullmatch=True))
+def test_type_names_map_there_and_back(package: str, kind: str, name: str) -> None:
+    type_name = f"{package}/{kind}/{name}"
+    assert ros_graph.ros_type(ros_graph.dds_type(type_name)) == type_name
+
+
+def test_names_as_ros_has_them() -> None:
+    assert ros_graph.dds_topic("/robot_1/odom") == "rt/robot_1/odom"
+    assert ros_graph.dds_type("nav_msgs/msg/Odometry") == "nav_msgs::msg::dds_::Odometry_"
+    assert ros_graph.ros_topic("rq/add_two_ints") is None
+    assert ros_graph.ros_topic("ros_discovery_info") is None
+    assert ros_graph.ros_type("HelloWorld") == "HelloWorld"
+
+
+def test_domain_from_argument_and_environment() -> None:
+    assert ros_graph.resolve_domain_id(-1, {}) == 0
+    assert ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": ""}) == 0
+    assert ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": "42"}) == 42
+    assert ros_graph.resolve_domain_id(7, {"ROS_DOMAIN_ID": "42"}) == 7
+    for text in ("233", "-1", "1.0", "four"):
+        with pytest.raises(ConfigError, match="ROS_DOMAIN_ID"):
+            ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": text})
+
+
+def test_localhost_from_environment() -> None:
+    assert not ros_graph.localhost_only({}) and not ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "0"})
+    assert ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "1"})
+    with pytest.raises(ConfigError, match="ROS_LOCALHOST_ONLY"):
+        ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "true"})
+
+
+@pytest.mark.parametrize(("distro", "size"), [("", 24), ("humble", 24), ("iron", 16), ("jazzy", 16), ("rolling", 16)])
+def test_gid_follows_the_distribution(distro: str, size: int) -> None:
+    assert ros_graph.gid_size({"ROS_DISTRO": distro} if distro else {}) == size
+
+
+@pytest.mark.parametrize("gid_bytes", [24, 16])
+@pytest.mark.parametrize("node_name", ["n", "radio", "four", "gr_ros2"])
+def test_discovery_info_reads_as_the_message_it_is(gid_bytes: int, node_name: str) -> None:
+    guids = [bytes([i] * 16) for i in range(4)]
+    data = ros_graph.participant_entities_info(
+        guids[0], node_name, "/robot_1", guids[1:2], guids[2:], gid_bytes=gid_bytes
+    )
+    store = get_typestore(Stores.EMPTY)
+    for name, text in HUMBLE_MSGS.items():
+        store.register(get_types_from_msg(text.replace("24", str(gid_bytes)).replace("char", "uint8"), name))
+    info = store.deserialize_cdr(data, "rmw_dds_common/msg/ParticipantEntitiesInfo")
+    (node,) = info.node_entities_info_seq  # type: ignore[attr-defined]
+    assert (node.node_namespace, node.node_name) == ("/robot_1", node_name)
+    assert [bytes(gid.data)[:16] for gid in node.reader_gid_seq] == guids[1:2]
+    assert [bytes(gid.data)[:16] for gid in node.writer_gid_seq] == guids[2:]
+    assert bytes(info.gid.data) == guids[0].ljust(gid_bytes, b"\0")  # type: ignore[attr-defined]
+
+
+def test_definitions() -> None:
+    text, digest = definition("nav_msgs/msg/Odometry")
+    assert "MSG: geometry_msgs/PoseWithCovariance" in text and digest.startswith("RIHS01_")
+    assert type_hash("nav_msgs/msg/Odometry") == digest
+    assert type_hash("robot_msgs/msg/WheelState") == ""
+    assert definition("robot_msgs/msg/WheelState")[0] == UNKNOWN
+    assert definition("robot_msgs/msg/WheelState", {"robot_msgs/msg/WheelState": "float32 speed\n"})[0] != UNKNOWN
