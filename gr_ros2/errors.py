@@ -7,7 +7,7 @@
     │   ├── LengthError · CrcError · VersionError · NoEntriesError
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   └── EncodeError
-    ├── MessageTooLargeError (ValueError)  a message no packet sequence of this size can carry
+    ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   └── BagError                    a bag cannot be read or written
     ├── PhyError (RuntimeError)         the flowgraph or radio failed
@@ -106,8 +106,10 @@ class EncodeError(WireError):
     kind = "encode"
 
 
-class MessageTooLargeError(GrRos2Error, ValueError):
-    """A message that needs more than 255 entries at this packet_len."""
+class CodecError(GrRos2Error, ValueError):
+    """A coded message that cannot be decoded here. ``row`` is the ledger row it ends in."""
+
+    row = "unsupported"
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

@@ -240,7 +240,7 @@ class RclpyMiddleware(Middleware):
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
     def in_executor(self, work: Callable[[], None]) -> None:
-        """Run it in the executor's thread, waiting ``JOIN_S`` at most; once closed all is destroyed and it is not run."""
+        """Run it in the executor's thread, waiting ``JOIN_S`` at most; not once closed: all is destroyed then."""
         if threading.current_thread() is self._thread:
             work()
             return

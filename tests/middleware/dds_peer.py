@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from typing import Any
 
-from gr_ros2.middleware import Publisher, Qos, Subscription
+from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.middleware.dds import DdsMiddleware
 
 
-def report_matches(endpoint: Publisher | Subscription, stop: threading.Event) -> None:
-    last = -1
+def report(middleware: Middleware, endpoint: Publisher | Subscription, stop: threading.Event) -> None:
+    """Say whenever the number of matches or a counter changes."""
+    last: tuple[int, str] | None = None
     while not stop.wait(0.01):
-        matched = endpoint.matched()
-        if matched != last:
-            print("matched", matched, flush=True)
-            last = matched
+        now = endpoint.matched(), json.dumps(middleware.counters)
+        if now != last:
+            print(f"matched {now[0]}\ncounters {now[1]}", flush=True)
+            last = now
 
 
 def main(domain: str, topic: str, type_name: str, role: str, *qos_words: str) -> None:
@@ -27,9 +29,9 @@ def main(domain: str, topic: str, type_name: str, role: str, *qos_words: str) ->
     if role == "pub":
         endpoint = middleware.advertise(topic, type_name, qos)
     else:
-        endpoint = middleware.subscribe(topic, type_name, qos, lambda data: print("data", data.hex(), flush=True))
+        endpoint = middleware.subscribe(topic, type_name, qos, lambda data: print(f"data {data.hex()}", flush=True))
     stop = threading.Event()
-    reporter = threading.Thread(target=report_matches, args=(endpoint, stop))
+    reporter = threading.Thread(target=report, args=(middleware, endpoint, stop))
     reporter.start()
     print("ready", flush=True)
     for line in sys.stdin:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import threading
@@ -46,11 +47,15 @@ def same(received: bytes, sent: bytes, padding: int) -> bool:
 
 
 class Peer:
-    """A publisher or subscriber in another process: ``matched N`` and ``data HEX`` lines out, hex lines in."""
+    """A publisher or subscriber in another process: ``ready``, ``matched N``, ``data HEX`` out, hex lines in.
+
+    Ours also says ``counters JSON``.
+    """
 
     def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
         self.matched = 0
         self.received: list[bytes] = []
+        self.counters: dict[str, int] = {}
         self.ready = False
         self._process = subprocess.Popen(
             list(command),
@@ -71,6 +76,8 @@ class Peer:
                 self.ready = True
             elif word == "matched":
                 self.matched = int(rest)
+            elif word == "counters":
+                self.counters = json.loads(rest)
             elif word == "data":
                 self.received.append(bytes.fromhex(rest))
 
@@ -79,6 +86,9 @@ class Peer:
         for payload in payloads:
             self._process.stdin.write(payload.hex() + "\n")
         self._process.stdin.flush()
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
 
     def close(self) -> None:
         """End of input makes a peer leave the graph; one that does not is ended."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -192,6 +193,53 @@ def test_another_type_under_the_same_name_is_counted(join: Callable[..., DdsMidd
     there.advertise("/a", CUSTOM, LATCHED)
     wait_for(lambda: here.counters["incompatible_type:/a"] == 1, "the counter")
     assert subscription.matched() == 0 and subscription.qos == Qos("best_effort", "volatile", 100)
+
+
+def test_what_a_stopped_process_misses_is_counted_as_lost(
+    join: Callable[..., DdsMiddleware], peer: Callable[..., Peer]
+) -> None:
+    there = peer("sub", "/a", STRING, BEST_EFFORT)
+    publisher = join().advertise("/a", STRING, BEST_EFFORT)
+    wait_for(lambda: publisher.matched() and there.matched, "match")
+    there.signal(signal.SIGSTOP)
+    for i in range(500):
+        publisher.publish(message(i, 8000))
+    there.signal(signal.SIGCONT)
+
+    def lost() -> bool:
+        publisher.publish(message(999))
+        return there.counters.get("samples_lost:/a", 0) > 0
+
+    wait_for(lost, "a count of lost messages")
+
+
+def test_a_subscriber_that_does_not_keep_up_blocks_for_a_second_at_most(
+    join: Callable[..., DdsMiddleware], peer: Callable[..., Peer]
+) -> None:
+    there = peer("sub", "/a", STRING, RELIABLE)
+    middleware = join()
+    publisher = middleware.advertise("/a", STRING, RELIABLE)
+    wait_for(lambda: publisher.matched() and there.matched, "match")
+    there.signal(signal.SIGSTOP)
+    sent = 0
+    with pytest.raises(MiddlewareError, match="does not keep up"):
+        for _ in range(10_000):
+            publisher.publish(message(sent, 8000))
+            sent += 1
+    there.signal(signal.SIGCONT)
+    assert middleware.counters == {"publish_blocked:/a": 1}
+    wait_for(lambda: len(there.received) >= sent, "what was accepted")
+    assert there.received == [message(i, 8000) for i in range(sent)]
+
+
+def test_a_program_that_forgets_to_close_ends_all_the_same() -> None:
+    script = (
+        "from gr_ros2.middleware.dds import DdsMiddleware, Qos\n"
+        f"m = DdsMiddleware(domain_id={domain()}, localhost_only=True)\n"
+        "m.subscribe('/a', 'std_msgs/String', Qos(), print)\n"
+        "m.advertise('/a', 'std_msgs/String', Qos()).publish(bytes([0, 1, 0, 0, 1, 0, 0, 0, 0]))\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], cwd=ROOT, timeout=60).returncode == 0
 
 
 def test_domains_do_not_mix(join: Callable[..., DdsMiddleware]) -> None:
