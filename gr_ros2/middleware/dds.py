@@ -1,8 +1,7 @@
 """The embedded middleware: a DDS participant of our own, visible to and usable by ROS 2 nodes, without a ROS install.
 
-Laws: one thread per participant receives, discovers and calls back; a subscription whose reliability or durability
-is left open asks only for what all publishers found offer, and changes readers when that changes: the old reader
-stays for ``OVERLAP_S`` while the new one is being found, and what both receive is delivered once.
+Laws: one thread per participant receives, discovers and calls back; its tables are guarded by one lock, never held
+while calling back or waiting.
 """
 
 from __future__ import annotations
@@ -12,14 +11,13 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
-from gr_ros2.middleware.adapt import settle
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Middleware, Qos, TopicInfo
 from gr_ros2.middleware.cdr_dds import (
-    BATCH,
     DdsError,
     DiscoveredEndpoint,
     EndpointWatch,
@@ -31,172 +29,13 @@ from gr_ros2.middleware.cdr_dds import (
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
+from gr_ros2.middleware.dds_endpoints import JOIN_S, SLACK, DdsPublisher, DdsSubscription
 from gr_ros2.registry import normalize_type
 
-OVERLAP_S = 2.0
-"""s an outdated reader stays beside its successor: Fast DDS may take a second to send to a new reader."""
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
-
-_SEEN_PER_PUBLISHER = 256
-_SEEN_PUBLISHERS = 64
-_LEAST = Qos("best_effort", "volatile")
-"""Asks for the least, and so is matched by every publisher."""
 _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
 _PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
 
 _log = logging.getLogger(__name__)
-
-
-class DdsPublisher(Publisher):
-    """A writer. ``publish`` may be called from any thread."""
-
-    def __init__(self, middleware: DdsMiddleware, topic: str, writer: RawWriter) -> None:
-        self._middleware = middleware
-        self._topic = topic
-        self.writer = writer
-        self._closed = False
-
-    def publish(self, payload: bytes) -> None:
-        """Publish; the payload arrives with up to 3 zeros behind it.
-
-        :raises MiddlewareError: closed, no CDR (less than 5 bytes, unknown encapsulation), or a reliable subscriber
-            did not take unbounded or large messages within a second (counted as ``publish_blocked:/topic``)
-        """
-        if self._closed or self._middleware.closed:
-            raise MiddlewareError(f"publish on {self._topic}: the publisher is closed")
-        try:
-            self.writer.write(payload)
-        except DdsError as error:
-            if error.timeout:
-                explanation = "a reliable subscriber does not keep up; one message was not published"
-                self._middleware.count(f"publish_blocked:{self._topic}", f"{self._topic}: {explanation}")
-                raise MiddlewareError(f"publish on {self._topic}: {explanation}") from error
-            raise MiddlewareError(f"publish on {self._topic}: {error}") from error
-
-    def matched(self) -> int:
-        return 0 if self._closed or self._middleware.closed else self.writer.matched()
-
-    def service(self) -> None:
-        """Called by the thread when the library has something to tell about this writer."""
-        self._middleware.count_incompatible(self._topic, self.writer.incompatible(), ())
-
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            self._middleware.forget(self)
-
-
-class DdsSubscription(Subscription):
-    """A reader, and for a while its predecessors."""
-
-    def __init__(
-        self, middleware: DdsMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
-    ) -> None:
-        self.topic = topic
-        self.type_name = type_name
-        self._middleware = middleware
-        self._callback = callback
-        self._wanted = qos
-        self._open_policies = [name for name in ("reliability", "durability") if getattr(qos, name) is None]
-        self._lock = threading.RLock()  # held while readers change or deliver
-        self._closed = False
-        self._qos: Qos | None = None
-        self._reader: RawReader | None = None
-        self._outdated: list[tuple[float, RawReader]] = []
-        self._seen: dict[int, dict[int, Entity]] = {}  # publisher -> stamp -> reader that had it
-
-    @property
-    def qos(self) -> Qos | None:
-        """What the reader currently asks for."""
-        return self._qos
-
-    def adapt(self, offers: Iterable[Qos]) -> None:
-        """Ask for what all publishers offer. Without any, leave things as they are, at first the least."""
-        offers = list(offers)
-        with self._lock:
-            if self._closed or (self._reader and not offers):
-                return
-            qos = settle(self._wanted, offers or [_LEAST])
-            if qos == self._qos:
-                return
-            if self._reader:
-                _log.info("%s: asking for %s, %s from now on", self.topic, qos.reliability, qos.durability)
-                self._outdated.append((time.monotonic() + OVERLAP_S, self._reader))
-            self._reader = self._middleware.make_reader(self, qos)
-            self._qos = qos
-        self._middleware.announce()
-
-    @property
-    def outdated(self) -> float | None:
-        """When the oldest outdated reader is due (time.monotonic()), None without any."""
-        outdated = self._outdated
-        return outdated[0][0] if outdated and not self._closed else None
-
-    def retire(self, now: float) -> None:
-        """Delete readers whose time is over, with what they still hold delivered."""
-        with self._lock:
-            if self._closed:
-                return
-            over = [reader for until, reader in self._outdated if until <= now]
-            self._outdated = [(until, reader) for until, reader in self._outdated if until > now]
-            for reader in over:
-                while self.service(reader) == BATCH:
-                    pass
-                self._middleware.drop_reader(reader)
-            if over:
-                self._middleware.announce()
-
-    def service(self, reader: RawReader) -> int:
-        """Deliver what one reader holds, at most BATCH; returns how many there were."""
-        with self._lock:
-            if self._closed:
-                return 0
-            lost = reader.lost()
-            if lost:
-                self._middleware.count(f"samples_lost:{self.topic}", f"{self.topic}: the DDS lost messages", lost)
-            self._middleware.count_incompatible(self.topic, reader.incompatible(), self._open_policies)
-            samples = reader.take()
-            for payload, source, stamp in samples:
-                if self._open_policies and self._repeated(source, stamp, reader.entity):
-                    continue
-                if self._closed:
-                    break
-                self._middleware.deliver(self.topic, self._callback, payload)
-            return len(samples)
-
-    def _repeated(self, source: int, stamp: int, reader: Entity) -> bool:
-        """Whether another reader of this subscription had that message."""
-        stamps = self._seen.get(source)
-        if stamps is None:
-            if len(self._seen) >= _SEEN_PUBLISHERS:
-                del self._seen[next(iter(self._seen))]
-            stamps = self._seen[source] = {}
-        if stamps.setdefault(stamp, reader) != reader:
-            return True
-        if len(stamps) > _SEEN_PER_PUBLISHER:
-            del stamps[next(iter(stamps))]
-        return False
-
-    def matched(self) -> int:
-        reader = self._reader
-        return 0 if self._closed or self._middleware.closed or reader is None else reader.matched()
-
-    def readers(self) -> list[RawReader]:
-        return [*([self._reader] if self._reader else []), *(reader for _, reader in self._outdated)]
-
-    def mute(self) -> None:
-        """No callback begins from now on."""
-        self._closed = True
-
-    def close(self) -> None:
-        if self._closed:
-            return
-        self.mute()
-        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
-        if self._lock.acquire(timeout=JOIN_S):
-            self._lock.release()
-        self._middleware.forget(self)
 
 
 class DdsMiddleware(Middleware):
@@ -319,6 +158,8 @@ class DdsMiddleware(Middleware):
 
     def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:
         topic = self._topic(subscription.topic, subscription.type_name)
+        if qos.depth and qos.durability == "volatile":
+            qos = replace(qos, depth=qos.depth + SLACK)
         reader = RawReader(self._participant, topic, qos, self._user_data(subscription.type_name))
         self._attach(reader.entity, (reader.entity, reader.condition), partial(subscription.service, reader))
         return reader

@@ -162,7 +162,7 @@ class RclpyMiddleware(Middleware):
 
         :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
         """
-        self._check_open()
+        self.check_open()
         subscription = _RclpySubscription(self, topic, type_name, qos, callback)
         subscription.adapt()
         self._subscriptions.append(subscription)
@@ -173,12 +173,12 @@ class RclpyMiddleware(Middleware):
 
         :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
         """
-        self._check_open()
+        self.check_open()
         return _RclpyPublisher(self, topic, type_name, qos)
 
     def discover(self) -> list[TopicInfo]:
         """See base. One row per type where a topic has several; depths only where the RMW announces them."""
-        self._check_open()
+        self.check_open()
         node = self._node
         found = []
         with _translated("the graph cannot be read"):
@@ -208,6 +208,11 @@ class RclpyMiddleware(Middleware):
     def closing(self) -> bool:
         """No callback begins from now on."""
         return self._closing.is_set()
+
+    def check_open(self) -> None:
+        """:raises MiddlewareError: closed, or its context was shut down from outside"""
+        if not self._open or self._closing.is_set():
+            raise MiddlewareError("rclpy: the middleware is closed")
 
     def publishers_of(self, topic: str, type_name: str) -> dict[bytes, Qos]:
         """What the publishers of a topic and type offer, our own included, by their ids; others are counted."""
@@ -255,10 +260,6 @@ class RclpyMiddleware(Middleware):
             self._subscriptions.remove(subscription)
 
     # Internals
-
-    def _check_open(self) -> None:
-        if not self._open or self._closing.is_set():
-            raise MiddlewareError("rclpy: the middleware is closed")
 
     def _trigger(self) -> bool:
         """Wake the executor; False when it has ended."""
@@ -424,6 +425,7 @@ class _RclpyPublisher(Publisher):
     def publish(self, payload: bytes) -> None:
         if self._closed:
             raise MiddlewareError(f"{self._topic}: the publisher is closed")
+        self._middleware.check_open()
         if len(payload) < ENCAPSULATION:  # an empty one makes rclpy's subscribers deaf
             raise MiddlewareError(f"{self._topic}: {len(payload)} bytes are no serialized message")
         with _translated(f"{self._topic}: publishing {len(payload)} bytes failed"):

@@ -195,22 +195,28 @@ def test_another_type_under_the_same_name_is_counted(join: Callable[..., DdsMidd
     assert subscription.matched() == 0 and subscription.qos == Qos("best_effort", "volatile", 100)
 
 
-def test_what_a_stopped_process_misses_is_counted_as_lost(
-    join: Callable[..., DdsMiddleware], peer: Callable[..., Peer]
-) -> None:
-    there = peer("sub", "/a", STRING, BEST_EFFORT)
-    publisher = join().advertise("/a", STRING, BEST_EFFORT)
-    wait_for(lambda: publisher.matched() and there.matched, "match")
-    there.signal(signal.SIGSTOP)
-    for i in range(500):
-        publisher.publish(message(i, 8000))
-    there.signal(signal.SIGCONT)
+@pytest.mark.parametrize("depth", [3, 100])
+def test_depth_bounds_what_waits_and_drops_are_counted(join: Callable[..., DdsMiddleware], depth: int) -> None:
+    here, there = join(), join()
+    reached, release = threading.Event(), threading.Event()
+    received: list[bytes] = []
 
-    def lost() -> bool:
-        publisher.publish(message(999))
-        return there.counters.get("samples_lost:/a", 0) > 0
+    def callback(payload: bytes) -> None:
+        received.append(payload)
+        reached.set()
+        release.wait(20)
 
-    wait_for(lost, "a count of lost messages")
+    subscription = here.subscribe("/a", STRING, Qos("reliable", "volatile", depth), callback)
+    publisher = there.advertise("/a", STRING, RELIABLE)
+    wait_for(lambda: publisher.matched() and subscription.matched(), "match")
+    publisher.publish(message(0))
+    wait_for(reached.is_set, "the first callback")
+    for i in range(1, 201):
+        publisher.publish(message(i))  # within a process the DDS hands over before this returns
+    release.set()
+    wait_for(lambda: len(received) == depth + 1, "what was kept")
+    assert received == [message(i) for i in (0, *range(201 - depth, 201))]
+    assert here.counters == {"samples_lost:/a": 200 - depth}
 
 
 def test_a_subscriber_that_does_not_keep_up_blocks_for_a_second_at_most(

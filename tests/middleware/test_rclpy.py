@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -331,10 +333,48 @@ def test_after_close_everything_says_so(start: Start) -> None:
 def test_context_shut_down_from_outside_ends_in_errors_not_in_a_hang(start: Start) -> None:
     one = start()
     subscription = one.subscribe("/chatter", STRING, RELIABLE, print)
+    publisher = one.advertise("/chatter", STRING, RELIABLE)
     one._context.shutdown()  # as rclpy's handler of SIGINT in a host does to every context
     one._thread.join(20)
     assert not one._thread.is_alive()
-    with pytest.raises(MiddlewareError, match="closed"):
+    with pytest.raises(MiddlewareError, match="the middleware is closed"):
         one.advertise("/chatter", STRING, RELIABLE)
+    with pytest.raises(MiddlewareError, match="the middleware is closed"):
+        publisher.publish(text("x"))
     subscription.close()
     one.close()
+
+
+def test_close_does_not_wait_for_a_callback_that_never_returns(start: Start) -> None:
+    one = start()
+    entered, release = threading.Event(), threading.Event()
+
+    def hang(_: bytes) -> None:
+        entered.set()
+        release.wait(60)
+
+    subscription = one.subscribe("/chatter", STRING, RELIABLE, hang)
+    publisher = one.advertise("/chatter", STRING, RELIABLE)
+    wait_for(publisher.matched)
+    publisher.publish(text("x"))
+    publisher.publish(text("y"))
+    assert entered.wait(20)
+    subscription.close()
+    one.close()
+    assert not release.is_set()
+    entered.clear()
+    release.set()
+    one._thread.join(20)
+    assert not one._thread.is_alive()
+    assert not entered.is_set(), "a callback began after close"
+
+
+def test_a_process_that_forgets_to_close_ends_cleanly() -> None:
+    program = f"""
+from gr_ros2.middleware import MIDDLEWARE, Qos
+middleware = MIDDLEWARE.load("rclpy")(domain_id={DOMAIN})
+middleware.subscribe("/chatter", "{STRING}", Qos(), print)
+middleware.advertise("/chatter", "{STRING}", Qos()).publish(b"\\0\\1\\0\\0\\1\\0\\0\\0\\0")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
