@@ -6,7 +6,6 @@ block of this process is checked against every other when it is made.
 
 from __future__ import annotations
 
-import sys
 import threading
 import weakref
 from collections.abc import Iterable, Mapping
@@ -18,10 +17,6 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.ros_graph import resolve_domain_id
 from gr_ros2.registry import Registry
-
-SWITCH_INTERVAL_S = 5e-5
-"""Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
-default of 5 ms (two hops), 0.2 ms with this."""
 
 _MAX_SRC_ID = 255
 _T = TypeVar("_T")
@@ -149,9 +144,3 @@ class LoopGuard:
 
 
 LOOP_GUARD = LoopGuard()
-
-
-def quicken_threads() -> None:
-    """Let Python threads hand over quickly; for the whole process, since there is only one such setting."""
-    if sys.getswitchinterval() > SWITCH_INTERVAL_S:
-        sys.setswitchinterval(SWITCH_INTERVAL_S)

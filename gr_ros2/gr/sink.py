@@ -18,12 +18,13 @@ from gnuradio import gr
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import GrRos2Error, MiddlewareError
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, quicken_threads, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, read_registry, replaced, settings
 from gr_ros2.gr.latency import CLOCK_TYPE, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import PDUS, packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.phy.threads import BlockThread, quicken_threads
 from gr_ros2.registry import Registry
 
 _JOIN_S = 1.0
@@ -70,6 +71,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._timer_idle = False
         self._running = False
         self._thread: threading.Thread | None = None
+        self._block_thread = BlockThread()
         self._counters: Counter[str] = Counter()
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
@@ -107,6 +109,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         quicken_threads()
+        self._block_thread.keep()
         with self._lock:
             self._running = True
         self._thread = threading.Thread(target=self._watch_timeouts, name="gr-ros2-sink", daemon=True)
@@ -120,6 +123,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
+        self._block_thread.release()
         return True
 
     def close(self) -> None:

@@ -20,11 +20,12 @@ from gnuradio import gr
 
 from gr_ros2.config import SourceConfig
 from gr_ros2.errors import GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, quicken_threads, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, read_registry, replaced, settings
 from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Refused, Sender, SenderEvent
 from gr_ros2.middleware import Middleware, Qos, Subscription
+from gr_ros2.phy.threads import BlockThread, quicken_threads
 from gr_ros2.registry import Registry
 
 _BATCH = 16
@@ -75,11 +76,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._running = False
         self._closed = False
         self._thread: threading.Thread | None = None
+        self._block_thread = BlockThread()
         self._unread = False
         self._counters: Counter[str] = Counter()
         self._said: set[tuple[int, str]] = set()
         self._subscriptions: list[Subscription] = []
         self.message_port_register_out(PDUS)
+        self._publish = self.message_port_pub  # found through two proxies otherwise, for every packet
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
         chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
@@ -123,6 +126,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         quicken_threads()
+        self._block_thread.keep()
         self._unread = pmt.is_null(self.message_subscribers(PDUS))
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
@@ -139,6 +143,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
+        self._block_thread.release()
         return True
 
     def close(self) -> None:
@@ -279,7 +284,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         for data in packets:
             if self.config.debug:
                 self._log.debug("tx %s", describe_bytes(data, self.config.packet_len, self.registry))
-            self.message_port_pub(PDUS, self._pdus.pdu(data, wall))
+            self._publish(PDUS, self._pdus.pdu(data, wall))
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)

@@ -54,7 +54,7 @@ class AirtimeClock(Generic[T]):
     def grants(self, now: float) -> int:
         """Credits to give out at ``now``; they count as given."""
         given = 0
-        while self._promised_until(now) <= now + self._lead:
+        while self._promised_until(now) - self._lead <= now:
             self._unused += 1
             given += 1
         return given

@@ -18,6 +18,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
+from gr_ros2.phy.threads import BlockThread, quicken_threads
 
 Pace = Literal["airtime", "flow"]
 WINDOW = 32
@@ -67,6 +68,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._changed = threading.Condition()
         self._running = False
         self._thread: threading.Thread | None = None
+        self._block_thread = BlockThread()
         self.message_port_register_in(_PDUS)
         self.message_port_register_out(_PDUS)
         self.message_port_register_out(_CREDIT)
@@ -78,6 +80,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return self._clock.backlog if self._clock is not None else 0
 
     def start(self) -> bool:
+        quicken_threads()
+        self._block_thread.keep()
         with self._changed:
             self._running = True
         self._thread = threading.Thread(target=self._run, name="gr-ros2-airtime", daemon=True)
@@ -91,6 +95,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
+        self._block_thread.release()
         return True
 
     def _arrive(self, pdu: Any) -> None:

@@ -42,6 +42,9 @@ class Phy(ABC):
     def burst_power(self) -> float:
         """Mean of the squared magnitude of one packet's samples, gap excluded; 0 for a PHY without samples."""
 
+    def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
+        """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
+
     @abstractmethod
     def transmitter(self) -> Any:
         """A fresh hier block: message port `pdus` in, one complex stream out.

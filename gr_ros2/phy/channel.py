@@ -17,6 +17,7 @@ from gnuradio import channels, gr
 
 from gr_ros2.config import ChannelConfig, build
 from gr_ros2.phy.base import Phy
+from gr_ros2.phy.threads import BlockThread
 
 _PDUS = pmt.intern("pdus")
 
@@ -50,7 +51,7 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
         self.connect(self, self._model, self)
 
     def set_snr_db(self, snr_db: float | None) -> None:
-        """dB, None = no noise.
+        """dB, None = no noise; heard about 8192 samples later, since the noise source has filled its buffer by then.
 
         :raises ConfigError: out of range
         """
@@ -84,6 +85,7 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         self.set_probability(probability)
         self.received = 0
         self.dropped = 0
+        self._block_thread = BlockThread()
         self.message_port_register_in(_PDUS)
         self.message_port_register_out(_PDUS)
         self.set_msg_handler(_PDUS, self._pass)
@@ -94,6 +96,14 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         :raises ConfigError: out of range
         """
         self._probability = build(ChannelConfig, {"packet_loss": probability}).packet_loss
+
+    def start(self) -> bool:
+        self._block_thread.keep()
+        return True
+
+    def stop(self) -> bool:
+        self._block_thread.release()
+        return True
 
     def _pass(self, pdu: Any) -> None:
         self.received += 1

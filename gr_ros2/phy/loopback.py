@@ -65,11 +65,13 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         self.source = source
         self.sink = sink
         self._running = False
-        flow = pace == "flow"
+        self._pace = pace
         self._transmitter = phy.transmitter() if phy.has_samples else None
         self._channel = Channel(channel, phy) if phy.has_samples else None
         # Each Python block costs a packet as much as source or sink do, so none stands here that does nothing.
-        self._gate = AirtimeGate(phy.airtime(), pace, progress=self._progress) if phy.has_samples or flow else None
+        self._gate = (
+            AirtimeGate(phy.airtime(), pace, progress=self._progress) if phy.has_samples or pace == "flow" else None
+        )
         self._loss = PacketLoss(channel.packet_loss, channel.seed) if phy.has_samples or channel.packet_loss else None
         last = source
         if self._gate is not None:
@@ -97,6 +99,8 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         except RuntimeError as error:
             self.stop()
             raise PhyError(f"phy {self.phy.name}: the flowgraph does not start ({error})") from error
+        if self._pace == "airtime":
+            self.phy.prefer_latency()
 
     def stop(self) -> None:
         """Stop and wait for every thread; harmless when it is not running."""

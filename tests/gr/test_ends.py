@@ -1,0 +1,65 @@
+"""The loop guard and the settings both blocks share."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr.ends import Graph, check_loop, read_registry, replaced, settings
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.registry import Registry
+
+REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
+
+
+def test_a_sink_that_feeds_a_source_is_refused() -> None:
+    with pytest.raises(ConfigError, match="/rx_robot_7/odom"):
+        check_loop(["/rx_robot_7/odom"], SinkConfig(), REGISTRY)
+    with pytest.raises(ConfigError, match="/robot_1/odom"):
+        check_loop(["/robot_1/odom"], SinkConfig(namespace_format="/robot_1"), REGISTRY)
+
+
+def test_publish_as_counts() -> None:
+    registry = REGISTRY.with_options({"tf": TopicOptions(publish_as="/tf")})
+    with pytest.raises(ConfigError, match="/tf"):
+        check_loop(["/tf"], SinkConfig(), registry)
+
+
+def test_other_topics_are_fine() -> None:
+    check_loop(["/robot_1/odom", "/tf", "/rx_robot_300/odom"], SinkConfig(), REGISTRY)
+
+
+def test_the_same_graph_is_the_same_domain() -> None:
+    graphs = [Graph(None, "memory", domain, "node") for domain in (51, 51, 52)]
+    try:
+        assert graphs[0].same_as(graphs[1])
+        assert not graphs[0].same_as(graphs[2])
+        with MemoryMiddleware(domain_id=52) as opened:
+            assert graphs[2].same_as(Graph(opened, "memory", -1, "node"))
+    finally:
+        for graph in graphs:
+            graph.close()
+
+
+def test_what_was_handed_over_is_not_closed() -> None:
+    with MemoryMiddleware(domain_id=53) as opened:
+        Graph(opened, "memory", 53, "node").close()
+        assert not opened.closed
+
+
+def test_a_bag_must_be_opened_by_hand() -> None:
+    with pytest.raises(ConfigError, match="path"):
+        Graph(None, "bag", -1, "node")
+
+
+def test_settings_name_what_is_wrong() -> None:
+    with pytest.raises(ConfigError, match="packet_len = 13"):
+        settings(SourceConfig, {"packet_len": 13}, "x.csv", None)
+    with pytest.raises(ConfigError, match="unknown key colour"):
+        settings(SinkConfig, {"colour": 1}, "x.csv", None)
+    with MemoryMiddleware(domain_id=54) as opened:
+        assert settings(SinkConfig, {}, "x.csv", opened).middleware == "memory"
+    assert replaced(SinkConfig(), debug=True).debug
+    with pytest.raises(ConfigError, match="registry is missing"):
+        read_registry("")

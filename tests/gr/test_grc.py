@@ -1,0 +1,160 @@
+"""GRC: descriptions that pass its own check, say what the code says, and examples that compile and carry messages."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import yaml
+from gnuradio import gr
+from gnuradio.grc.core.platform import Platform
+from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.grc_path import example, grc_path
+from gr_ros2.link import SCHEDULER
+from gr_ros2.middleware import MIDDLEWARE, Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from tests.gr.probe import wait_for
+
+DESCRIPTIONS = sorted(grc_path().glob("*.block.yml"))
+EXAMPLES = sorted(example("topics.csv").parent.glob("*.grc"))
+BLOCKS = {"ros2_source": (RosSource, SourceConfig), "ros2_sink": (RosSink, SinkConfig)}
+
+
+def description(name: str) -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((grc_path() / f"{name}.block.yml").read_text())
+    return loaded
+
+
+@pytest.mark.parametrize("path", DESCRIPTIONS, ids=lambda path: path.name)
+def test_it_passes_grcs_own_check(path: Path) -> None:
+    loaded = yaml.safe_load(path.read_text())
+    validator = Validator(BLOCK_SCHEME)
+    validator.run(loaded)
+    assert validator.messages == []
+    assert path.name == f"{loaded['id']}.block.yml"
+    assert loaded["category"] == "[ROS 2]"
+    assert loaded["documentation"]
+
+
+@pytest.mark.parametrize("name", list(BLOCKS))
+def test_parameters_and_defaults_are_those_of_the_configuration(name: str) -> None:
+    wanted = {
+        item.name: item.default if item.default is not MISSING else item.default_factory()
+        for item in fields(BLOCKS[name][1])
+    }
+    written = {}
+    for parameter in description(name)["parameters"]:
+        default = parameter["default"]
+        text = parameter["dtype"] in ("string", "file_open")
+        written[parameter["id"]] = default if text else ast.literal_eval(default)
+    written = {key: tuple(value) if isinstance(value, list) else value for key, value in written.items()}
+    plain = {key: getattr(value, "default_factory", lambda value=value: value)() for key, value in wanted.items()}
+    assert written == plain
+
+
+@pytest.mark.parametrize("name", list(BLOCKS))
+def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> None:
+    loaded = description(name)
+    for parameter in loaded["parameters"]:
+        assert f"{parameter['id']}=${{{parameter['id']}}}" in loaded["templates"]["make"]
+        assert f"{parameter['label'].split(' (')[0].rstrip('.')}".split()[0] in loaded["documentation"]
+    for callback in loaded["templates"]["callbacks"]:
+        assert hasattr(BLOCKS[name][0], callback.split("(")[0])
+
+
+def test_options_are_the_tables() -> None:
+    for name in BLOCKS:
+        options = {item["id"]: item.get("options") for item in description(name)["parameters"]}
+        assert [ast.literal_eval(option) for option in options["middleware"]] == [
+            name for name in MIDDLEWARE if name != "bag"
+        ]
+    options = {item["id"]: item.get("options") for item in description("ros2_source")["parameters"]}
+    assert [ast.literal_eval(option) for option in options["scheduler"]] == list(SCHEDULER)
+
+
+@pytest.fixture(scope="module")
+def platform() -> Platform:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GRC_BLOCKS_PATH", str(grc_path()))
+        platform = Platform(
+            name="test",
+            prefs=gr.prefs(),
+            version=gr.version(),
+            version_parts=(gr.major_version(), gr.api_version(), gr.minor_version()),
+        )
+        platform.build_library()
+    return platform
+
+
+def test_grc_lists_the_blocks(platform: Platform) -> None:
+    assert {path.name.removesuffix(".block.yml") for path in DESCRIPTIONS} <= set(platform.blocks)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_opens_without_a_complaint(platform: Platform, path: Path) -> None:
+    graph = platform.make_flow_graph(str(path))
+    graph.rewrite()
+    graph.validate()
+    assert [str(message) for message in graph.iter_error_messages()] == []
+
+
+@pytest.mark.parametrize(("setting", "value"), [("packet_len", "13"), ("robot_id", "255"), ("domain_id", "233")])
+def test_grc_refuses_what_the_block_would_refuse(platform: Platform, setting: str, value: str) -> None:
+    graph = platform.make_flow_graph(str(example("direct_loopback.grc")))
+    for name in BLOCKS:
+        graph.get_block(f"{name}_0").params[setting].set_value(value)
+    graph.rewrite()
+    graph.validate()
+    complaints = " ".join(str(message) for message in graph.iter_error_messages())
+    assert all(f"{name}_0" in complaints for name in BLOCKS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) -> None:
+    grcc = shutil.which("grcc")
+    assert grcc is not None, "grcc is missing; it comes with GNU Radio"
+    copy = tmp_path / path.name
+    # The same flowgraph on the graph of tests, which needs no discovery time.
+    copy.write_text(path.read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    assert "memory" in copy.read_text()
+    environ = {**os.environ, "GRC_BLOCKS_PATH": str(grc_path())}
+    done = subprocess.run(
+        [sys.executable, grcc, "-o", str(tmp_path), str(copy)], env=environ, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    spec = importlib.util.spec_from_file_location(path.stem, tmp_path / f"{path.stem}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    top = getattr(module, path.stem)()
+    heard: list[bytes] = []
+    try:
+        with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:
+            other.subscribe("/rx_robot_1/odom", "nav_msgs/Odometry", Qos(depth=0), heard.append)
+            top.start()
+            publisher = robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=0))
+            sent = [b"\0\1\0\0" + bytes([number]) * 720 for number in range(10)]
+            for payload in sent:
+                publisher.publish(payload)
+            wait_for(lambda: len(heard) == len(sent), "every message")
+            assert heard == sent
+    finally:
+        top.stop()
+        top.wait()
+        top.ros2_source_0.close()
+        top.ros2_sink_0.close()

@@ -1,0 +1,59 @@
+"""PDUs and back: any bytes survive, any garbage is named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import numpy as np
+import pmt
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.gr.pmts import PduMaker, packet_of
+
+
+@given(st.binary(min_size=14, max_size=4095))
+def test_bytes_survive(data: bytes) -> None:
+    assert packet_of(PduMaker().pdu(data, 0.0)) == (data, "")
+
+
+@given(st.binary(min_size=14, max_size=300))
+def test_a_pdu_is_what_gnu_radio_itself_would_make(data: bytes) -> None:
+    vector = pmt.cdr(PduMaker().pdu(data, 0.0))
+    assert pmt.equal(vector, pmt.init_u8vector(len(data), list(data)))
+
+
+def test_metadata_is_read_from_the_header() -> None:
+    maker = PduMaker()
+    for seq in (7, 8, 7):
+        metadata = pmt.to_python(pmt.car(maker.pdu(bytes([0b0000_0100, 3, 255, seq]) + bytes(60), 12.5)))
+        assert metadata == {"src_id": 3, "dst_id": 255, "seq": seq, "qos": 1, "t_src_wall": 12.5}
+
+
+def test_remembered_metadata_is_bounded() -> None:
+    maker = PduMaker()
+    for number in range(10_000):
+        maker.pdu(number.to_bytes(4, "big") + bytes(10), 0.0)
+    assert len(maker._metadata) <= 4096
+
+
+@pytest.mark.parametrize(
+    ("garbage", "reason"),
+    [
+        (pmt.PMT_NIL, "not_a_pair"),
+        (pmt.intern("x"), "not_a_pair"),
+        (pmt.from_long(3), "not_a_pair"),
+        (pmt.init_u8vector(3, [1, 2, 3]), "not_a_pair"),
+        (pmt.cons(pmt.PMT_NIL, pmt.PMT_NIL), "not_u8"),
+        (pmt.cons(pmt.make_dict(), pmt.intern("x")), "not_u8"),
+        (pmt.cons(pmt.make_dict(), pmt.init_s16vector(3, [1, 2, 3])), "not_u8"),
+        (pmt.cons(pmt.make_dict(), pmt.to_pmt(np.zeros(4, np.float32))), "not_u8"),
+        (pmt.cons(pmt.make_dict(), pmt.init_u8vector(0, [])), ""),
+    ],
+)
+def test_garbage_is_named(garbage: Any, reason: str) -> None:
+    assert packet_of(garbage) == (b"", reason)

@@ -1,0 +1,254 @@
+"""RosSink: packets in, ROS messages out; garbage is counted and nothing else is lost."""
+
+from __future__ import annotations
+
+import logging
+import random
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import pmt
+from gnuradio import gr
+
+from gr_ros2.config import SourceConfig
+from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.gr import RosSink
+from gr_ros2.link import Delivered, Lost, Sender
+from gr_ros2.middleware import Publisher, Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.registry import Registry
+from tests.gr.probe import Probe, wait_for
+
+REGISTRY = Registry.from_rows(
+    {"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid", "cmd_vel": "geometry_msgs/Twist"}
+)
+DOMAIN = 62
+PACKET_LEN = 64
+
+
+def packets(*messages: tuple[int, bytes], src_id: int = 1) -> list[bytes]:
+    """What a sender makes of messages given as (topic id, payload)."""
+    sender = Sender(REGISTRY, SourceConfig(robot_id=src_id, packet_len=PACKET_LEN, repeat_s=0), rng=random.Random(1))
+    for topic_id, payload in messages:
+        sender.submit(topic_id, payload, 0.0)
+    made = []
+    while (data := sender.next_packet(0.0)) is not None:
+        made.append(data)
+    return made
+
+
+def stamped(seconds: float) -> bytes:
+    """An Odometry, as far as the stamp goes."""
+    return b"\0\1\0\0" + struct.pack("<iI", int(seconds), int(seconds % 1 * 1e9)) + bytes(60)
+
+
+class Rig:
+    """A probe, a sink behind it, and someone who listens to what comes out."""
+
+    def __init__(self) -> None:
+        self.top = gr.top_block()
+        self.probe = Probe()
+        self.listener = MemoryMiddleware(domain_id=DOMAIN)
+        self.heard: list[bytes] = []
+        self.sink: RosSink | None = None
+
+    def make(self, **settings: Any) -> RosSink:
+        values = {"middleware": "memory", "domain_id": DOMAIN, "packet_len": PACKET_LEN, **settings}
+        self.sink = RosSink(REGISTRY, **values)
+        return self.sink
+
+    def start(self, topic: str = "/rx_robot_1/odom", kind: str = "nav_msgs/Odometry") -> None:
+        self.listener.subscribe(topic, kind, Qos(depth=0), self.heard.append)
+        self.top.msg_connect((self.probe, "pdus"), (self.sink, "pdus"))
+        self.top.start()
+
+    def close(self) -> None:
+        self.top.stop()
+        self.top.wait()
+        if self.sink is not None:
+            self.sink.close()
+        self.listener.close()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.close()
+
+
+def test_messages_come_out_unaltered_and_in_order(rig: Rig) -> None:
+    sink = rig.make(publisher_depth=0)
+    rig.start()
+    sent = [stamped(number) + bytes([number]) * 600 for number in range(1, 40)]
+    for data in packets(*((0, payload) for payload in sent)):
+        rig.probe.post(data)
+    wait_for(lambda: len(rig.heard) == len(sent))
+    assert rig.heard == sent
+    assert sink.stats()["topics"]["/rx_robot_1/odom"]["delivered"] == len(sent)
+
+
+def test_each_sender_has_its_topics(rig: Rig) -> None:
+    sink = rig.make(namespace_format="/from_{src_id}/x")
+    rig.start("/from_7/x/cmd_vel", "geometry_msgs/Twist")
+    for data in packets((2, b"\0\1\0\0" + bytes(48)), src_id=7) + packets((0, stamped(1)), src_id=8):
+        rig.probe.post(data)
+    wait_for(lambda: rig.heard)
+    wait_for(lambda: set(sink.stats()["topics"]) == {"/from_7/x/cmd_vel", "/from_8/x/odom"})
+
+
+def test_a_latched_topic_reaches_a_late_joiner(rig: Rig) -> None:
+    sink = rig.make()
+    rig.start()
+    for data in packets((1, b"\0\1\0\0" + bytes(200))):
+        rig.probe.post(data)
+    wait_for(lambda: "/rx_robot_1/map" in sink.stats()["topics"])
+    late: list[bytes] = []
+    rig.listener.subscribe("/rx_robot_1/map", "nav_msgs/OccupancyGrid", Qos(), late.append)
+    wait_for(lambda: late)
+
+
+def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
+    sink = rig.make()
+    rig.start()
+    good = packets((0, stamped(5)))
+    broken = bytes([good[0][0], *good[0][1:-1], good[0][-1] ^ 1])
+    garbage = [
+        pmt.PMT_NIL,
+        pmt.intern("x"),
+        pmt.cons(pmt.PMT_NIL, pmt.PMT_NIL),
+        pmt.cons(pmt.make_dict(), pmt.init_f32vector(3, [1, 2, 3])),
+    ]
+    for message in garbage:
+        rig.probe.post_message(message)
+    for data in (b"", bytes(13), bytes(PACKET_LEN), bytes(5000), broken, *good):
+        rig.probe.post(data)
+    wait_for(lambda: rig.heard == [stamped(5)])
+    stats = sink.stats()
+    assert (stats["not_a_pair"], stats["not_u8"], stats["handler_failed"]) == (2, 2, 0)
+    assert stats["rejected"]["length"] == 3
+    assert sum(stats["rejected"].values()) == 5
+    assert stats["handled"] == 9 + len(good)
+
+
+def test_an_incomplete_message_expires_without_further_packets(rig: Rig) -> None:
+    events: list[Any] = []
+    rig.make(reassembly_timeout=0.05, observer=events.append)
+    rig.start()
+    rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
+    wait_for(lambda: events)
+    assert isinstance(events[0], Lost)
+    assert events[0].reason == "expired"
+    assert rig.sink.stats()["topics"]["/rx_robot_1/odom"]["lost"] == {"expired": 1}
+
+
+def test_delivered_is_observed_after_publication(rig: Rig) -> None:
+    published: list[bytes] = []
+    seen: list[tuple[Any, int]] = []
+    with MemoryMiddleware(domain_id=DOMAIN) as middleware:
+        advertise = middleware.advertise
+
+        def watched(topic: str, type_name: str, qos: Qos) -> Publisher:
+            publisher = advertise(topic, type_name, qos)
+            publish = publisher.publish
+            publisher.publish = lambda payload: (publish(payload), published.append(payload))[0]
+            return publisher
+
+        middleware.advertise = watched
+        rig.make(middleware=middleware, observer=lambda event: seen.append((event, len(published))))
+        rig.start()
+        rig.probe.post(packets((0, stamped(5)[:40]))[0])
+        wait_for(lambda: seen)
+        assert isinstance(seen[0][0], Delivered)
+        assert seen[0][1] == 1
+        rig.sink.close()
+
+
+def test_a_failed_publication_is_counted_and_observed(rig: Rig) -> None:
+    events: list[Any] = []
+    middleware = MemoryMiddleware(domain_id=DOMAIN)
+    sink = rig.make(middleware=middleware, observer=events.append)
+    rig.start()
+    middleware.close()
+    with pytest.raises(MiddlewareError):
+        middleware.advertise("/x", "nav_msgs/Odometry", Qos())
+    rig.probe.post(packets((0, stamped(5)[:40]))[0])
+    wait_for(lambda: events)
+    assert events == [Lost(1, 0, "publish_failed", events[0].entry_id)]
+    assert sink.stats()["publish_failed"] == 1
+
+
+def test_a_failing_observer_does_not_end_reception(rig: Rig) -> None:
+    def fail(_event: Any) -> None:
+        raise ValueError("observer")
+
+    sink = rig.make(observer=fail)
+    rig.start()
+    for data in packets(*((0, stamped(number)[:40]) for number in (1, 2))):
+        rig.probe.post(data)
+    wait_for(lambda: len(rig.heard) == 2)
+    wait_for(lambda: sink.stats()["handler_failed"] == 2)
+
+
+def test_latency_by_wall_clock(rig: Rig) -> None:
+    sink = rig.make()
+    rig.start()
+    for data in packets((0, stamped(time.time() - 2)), (0, stamped(time.time() + 3600)), (2, bytes(52))):
+        rig.probe.post(data)
+    wait_for(lambda: sink.handled >= 2 and len(sink.stats()["topics"]) == 2)
+    wait_for(lambda: sink.stats()["topics"]["/rx_robot_1/odom"]["latency_s"]["measured"] == 2)
+    latency = sink.stats()["topics"]["/rx_robot_1/odom"]["latency_s"]
+    assert latency["max"] >= 2
+    assert latency["negative"] == 1
+    assert sink.stats()["topics"]["/rx_robot_1/cmd_vel"]["latency_s"] is None
+    assert sink.stats()["latency_clock"] == "stamp_wall"
+
+
+def test_latency_by_simulated_clock(rig: Rig) -> None:
+    sink = rig.make(use_sim_time=True)
+    rig.start()
+    clock = rig.listener.advertise("/clock", "rosgraph_msgs/Clock", Qos())
+    clock.publish(b"\0\1\0\0" + struct.pack("<iI", 100, 500_000_000))
+    wait_for(lambda: sink._sim_time == 100.5)
+    for data in packets((0, stamped(100.0))):
+        rig.probe.post(data)
+    wait_for(lambda: sink.stats()["topics"])
+    wait_for(lambda: sink.stats()["topics"]["/rx_robot_1/odom"]["latency_s"])
+    assert sink.stats()["topics"]["/rx_robot_1/odom"]["latency_s"]["p50"] == pytest.approx(0.5)
+    assert sink.stats()["latency_clock"] == "stamp_sim"
+
+
+def test_settings_change_while_running(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    sink = rig.make()
+    rig.start()
+    sink.set_reassembly_timeout(0.05)
+    with caplog.at_level(logging.DEBUG, "gr_ros2.gr.sink"):
+        sink.set_debug(True)
+        rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
+        wait_for(lambda: sink.stats()["topics"])
+        assert "rx v0 qos=default" in caplog.text
+    sink.set_debug(False)
+    with pytest.raises(ConfigError, match="reassembly_timeout"):
+        sink.set_reassembly_timeout(0.0)
+
+
+def test_stopped_started_and_closed_twice(rig: Rig) -> None:
+    sink = rig.make()
+    rig.start()
+    rig.top.stop()
+    rig.top.wait()
+    rig.top.start()
+    rig.probe.post(packets((0, stamped(5)[:40]))[0])
+    wait_for(lambda: rig.heard)
+    rig.top.stop()
+    rig.top.wait()
+    sink.close()
+    sink.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "gr-ros2-sink"]

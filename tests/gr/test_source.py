@@ -1,0 +1,253 @@
+"""RosSource: ROS messages in, packets out, nothing dropped without a name."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import pmt
+from gnuradio import gr
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.link import Accepted, Refused, SentPacket
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.registry import Registry
+from gr_ros2.wire import decode
+from tests.gr.probe import Probe, wait_for
+
+REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
+DOMAIN = 61
+
+
+class Rig:
+    """A source, a probe behind it, and a robot that publishes."""
+
+    def __init__(self) -> None:
+        self.top = gr.top_block()
+        self.probe = Probe()
+        self.robot = MemoryMiddleware(domain_id=DOMAIN)
+        self.source: RosSource | None = None
+
+    def make(self, **settings: Any) -> RosSource:
+        self.source = RosSource(
+            REGISTRY, **{"namespace": "/robot_1", "middleware": "memory", "domain_id": DOMAIN, **settings}
+        )
+        return self.source
+
+    def start(self, credit: bool = False) -> None:
+        self.top.msg_connect((self.source, "pdus"), (self.probe, "pdus"))
+        if credit:
+            self.top.msg_connect((self.probe, "credit"), (self.source, "credit"))
+        self.top.start()
+
+    def publish(self, payload: bytes, topic: str = "/robot_1/odom", count: int = 1) -> None:
+        publisher = self.robot.advertise(topic, REGISTRY.named(topic.rsplit("/", 1)[-1]).type_name, Qos(depth=0))
+        for _ in range(count):
+            publisher.publish(payload)
+
+    def close(self) -> None:
+        if self.source is not None:
+            self.source.close()
+        self.top.stop()
+        self.top.wait()
+        self.robot.close()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.close()
+
+
+def test_a_message_leaves_as_packets_with_metadata(rig: Rig) -> None:
+    before = time.time()
+    rig.make(packet_len=64, dst_id=9, hop=3)
+    rig.start()
+    rig.publish(b"\0\1\0\0" + bytes(720))
+    wait_for(lambda: rig.probe.handled == 15)
+    packets = [decode(data, 64) for data in rig.probe.packets]
+    assert {(packet.src_id, packet.dst_id, packet.hop) for packet in packets} == {(1, 9, 3)}
+    metadata = [pmt.to_python(pmt.car(message)) for message in rig.probe.messages]
+    assert [item["seq"] for item in metadata] == [packet.seq for packet in packets]
+    assert all(item["src_id"] == 1 and item["dst_id"] == 9 and item["qos"] == 0 for item in metadata)
+    assert all(before <= item["t_src_wall"] <= time.time() for item in metadata)
+
+
+def test_all_topics_or_a_subset(rig: Rig) -> None:
+    assert set(rig.make().subscribed) == {"/robot_1/odom", "/tf"}
+    rig.source.close()
+    assert set(rig.make(topics=["/odom"]).subscribed) == {"/robot_1/odom"}
+
+
+def test_messages_before_the_start_are_kept(rig: Rig) -> None:
+    source = rig.make()
+    rig.publish(b"\0\1\0\0abcd")
+    wait_for(lambda: source.stats()["topics"]["/robot_1/odom"]["submitted"] == 1)
+    rig.start()
+    wait_for(lambda: rig.probe.handled == 1)
+    wait_for(lambda: source.idle)
+
+
+def test_credit_paces(rig: Rig) -> None:
+    rig.make(packet_len=64).use_credit()
+    rig.start(credit=True)
+    rig.publish(b"\0\1\0\0" + bytes(720))
+    wait_for(lambda: not rig.source.idle)
+    for number in range(1, 4):
+        rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
+        wait_for(lambda number=number: rig.probe.handled == number)
+    assert rig.source.stats()["packets"] == 3
+
+
+def test_events_reach_the_observer_in_order(rig: Rig) -> None:
+    events: list[Any] = []
+    rig.make(packet_len=64, observer=events.append)
+    rig.start()
+    rig.publish(bytes(40))
+    rig.publish(bytes(64_000))
+    wait_for(lambda: len(events) == 4)
+    assert sorted(type(event).__name__ for event in events) == ["Accepted", "Accepted", "Refused", "SentPacket"]
+    assert isinstance(events[0], Accepted)
+    assert any(isinstance(event, Refused) and event.reason == "too_large" for event in events)
+    assert any(isinstance(event, SentPacket) for event in events)
+
+
+def test_a_message_too_large_is_said_once_with_the_remedy(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    source = rig.make(packet_len=64)
+    rig.start()
+    rig.publish(bytes(64_000), count=3)
+    wait_for(lambda: source.stats()["topics"]["/robot_1/odom"]["refused"] == {"too_large": 3})
+    said = [record.getMessage() for record in caplog.records if "too_large" in record.getMessage()]
+    assert len(said) == 1
+    assert "packet_len" in said[0]
+
+
+def test_a_port_that_nobody_reads_is_said_and_counted(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    source = rig.make()
+    rig.top.msg_connect((rig.probe, "credit"), (source, "credit"))
+    rig.top.start()
+    wait_for(lambda: "nothing reads" in caplog.text)
+    rig.publish(bytes(40), count=5)
+    rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
+    wait_for(lambda: source.stats()["unread"] > 0)
+
+
+def test_backpressure_holds_the_publisher_back_and_close_lets_it_go(rig: Rig) -> None:
+    source = rig.make(packet_len=64, queue_depth=2, backpressure=True, subscriber_depth=0)
+    source.use_credit()
+    rig.start(credit=True)
+    rig.publish(bytes(40), count=10)
+    wait_for(lambda: source.stats()["topics"]["/robot_1/odom"]["queued"] == 2)
+    assert source.stats()["topics"]["/robot_1/odom"]["submitted"] == 2
+    for number in range(1, 6):
+        rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
+        wait_for(lambda number=number: rig.probe.handled == number)
+    assert source.stats()["topics"]["/robot_1/odom"]["refused"] == {}
+    source.close()
+    assert source.stats()["held_back_at_close"] == 1
+
+
+def test_settings_change_while_running(rig: Rig) -> None:
+    source = rig.make(packet_len=64)
+    rig.start()
+    source.set_dst_id(4)
+    source.set_hop(2)
+    source.set_greedy(True)
+    source.set_flush_timeout(0.0)
+    source.set_packet_rate(1000.0)
+    source.set_queue_depth(5)
+    source.set_repeat_s(0.0)
+    source.set_debug(True)
+    source.set_debug(False)
+    rig.publish(bytes(40))
+    wait_for(lambda: rig.probe.handled == 1)
+    packet = decode(rig.probe.packets[0], 64)
+    assert (packet.dst_id, packet.hop) == (4, 2)
+    assert source.config.packet_rate == 1000.0
+    with pytest.raises(ConfigError, match="dst_id = 300"):
+        source.set_dst_id(300)
+    assert source.config.dst_id == 4
+
+
+def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
+    def fail(event: Any) -> None:
+        if isinstance(event, SentPacket) and event.entries[0].serial == 0:
+            raise ValueError("observer")
+
+    source = rig.make(packet_len=64, observer=fail)
+    rig.start()
+    rig.publish(bytes(40))
+    wait_for(lambda: source.stats()["pump_failed"] == 1)
+    rig.publish(bytes(40))
+    wait_for(lambda: rig.probe.handled >= 1)
+
+
+def test_debug_lines(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, "gr_ros2.gr.source"):
+        rig.make(packet_len=64, debug=True)
+        rig.start()
+        rig.publish(bytes(40))
+        wait_for(lambda: rig.probe.handled == 1)
+    assert "src=1 dst=255" in caplog.text
+    assert "0:odom#" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"packet_len": 13}, "packet_len = 13"),
+        ({"colour": 1}, "unknown key colour"),
+        ({"topics": ["nope"]}, "nope"),
+        ({"namespace": "/robot"}, "no digits"),
+        ({"middleware": "carrier-pigeon"}, "carrier-pigeon"),
+        ({"min_fragment": 300}, "min_fragment = 300"),
+        ({"scheduler": "nope"}, "nope"),
+    ],
+)
+def test_what_is_wrong_is_named(rig: Rig, settings: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        rig.make(**settings)
+
+
+def test_a_registry_is_needed() -> None:
+    with pytest.raises(ConfigError, match="registry"):
+        RosSource(namespace="/robot_1", middleware="memory")
+    with pytest.raises(ConfigError, match="nowhere"):
+        RosSource("nowhere.csv", namespace="/robot_1", middleware="memory")
+
+
+def test_a_loop_is_refused_whichever_comes_first(rig: Rig) -> None:
+    rig.make()
+    with pytest.raises(ConfigError, match="loop"):
+        RosSink(REGISTRY, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{src_id}")
+    RosSink(REGISTRY, middleware="memory", domain_id=DOMAIN + 1, namespace_format="/robot_{src_id}").close()
+    rig.source.close()
+    sink = RosSink(REGISTRY, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{src_id}")
+    with pytest.raises(ConfigError, match="loop"):
+        rig.make()
+    sink.close()
+
+
+def test_stopped_started_and_closed_twice(rig: Rig) -> None:
+    source = rig.make()
+    rig.start()
+    rig.top.stop()
+    rig.top.wait()
+    rig.top.start()
+    rig.publish(bytes(40))
+    wait_for(lambda: rig.probe.handled == 1)
+    rig.top.stop()
+    rig.top.wait()
+    source.close()
+    source.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("gr-ros2-source")]

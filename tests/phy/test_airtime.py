@@ -1,0 +1,91 @@
+"""The gate: nothing passes early, credits keep the source just in time, and it stops at once."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gnuradio import gr
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.phy.airtime import AirtimeGate
+from tests.gr.probe import Probe, wait_for
+
+
+@pytest.fixture
+def top() -> Iterator[gr.top_block]:
+    top = gr.top_block()
+    yield top
+    top.stop()
+    top.wait()
+
+
+def wire(top: gr.top_block, gate: AirtimeGate) -> Probe:
+    probe = Probe()
+    top.msg_connect((probe, "pdus"), (gate, "pdus"))
+    top.msg_connect((gate, "pdus"), (probe, "pdus"))
+    top.msg_connect((gate, "credit"), (probe, "credit"))
+    top.start()
+    return probe
+
+
+def test_packets_pass_one_airtime_apart_and_never_sooner(top: gr.top_block) -> None:
+    gate = AirtimeGate(0.02)
+    probe = wire(top, gate)
+    for number in range(10):
+        probe.post(bytes([number]))
+    wait_for(lambda: gate.backlog, "the queue")
+    wait_for(lambda: probe.handled == 10, "every packet")
+    assert probe.packets == [bytes([number]) for number in range(10)]
+    # A late wake-up may bring two packets closer together, but never n of them in less than n - 1 airtimes less that.
+    assert probe.times[-1] - probe.times[0] > 0.02 * 8
+    assert (gate.passed, gate.backlog) == (10, 0)
+
+
+def test_one_credit_first_then_one_per_packet(top: gr.top_block) -> None:
+    probe = wire(top, AirtimeGate(0.02))
+    for number in range(5):
+        wait_for(lambda number=number: probe.credits == number + 1, "a credit")
+        probe.post(bytes(1))
+    wait_for(lambda: probe.handled == 5, "every packet")
+    wait_for(lambda: probe.credits == 6, "the last credit")
+
+
+def test_without_airtime_packets_pass_at_once(top: gr.top_block) -> None:
+    probe = wire(top, AirtimeGate(0.0))
+    probe.post(b"x")
+    wait_for(lambda: probe.handled == 1)
+
+
+def test_flow_keeps_a_window_of_packets_under_way(top: gr.top_block) -> None:
+    done = itertools.count()
+    through = [0]
+    probe = wire(top, AirtimeGate(1.0, "flow", window=4, progress=lambda: through[0]))
+    wait_for(lambda: probe.credits == 4, "the window")
+    for _ in range(4):
+        probe.post(bytes([next(done)]))
+    wait_for(lambda: probe.handled == 4, "the packets, whatever their airtime")
+    assert probe.credits == 4
+    through[0] = 3
+    wait_for(lambda: probe.credits == 7, "credits for what is through")
+
+
+def test_it_stops_with_packets_on_the_air() -> None:
+    top = gr.top_block()
+    gate = AirtimeGate(3600.0)
+    probe = wire(top, gate)
+    probe.post(b"x")
+    wait_for(lambda: gate.backlog == 1)
+    top.stop()
+    top.wait()
+    assert probe.handled == 0
+
+
+@pytest.mark.parametrize("settings", [{"airtime": -1.0}, {"pace": "fast"}, {"window": 0}, {"airtime": 1.0, "lead": -1}])
+def test_senseless_settings_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        AirtimeGate(**settings)

@@ -1,0 +1,130 @@
+"""The whole link, for every PHY of the table: nothing lost, nothing altered, a clean stop."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.loopback import LoopbackLink
+from tests.gr.probe import Probe, wait_for
+
+RATE = 5e6
+
+
+def make(name: str, packet_len: int = 64) -> Phy:
+    phy: Phy = PHY.load(name)(packet_len, RATE)
+    return phy
+
+
+def packets(count: int, packet_len: int = 64) -> list[bytes]:
+    source = random.Random(count)
+    return [source.randbytes(packet_len) for _ in range(count)]
+
+
+@pytest.mark.parametrize("pace", ["airtime", "flow"])
+@pytest.mark.parametrize("name", list(PHY))
+def test_every_packet_comes_out_unaltered_and_in_order(name: str, pace: str) -> None:
+    source, sink = Probe(), Probe()
+    sent = packets(100)
+    with LoopbackLink(make(name), source, sink, pace=pace) as link:
+        for packet in sent:
+            source.post(packet)
+        wait_for(lambda: sink.handled == len(sent), "every packet")
+        counts = link.counts()
+    assert sink.packets == sent
+    assert (counts.passed, counts.backlog, counts.transmitted) == (100, 0, 100)
+    assert (counts.received, counts.dropped) == (100, 0)
+
+
+@pytest.mark.parametrize("name", list(PHY))
+def test_packet_loss_is_counted(name: str) -> None:
+    source, sink = Probe(), Probe()
+    with LoopbackLink(make(name), source, sink, channel=ChannelConfig(packet_loss=0.5, seed=1)) as link:
+        for packet in packets(100):
+            source.post(packet)
+        wait_for(lambda: link.counts().received == 100, "every packet")
+        wait_for(lambda: sink.handled == 100 - link.counts().dropped)
+        assert 20 < link.counts().dropped < 80
+        link.set_packet_loss(0.0)
+        source.post(bytes(64))
+        wait_for(lambda: sink.packets[-1:] == [bytes(64)])
+
+
+@pytest.mark.parametrize("frequency_offset", [0.0, 0.005])
+def test_a_channel_that_ofdm_is_made_for_loses_nothing(frequency_offset: float) -> None:
+    channel = ChannelConfig(snr_db=30, frequency_offset=frequency_offset, taps=(1, 0, 0, 0.4), seed=1)
+    source, sink = Probe(), Probe()
+    sent = packets(100)
+    with LoopbackLink(make("ofdm"), source, sink, channel=channel):
+        for packet in sent:
+            source.post(packet)
+        wait_for(lambda: sink.handled == len(sent), "every packet")
+    assert sink.packets == sent
+
+
+def test_noise_while_running() -> None:
+    source, sink = Probe(), Probe()
+    with LoopbackLink(make("ofdm"), source, sink) as link:
+        link.set_snr_db(-20.0)
+        for packet in packets(20):
+            source.post(packet)
+        wait_for(lambda: link.counts().transmitted == 20)
+        in_noise = sink.handled
+        assert in_noise < 20
+        link.set_frequency_offset(0.0)
+        link.set_snr_db(None)
+        # The change reaches the samples a buffer later: the noise source had filled its own.
+        for packet in packets(40):
+            source.post(packet)
+        wait_for(lambda: sink.handled >= in_noise + 20, "packets after the noise")
+
+
+def test_a_paced_source_is_told_and_gets_credits() -> None:
+    source, sink = Probe(), Probe()
+    with LoopbackLink(make("ofdm"), source, sink, paced=True):
+        wait_for(lambda: source.credits)
+    assert source.uses_credit
+    source = Probe()
+    with LoopbackLink(make("ofdm"), source, Probe(), paced=False):
+        pass
+    assert not source.uses_credit
+
+
+def test_what_has_no_samples_has_no_noise() -> None:
+    link = LoopbackLink(make("direct"), Probe(), Probe())
+    for change in (
+        lambda: link.set_snr_db(10),
+        lambda: link.set_frequency_offset(0),
+        lambda: link.set_packet_loss(0.1),
+    ):
+        with pytest.raises(PhyError, match="direct"):
+            change()
+
+
+def test_a_loss_out_of_range_is_refused() -> None:
+    with pytest.raises(ConfigError, match="packet_loss"):
+        LoopbackLink(make("ofdm"), Probe(), Probe()).set_packet_loss(2.0)
+
+
+@pytest.mark.parametrize("name", list(PHY))
+def test_it_stops_cleanly_at_any_moment_and_leaves_no_thread(name: str) -> None:
+    for rounds in range(4):
+        source, sink = Probe(), Probe()
+        link = LoopbackLink(make(name, 1500), source, sink)
+        link.stop()
+        link.start()
+        for packet in packets(rounds * 20, 1500):
+            source.post(packet)
+        started = time.monotonic()
+        link.stop()
+        link.stop()
+        assert time.monotonic() - started < 2.0
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("gr-ros2")]

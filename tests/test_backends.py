@@ -1,0 +1,101 @@
+"""The tables of back-ends: nothing is imported before it is chosen, and a missing package is named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from gr_ros2.backends import Backend, BackendTable
+from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.link import SCHEDULER
+from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.phy import PHY
+
+ROWS = {
+    "there": Backend("collections", "OrderedDict", "always there"),
+    "missing": Backend("no_such_package_at_all.bus", "Bus", "not installed", "pip install no-such-package"),
+    "broken": Backend("no_such_package_at_all.bus", "Bus", "ours, so a missing module is a bug"),
+}
+TABLE = BackendTable("bus", ROWS)
+
+
+def test_a_table_is_a_mapping_in_order() -> None:
+    assert list(TABLE) == list(ROWS)
+    assert len(TABLE) == 3
+    assert TABLE["missing"].requires == "pip install no-such-package"
+    assert "nonsense" not in TABLE
+
+
+def test_load_gives_the_class() -> None:
+    from collections import OrderedDict
+
+    assert TABLE.load("there") is OrderedDict
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="bus: no 'nonsense'; known are there, missing, broken"):
+        TABLE.load("nonsense")
+
+
+def test_a_missing_back_end_names_the_package() -> None:
+    with pytest.raises(BackendMissingError, match="bus 'missing' needs pip install no-such-package"):
+        TABLE.load("missing")
+
+
+def test_a_missing_back_end_is_an_import_error_too() -> None:
+    with pytest.raises(ImportError):
+        TABLE.load("missing")
+
+
+def test_a_bug_of_ours_does_not_look_like_a_missing_package() -> None:
+    with pytest.raises(ModuleNotFoundError) as caught:
+        TABLE.load("broken")
+    assert not isinstance(caught.value, BackendMissingError)
+
+
+@pytest.mark.parametrize("table", [MIDDLEWARE, PHY, SCHEDULER], ids=lambda table: table.family)
+def test_every_row_has_a_summary_of_one_line(table: BackendTable) -> None:
+    assert all(row.summary and "\n" not in row.summary for row in table.values())
+
+
+@pytest.mark.parametrize(
+    ("table", "name"),
+    [("middleware", "bag"), ("middleware", "memory"), ("middleware", "dds"), ("phy", "direct"), ("phy", "ofdm")],
+)
+def test_our_back_ends_load(table: str, name: str) -> None:
+    found = {"middleware": MIDDLEWARE, "phy": PHY}[table].load(name)
+    assert found.name == name
+
+
+@pytest.mark.parametrize(
+    ("package", "table", "name", "remedy"),
+    [
+        ("cyclonedds", "middleware", "dds", "pip install cyclonedds"),
+        ("rclpy", "middleware", "rclpy", "a sourced ROS 2 setup"),
+        ("gnuradio", "phy", "ofdm", "apt install gnuradio"),
+    ],
+)
+def test_choosing_what_is_not_installed_names_what_to_install(package: str, table: str, name: str, remedy: str) -> None:
+    code = f"""
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == {package!r}:
+            raise ImportError("blocked")
+
+sys.meta_path.insert(0, Blocked())
+from gr_ros2.errors import BackendMissingError
+from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.phy import PHY
+try:
+    {table.upper()}.load({name!r})
+except BackendMissingError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"{table} {name!r} needs" in done.stdout
+    assert remedy in done.stdout
