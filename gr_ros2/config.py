@@ -31,6 +31,7 @@ RobotId = Annotated[int, Field(ge=-1, le=254)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 QosClass = Literal["default", "latency", "bulk"]
+QueuePolicy = Literal["latest", "fifo", "deadline"]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -43,6 +44,13 @@ class TopicOptions:
     :param depth: QoS depth of subscription and publisher, None takes ``subscriber_depth``/``publisher_depth``
     :param queue_depth: messages waiting at the source, 0 unbounded, None takes the source's ``queue_depth``
     :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
+    :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
+        ``queue_depth``), deadline (fifo, and stale after ``deadline_ms``); None: latest where ``depth`` is 1, else fifo
+    :param deadline_ms: ms after submission until which a message must be across, or it is dropped; 0 none
+    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
+    :param max_rate: messages/s sent at most, 0 unlimited
+    :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/compression.md)
+    :param quantize: bounded loss per field, '' lossless (docs/compression.md)
     """
 
     qos: QosClass = "default"
@@ -51,11 +59,28 @@ class TopicOptions:
     depth: Count | None = None
     queue_depth: Count | None = None
     publish_as: str = ""
+    queue: QueuePolicy | None = None
+    deadline_ms: Annotated[float, Field(ge=0, le=3_600_000, allow_inf_nan=False)] = 0.0
+    weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    codec: str = "auto"
+    quantize: str = ""
+
+    @model_validator(mode="after")
+    def _deadline(self) -> TopicOptions:
+        if self.queue == "deadline" and not self.deadline_ms:
+            raise ValueError("queue = 'deadline': deadline_ms is missing; set it above 0")
+        return self
+
+    @property
+    def queue_policy(self) -> QueuePolicy:
+        """``queue``, or what the depth asks for: a KeepLast depth of 1 says that only the newest message matters."""
+        return self.queue or ("latest" if self.depth == 1 else "fifo")
 
 
 @dataclass(frozen=True, config=_STRICT)
 class SourceConfig:
-    """ROS Source (the paper, section 4.3; ``../docs/parameters.md``).
+    """ROS Source (the paper, section 4.3; docs/parameters.md).
 
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
     :param topics: subset of the registry, with or without leading slash; [] = all
@@ -74,6 +99,8 @@ class SourceConfig:
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
     :param repeat_s: s between repeats of a transient-local topic, 0 off
+    :param compression: code every message, C = 1; the sink must have it too
+    :param dictionaries: files of dictionaries of your own, the same at both ends
     :param topic_options: per topic name, over the registry's columns
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
     :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
@@ -97,6 +124,8 @@ class SourceConfig:
     entry_ids: Literal["sequential", "random"] = "sequential"
     scheduler: str = "paper"
     repeat_s: Seconds = 10.0
+    compression: bool = False
+    dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     middleware: str = "dds"
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
@@ -142,6 +171,8 @@ class SinkConfig:
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all
+    :param compression: decode messages of packets with C = 1
+    :param dictionaries: files of dictionaries of your own, the same at both ends
     :param topic_options: per topic name, over the registry's columns
     :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
@@ -158,6 +189,8 @@ class SinkConfig:
     max_sources: Annotated[int, Field(ge=1, le=256)] = 16
     max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000
     max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
+    compression: bool = False
+    dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     use_sim_time: bool = False
     middleware: str = "dds"

@@ -8,6 +8,7 @@
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
+    │   └── UnknownDictionaryError · DamagedError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   └── BagError                    a bag cannot be read or written
     ├── PhyError (RuntimeError)         the flowgraph or radio failed
@@ -110,6 +111,18 @@ class CodecError(GrRos2Error, ValueError):
     """A coded message that cannot be decoded here. ``row`` is the ledger row it ends in."""
 
     row = "unsupported"
+
+
+class UnknownDictionaryError(CodecError):
+    """A message coded with a dictionary that is not held here, or with another one of that name."""
+
+    row = "unknown_dictionary"
+
+
+class DamagedError(CodecError):
+    """Bytes that are no coded message, or one larger than is taken."""
+
+    row = "damaged"
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

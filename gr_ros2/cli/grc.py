@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import click
 
-from gr_ros2 import grc_path as grc
+from gr_ros2.grc_path import grc_path as block_folder
+from gr_ros2.grc_path import install as install_blocks
 
 
 @click.command("grc-path")
@@ -12,5 +13,5 @@ from gr_ros2 import grc_path as grc
 def grc_path(install: bool) -> None:
     """Print the folder of block descriptions for GRC."""
     if install:
-        grc.install()
-    print(grc.grc_path())
+        install_blocks()
+    print(block_folder())

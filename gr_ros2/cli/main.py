@@ -25,22 +25,23 @@ Commands = Mapping[str, tuple[str, str]]
 """name -> (``module:attribute``, the line that help shows), in the order in which help lists them."""
 
 PACKET_COMMANDS: Commands = {
-    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
-    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
     "decode": ("gr_ros2.cli.packet:decode_packets", "Packets (hex, binary or pcap) to readable fields."),
 }
 REGISTRY_COMMANDS: Commands = {
-    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
-    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
     "check": ("gr_ros2.cli.registry:check", "Validate a registry CSV; print its rows and digest."),
     "from-graph": ("gr_ros2.cli.registry:from_graph", "Write a registry from the topics on the ROS graph."),
 }
 COMMANDS: Commands = {
     "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
     "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "plan": ("gr_ros2.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
+    "report": ("gr_ros2.cli.report:report", "The HTML report of one or several runs, from their folders."),
+    "compare": ("gr_ros2.cli.compare:compare", "Runs side by side: a table, and their curves in one figure."),
+    "dashboard": ("gr_ros2.cli.dashboard:dashboard", "Open the live page of a run started with --dashboard."),
     "scenarios": ("gr_ros2.cli.scenarios:scenarios", "List the built-in scenarios."),
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
+    "dict": ("gr_ros2.cli.dict:group", "Dictionaries for message compression."),
     "grc-path": ("gr_ros2.cli.grc:grc_path", "The folder of block descriptions for GRC."),
 }
 

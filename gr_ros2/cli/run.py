@@ -1,4 +1,4 @@
-"""`gr-ros2 demo` and `gr-ros2 run`: one experiment, its progress, its tables and its pictures."""
+"""`gr-ros2 demo` and `gr-ros2 run`: one experiment, its progress, its tables and its report."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import Any
 import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.dashboard import dashboard_option, watchers
+from gr_ros2.cli.terminal import path_text
 from gr_ros2.experiment import runner
-from gr_ros2.experiment.figures import latency_figure, path_figure, save_figure
-from gr_ros2.experiment.result import Result
+from gr_ros2.experiment.explain import explanation
+from gr_ros2.experiment.report import Run, write_report
 from gr_ros2.experiment.scenario import Scenario, load_scenario
-from gr_ros2.experiment.table import ledger_table, notes, summary_table
-
-_PLAIN_WIDTH = 110
-"""Columns of the tables where the output is no terminal."""
+from gr_ros2.experiment.table import as_table, ledger_table, notes, paper_grid, summary_table
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
@@ -27,6 +28,7 @@ _options = [
     click.option(
         "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys."
     ),
+    dashboard_option,
 ]
 
 
@@ -51,26 +53,34 @@ def demo(**options: Any) -> None:
     _run("demo", **options)
 
 
-def _run(name: str, *, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]) -> None:
+def _run(
+    name: str,
+    *,
+    out: Path | None,
+    seed: int | None,
+    duration: float | None,
+    overrides: tuple[str, ...],
+    dashboard: str | None,
+) -> None:
     scenario = load_scenario(name, overrides, seed=seed, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_PLAIN_WIDTH)
+    console = make_console()
     # A service manager's SIGTERM ends a run as Ctrl-C does, with its result written.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with _bar(console) as bar:
+    with watchers(dashboard, console) as onlookers, _bar(console) as bar:
         task = bar.add_task(scenario.name, total=scenario.duration_s or None, sent=0, delivered=0)
 
         def advance(progress: runner.Progress) -> None:
             done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
             bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
 
-        outcome = runner.run_scenario(scenario, out, advance)
-    pictures = _draw(outcome, out)
-    _print(console, scenario, outcome.result)
+        outcome = runner.run_scenario(scenario, out, advance, onlookers)
+    _print(console, scenario, outcome)
+    written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]
     console.print(
-        f"\nWritten to {out}: result.json, bag {runner.DELIVERED_BAG}/, {', '.join(pictures)}", soft_wrap=True
+        f"\nWritten to {out}: {written[0]}, result.json, bag {runner.DELIVERED_BAG}/, the tables messages and packets, "
+        f"{', '.join(written[1:])}",
+        soft_wrap=True,
     )
 
 
@@ -85,20 +95,8 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _draw(outcome: runner.Outcome, out: Path) -> list[str]:
-    """Write the pictures; their file names."""
-    written: list[str] = []
-    for name, (sent, received) in outcome.tracks.items():
-        if sent.xy:
-            figure = path_figure(sent.xy, received.xy, name, outcome.names.get(name, name))
-            stem = "path" if not written else f"path{name.replace('/', '_')}"
-            written += [path.name for path in save_figure(figure, out, stem)]
-    curves = {topic.topic: topic.latency_cdf_s for topic in outcome.result.topics}
-    written += [path.name for path in save_figure(latency_figure(curves), out, "latency")]
-    return written
-
-
-def _print(console: Console, scenario: Scenario, result: Result) -> None:
+def _print(console: Console, scenario: Scenario, outcome: runner.Outcome) -> None:
+    result = outcome.result
     phy = result.phy
     if phy["sample_rate"]:
         chosen = (
@@ -111,7 +109,12 @@ def _print(console: Console, scenario: Scenario, result: Result) -> None:
         )
     packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())
     console.print(f"packets: {packets}\n")
+    if scenario.name.startswith("paper-"):
+        console.print(as_table(paper_grid([result])))
     console.print(summary_table([result]))
     console.print(ledger_table(result))
-    for line in notes(result):
+    for path in outcome.trace.paths():
+        title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
+        console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
+    for line in (*explanation(result, outcome.trace), *notes(result)):
         console.print(line)

@@ -2,7 +2,7 @@
 
 Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
 a delivery with its very bytes was seen; repeats count neither as sent nor as delivered; memory holds payload
-digests only of messages whose fate is open, and about 20 bytes of each message besides.
+digests only of messages whose fate is open, and about 33 bytes of each message besides.
 
 Events must come in causal order: what a packet carries is told before its reception is, and a packet's reception
 (:meth:`Ledger.packet_received`) before what the receiver makes of it. The ledger may be fed from several threads.
@@ -38,6 +38,8 @@ NOT_TAKEN = "not_taken"
 IN_FLIGHT = "in_flight"
 """Still in the source's queue, in the PHY, or behind the last packet that arrived."""
 
+_OPEN = 255
+
 REORDER_WINDOW = 1024
 """A packet this many packets older than the newest received one will not arrive any more."""
 
@@ -53,6 +55,9 @@ class TopicLedger:
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
     :param size: serialized bytes; 0 where refused before it was queued
+    :param serial: the sender's number of the message
+    :param row: the ledger row it ended in, as its place in ``list(codes)``; _OPEN while its fate is open
+    :param codes: ledger row -> its code in ``row``
     """
 
     src_id: int
@@ -64,6 +69,14 @@ class TopicLedger:
     t_sent: array[float] = field(default_factory=lambda: array("d"))
     t_delivered: array[float] = field(default_factory=lambda: array("d"))
     size: array[int] = field(default_factory=lambda: array("L"))
+    serial: array[int] = field(default_factory=lambda: array("q"))
+    row: array[int] = field(default_factory=lambda: array("B"))
+    codes: dict[str, int] = field(default_factory=dict)
+
+    def book(self, position: int, row: str) -> None:
+        """The message at this place of the arrays ends in this row."""
+        self.rows[row] += 1
+        self.row[position] = self.codes.setdefault(row, len(self.codes))
 
 
 @dataclass(slots=True, eq=False)
@@ -127,6 +140,8 @@ class Ledger:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """What the sender with this source id reports."""
         with self._lock:
+            if self._finished:
+                return
             source = self._sources.setdefault(src_id, _Source(src_id))
             if isinstance(event, SentPacket):
                 self._sent(source, event)
@@ -135,15 +150,20 @@ class Ledger:
             else:
                 self._refused(source, event)
 
-    def packet_received(self, data: bytes) -> None:
-        """Bytes the PHY handed to the sink, whatever they are."""
+    def packet_received(self, data: bytes) -> tuple[int, int] | None:
+        """Bytes the PHY handed to the sink, whatever they are.
+
+        :return: source and number, from 0 per source, of the packet sent with these bytes; None where none was
+        """
         with self._lock:
+            if self._finished:
+                return None
             self._packets_handed_up += 1
             digest = _digest(data)
             for source in self._sources.values():
                 if digest in source.waiting:
-                    _arrived(source, digest)
-                    return
+                    return source.src_id, _arrived(source, digest)
+        return None
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports.
@@ -151,6 +171,8 @@ class Ledger:
         :param now: s, on the clock of the sender's events; of a delivery: when the message was republished
         """
         with self._lock:
+            if self._finished:
+                return
             if isinstance(event, Delivered):
                 self._delivered(event, now)
             elif isinstance(event, Lost):
@@ -159,7 +181,7 @@ class Ledger:
                 self._rejected[event.error.kind] += 1
 
     def finish(self, drained: bool = False) -> list[TopicLedger]:
-        """Close the books. Further events are an error.
+        """Close the books. What the run's threads report later is no part of it and is ignored.
 
         :param drained: nothing is left in the PHY, so what was sent and has not arrived is lost
         :return: one ledger per source and topic that occurred, by source and topic id
@@ -195,6 +217,17 @@ class Ledger:
             topics = self._topics.values()
             return sum(topic.sent for topic in topics), sum(topic.rows[DELIVERED] for topic in topics)
 
+    def rows(self) -> dict[tuple[int, int], Counter[str]]:
+        """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
+        PHY still holding what has not arrived. The rows add up to what was sent."""
+        with self._lock:
+            rows = {key: Counter(topic.rows) for key, topic in self._topics.items()}
+            for source in self._sources.values():
+                for message in source.open.values():
+                    key = (message.topic.src_id, message.topic.topic_id)
+                    rows[key][_final_row(source, message, drained=False)] += 1
+            return rows
+
     def unresolved(self) -> int:
         """Messages accepted by the senders whose fate is open: neither delivered, refused nor given up."""
         with self._lock:
@@ -215,6 +248,8 @@ class Ledger:
         topic.t_sent.append(t)
         topic.t_delivered.append(nan)
         topic.size.append(size)
+        topic.serial.append(serial)
+        topic.row.append(_OPEN)
         return topic
 
     def _accepted(self, source: _Source, event: Accepted) -> None:
@@ -227,7 +262,7 @@ class Ledger:
         message = source.open.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
-            topic.rows[event.reason] += 1
+            topic.book(topic.sent - 1, event.reason)
         else:
             self._close(source, message, event.reason)
 
@@ -305,7 +340,7 @@ class Ledger:
 
     def _close(self, source: _Source, message: _Open, row: str) -> None:
         topic_id, serial = message.topic.topic_id, message.serial
-        message.topic.rows[row] += 1
+        message.topic.book(message.position, row)
         del source.open[serial]
         _take(source.by_digest, (topic_id, message.digest), serial)
         if message.entry_id >= 0:
@@ -346,8 +381,11 @@ def _take(index: dict[_Key, _Shelf], key: _Key, serial: int) -> None:
         del index[key]
 
 
-def _arrived(source: _Source, digest: bytes) -> None:
-    """A packet of this source came in: the first one with these bytes that was sent after the newest received."""
+def _arrived(source: _Source, digest: bytes) -> int:
+    """A packet of this source came in: the first one with these bytes that was sent after the newest received.
+
+    :return: its number
+    """
     copies = source.waiting[digest]
     ordinal, entries = next((copy for copy in copies if copy[0] > source.last_received), copies[0])
     copies.remove((ordinal, entries))
@@ -365,6 +403,7 @@ def _arrived(source: _Source, digest: bytes) -> None:
             rest.popleft()
             if not rest:
                 del source.waiting[old_digest]
+    return ordinal
 
 
 def _final_row(source: _Source, message: _Open, drained: bool) -> str:

@@ -98,23 +98,29 @@ def latency_cdf(latencies: Floats) -> tuple[float, ...]:
 
 
 def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
-    """Mean and peak of the age of information, exactly: it is a sawtooth that rises with slope 1 and falls to
-    ``t_delivered - t_sent`` whenever a message newer than all before is delivered.
+    """Mean and peak of the age of information, exactly, over its :func:`teeth`.
+
+    :return: None where nothing was delivered, or only at the very end of the watch
+    """
+    start, until, newest = teeth(t_sent, t_delivered, t_end)
+    if not len(start):
+        return None
+    low, high = start - newest, until - newest  # age at both ends of each tooth
+    lengths = until - start
+    return Age(float(((low + high) / 2 * lengths).sum() / lengths.sum()), float(high.max()))
+
+
+def teeth(t_sent: Floats, t_delivered: Floats, t_end: float) -> tuple[Floats, Floats, Floats]:
+    """The age of information is a sawtooth: it rises with slope 1 and falls to ``t_delivered - t_sent`` whenever a
+    message newer than all before is delivered.
 
     :param t_sent: s, when each delivered message was submitted, in any order
     :param t_delivered: s, when it was delivered
-    :param t_end: s, end of the watch; a first delivery later than that moves it there
-    :return: None where nothing was delivered, or only at the very end of the watch
+    :param t_end: s, end of the watch
+    :return: of each tooth its start, its end, and the submission time of the newest message delivered by then
     """
-    if not len(t_sent):
-        return None
     order = np.argsort(t_delivered, kind="stable")
     times, newest = t_delivered[order], np.maximum.accumulate(t_sent[order])
     inside = times < t_end
     times, newest = times[inside], newest[inside]
-    if not len(times):
-        return None
-    until = np.append(times[1:], t_end)
-    low, high = times - newest, until - newest  # age at both ends of each tooth
-    lengths = until - times
-    return Age(float(((low + high) / 2 * lengths).sum() / lengths.sum()), float(high.max()))
+    return times, np.append(times[1:], t_end)[: len(times)], newest

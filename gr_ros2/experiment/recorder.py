@@ -1,15 +1,16 @@
 """Watches one run and turns what it saw into results: the loss ledger, the paths and the numbers of every topic.
 
 Law: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
-lock and the reading of one position.
+lock and the reading of one position; what it keeps of a message or packet are numbers in arrays.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from itertools import product
+from math import nan
 from typing import Any
 
 from gr_ros2.experiment.ledger import Ledger, TopicLedger
@@ -17,16 +18,9 @@ from gr_ros2.experiment.metrics import TopicMetrics, topic_metrics
 from gr_ros2.experiment.path import path_error, rms_error
 from gr_ros2.experiment.positions import PositionReader, position_reader
 from gr_ros2.experiment.result import AgeResult, LatencyResult, TopicResult
-from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.experiment.trace import PacketLog, Trace, Track, make_trace
+from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.registry import Registry, Topic
-
-
-@dataclass(slots=True)
-class Track:
-    """A path: times, s on the run's clock, and positions (x, y), m."""
-
-    t: list[float] = field(default_factory=list)
-    xy: list[tuple[float, float]] = field(default_factory=list)
 
 
 class Recorder:
@@ -49,6 +43,8 @@ class Recorder:
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
         self.counters: Counter[str] = Counter()
+        self._packets = {src_id: PacketLog() for src_id in namespaces}
+        self._books: list[TopicLedger] = []
         self._registry = registry
         self._namespaces = dict(namespaces)
         self._topic_ids = range(len(registry)) if topic_ids is None else sorted(topic_ids)
@@ -59,13 +55,18 @@ class Recorder:
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """What the sender with this source id reports."""
+        if isinstance(event, SentPacket):
+            self._packets.setdefault(src_id, PacketLog()).sent(event)
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
 
-    def packet_received(self, data: bytes) -> None:
-        """Bytes the PHY handed to the sink, before the sink reads them."""
-        self.ledger.packet_received(data)
+    def packet_received(self, data: bytes, now: float = nan) -> None:
+        """Bytes the PHY handed to the sink, before the sink reads them, at ``now`` on the sender's clock."""
+        packet = self.ledger.packet_received(data)
+        if packet is not None:
+            src_id, number = packet
+            self._packets[src_id].received(number, now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports; of a delivery once it is republished, at ``now`` on the sender's clock."""
@@ -89,6 +90,7 @@ class Recorder:
         books = {(book.src_id, book.topic_id): book for book in self.ledger.finish(drained)}
         for key in product(self._namespaces, self._topic_ids):
             books.setdefault(key, TopicLedger(*key))
+        self._books = [books[key] for key in sorted(books)]
         numbers = {key: topic_metrics(books[key], duration_s, t_end) for key in sorted(books)}
         self._delivered = sum(metrics.delivered for metrics in numbers.values())
         self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
@@ -110,10 +112,24 @@ class Recorder:
             else None,
         }
 
-    def tracks(self) -> dict[str, tuple[Track, Track]]:
-        """Transmitted and received path of every topic that has positions, by its name at the source."""
+    def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
+        """Every message, packet and position. To be asked after :meth:`finish`.
+
+        :param t0: s on the run's clock, when submission began
+        :param t_end: s on the run's clock, when it ended
+        :param published_as: name of a topic at the sink by its name at the source
+        """
         keys = sorted(self.sent.keys() | self.received.keys())
-        return {self._name(*key): (self.sent.get(key, Track()), self.received.get(key, Track())) for key in keys}
+        tracks = {key: (self.sent.get(key, Track()), self.received.get(key, Track())) for key in keys}
+        return make_trace(
+            self._books,
+            logs=self._packets,
+            tracks=tracks,
+            name_of=self._name,
+            published_as=published_as,
+            t0=t0,
+            t_end=t_end,
+        )
 
     def _follow(
         self, tracks: dict[tuple[int, int], Track], src_id: int, topic_id: int, payload: bytes, t: float
@@ -127,7 +143,8 @@ class Recorder:
             return
         track = tracks.setdefault((src_id, topic_id), Track())
         track.t.append(t)
-        track.xy.append(position)
+        track.x.append(position[0])
+        track.y.append(position[1])
 
     def _topic(self, topic_id: int) -> Topic | None:
         return self._registry[topic_id] if topic_id < len(self._registry) else None

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.experiment.load import make_phy, source_names
-from gr_ros2.experiment.recorder import Recorder, Track
+from gr_ros2.experiment.recorder import Recorder
 from gr_ros2.experiment.result import RESULT_FILE, Result, write_result
 from gr_ros2.experiment.scenario import Scenario, dump
+from gr_ros2.experiment.trace import Trace, write_trace
+from gr_ros2.experiment.watch import Fanout, LiveRun, Watcher
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
@@ -50,12 +52,10 @@ class Progress:
 
 @dataclass
 class Outcome:
-    """What a run gives back: the result and the paths by topic (sent, received)."""
+    """What a run gives back: the result, and what happened message by message."""
 
     result: Result
-    tracks: dict[str, tuple[Track, Track]] = field(default_factory=dict)
-    names: dict[str, str] = field(default_factory=dict)
-    """Topic at the sink by topic at the source."""
+    trace: Trace
 
 
 class Listener:
@@ -86,34 +86,48 @@ class Listener:
 
 
 def run_scenario(
-    scenario: Scenario, out: Path | None = None, on_progress: Callable[[Progress], None] | None = None
+    scenario: Scenario,
+    out: Path | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    watchers: Sequence[Watcher] = (),
 ) -> Outcome:
     """Run a scenario to its end, or until KeyboardInterrupt.
 
-    :param out: folder for ``result.json`` and the bag of delivered messages, made if missing; None writes nothing
+    :param out: folder for ``result.json``, the tables of the trace and the bag of delivered messages, made if missing;
+        None writes nothing
     :param on_progress: called about 20 times a second
+    :param watchers: onlookers; with one, the link is built so that its channel can be changed and its signal seen
     :raises ConfigError: when the scenario cannot be set up
     :raises RunError: when it fails under way
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
-    with ExitStack() as stack:
-        run = _Run(scenario, out, stack)
-        outcome = run.execute(on_progress)
+    outcome: Outcome | None = None
+    try:
+        with ExitStack() as stack:
+            outcome = _Run(scenario, out, stack, watchers).execute(on_progress)
+    finally:
+        for watcher in watchers:
+            watcher.run_ended(None if outcome is None else outcome.result)
     if out is not None:
+        write_trace(outcome.trace, out)
         write_result(outcome.result, out / RESULT_FILE)
     return outcome
 
 
 class _Run:
-    def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack) -> None:
+    def __init__(
+        self, scenario: Scenario, out: Path | None, stack: ExitStack, watchers: Sequence[Watcher] = ()
+    ) -> None:
         self.scenario = scenario
+        self.watchers = watchers
         self.registry = scenario.load_registry()
         self.phy: Phy = make_phy(scenario, self.registry)
         self.src_id = scenario.ros_source.src_id()
         self.topics = source_names(scenario, self.registry)
         namespaces = {self.src_id: scenario.ros_source.namespace}
         self.recorder = Recorder(self.registry, namespaces, self.topics.values())
+        self.ears = Fanout([self.recorder, *watchers])
         self.interrupted = False
         self.listener: Listener | None = None
         self.sim: SimPublisher | None = None
@@ -133,7 +147,7 @@ class _Run:
         self.source = RosSource(
             self.registry,
             middleware=self.input,
-            observer=partial(self.recorder.sender_event, self.src_id),
+            observer=partial(self.ears.sender_event, self.src_id),
             seed=scenario.seed,
             **_values(replace(scenario.ros_source, backpressure=backpressure)),
         )
@@ -141,8 +155,8 @@ class _Run:
         self.sink = RosSink(
             self.registry,
             middleware=output,
-            observer=lambda event: self.recorder.receiver_event(event, time.monotonic()),
-            packet_observer=self.recorder.packet_received,
+            observer=lambda event: self.ears.receiver_event(event, time.monotonic()),
+            packet_observer=lambda data: self.ears.packet_received(data, time.monotonic()),
             **_values(scenario.ros_sink),
         )
         stack.callback(self.sink.close)
@@ -151,9 +165,17 @@ class _Run:
             out.mkdir(parents=True, exist_ok=True)
             self.listener = self._listen(out, stack)
         self.link = LoopbackLink(
-            self.phy, self.source, self.sink, channel=scenario.channel, pace=scenario.pace, paced=scenario.paced
+            self.phy,
+            self.source,
+            self.sink,
+            channel=scenario.channel,
+            pace=scenario.pace,
+            paced=scenario.paced,
+            instrumented=bool(self.watchers),
         )
         stack.callback(self.link.stop)
+        for watcher in self.watchers:
+            watcher.run_started(self._live())
         if scenario.bag_path is None:
             robots = {robot_id: output for robot_id in self._robot_ids() if robot_id != self.src_id}
             if self.src_id in self._robot_ids():
@@ -162,6 +184,18 @@ class _Run:
                 )
             self.sim = SimPublisher(Fleet(scenario.sim), robots, scenario.duration_s)
             stack.callback(self.sim.close)
+
+    def _live(self) -> LiveRun:
+        return LiveRun(
+            name=self.scenario.name,
+            duration_s=self.scenario.duration_s,
+            packet_len=self.scenario.packet_len,
+            registry=self.registry,
+            topics={(self.src_id, topic_id): name for name, topic_id in self.topics.items()},
+            sources={self.src_id: self.source},
+            links=(self.link,),
+            ledger=self.recorder.ledger,
+        )
 
     def _robot_ids(self) -> range:
         return range(1, self.scenario.sim.robots + 1)
@@ -235,7 +269,7 @@ class _Run:
             counters=self._counters(),
         )
         names = dict(zip(self.topics, self._output_topics(), strict=True))
-        return Outcome(result, self.recorder.tracks(), names)
+        return Outcome(result, self.recorder.trace(begin, end, names))
 
     def _wait_matched(self) -> None:
         """Wait until every end of both graphs has found the other, so that no message goes unheard."""

@@ -1,4 +1,4 @@
-"""Results as tables: the paper's table 6 with latency beside it, and the loss ledger. Returned, never printed.
+"""Results as tables: the paper's table 6, delivery and latency, and the loss ledger. Returned, never printed.
 
 Law: a number that does not apply shows as a dash.
 """
@@ -6,6 +6,7 @@ Law: a number that does not apply shows as a dash.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from rich import box
 from rich.markup import escape
@@ -15,44 +16,100 @@ from gr_ros2.experiment.ledger import DELIVERED
 from gr_ros2.experiment.result import Result, TopicResult
 
 _DASH = "–"
-_HEADINGS = ("Duration [s]", "Sent", "Recv", "PDR", "Goodput [B/s]", "p50 [ms]", "p95 [ms]", "p99 [ms]")
+PAPER = "the paper"
+"""How the tables call the authors' own run."""
 
 
-def summary_table(results: Sequence[Result]) -> Table:
+@dataclass(frozen=True)
+class Grid:
+    """A table as text, for the terminal and for HTML alike.
+
+    :param texts: so many columns from the left are text, the others numbers
+    :param sections: lines by section
+    """
+
+    title: str
+    headings: tuple[str, ...]
+    sections: tuple[tuple[tuple[str, ...], ...], ...]
+    texts: int = 1
+
+
+PAPER_TABLE_6 = {"ofdm": ("OFDM", 38.0, 1328, 12, 0.01, 228.6), "direct": ("Direct", 15.0, 452, 452, 1.00, 21767.9)}
+"""The paper's table 6 by PHY: config, duration [s], sent, received, PDR, goodput [B/s]."""
+
+_TABLE_6 = ("Duration [s]", "Sent", "Recv", "PDR", "Goodput [B/s]")
+
+
+def summary_grid(results: Sequence[Result]) -> Grid:
     """One line per topic: config, duration, sent, received, PDR and goodput as in the paper's table 6, and latency."""
-    table = _table("Delivery and latency")
-    table.add_column("Config", no_wrap=True)
-    table.add_column("Topic", overflow="fold")
-    for heading in _HEADINGS:
-        table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
-    for result in results:
-        for topic in result.topics:
-            latency = topic.latency_s
-            table.add_row(
-                escape(result.scenario),
-                topic.topic,
-                f"{result.duration_s:.1f}",
-                str(topic.sent),
-                str(topic.delivered),
-                _number(topic.pdr, "{:.2f}"),
-                _number(topic.goodput_Bps, "{:.1f}"),
-                *(_milliseconds(value) for value in (latency.p50, latency.p95, latency.p99)),
+    return Grid(
+        "Delivery and latency",
+        ("Config", "Topic", *_TABLE_6, "p50 [ms]", "p95 [ms]", "p99 [ms]"),
+        tuple(
+            tuple(
+                (
+                    result.scenario,
+                    topic.topic,
+                    *_table_6(result, topic),
+                    *(milliseconds(value) for value in (topic.latency_s.p50, topic.latency_s.p95, topic.latency_s.p99)),
+                )
+                for topic in result.topics
             )
+            for result in results
+        ),
+        texts=2,
+    )
+
+
+def paper_grid(results: Sequence[Result]) -> Grid:
+    """The paper's table 6 and below each of its lines the odometry of the runs over the same kind of PHY."""
+    sections = []
+    for phy, (config, duration, sent, received, pdr, goodput) in PAPER_TABLE_6.items():
+        theirs = (config, PAPER, f"{duration:.1f}", str(sent), str(received), f"{pdr:.2f}", f"{goodput:.1f}")
+        ours = [
+            (config, result.scenario, *_table_6(result, topic))
+            for result in results
+            for topic in result.topics
+            if result.phy["name"] == phy and topic.type == "nav_msgs/msg/Odometry"
+        ]
+        sections.append((theirs, *ours))
+    return Grid("Table 6 of the paper, and odometry here", ("Config", "Run", *_TABLE_6), tuple(sections), texts=2)
+
+
+def ledger_grid(result: Result) -> Grid:
+    """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
+    rows = [DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
+    rows = list(dict.fromkeys(rows))
+    lines = (
+        (topic.topic, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for topic in result.topics
+    )
+    return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))
+
+
+def as_table(grid: Grid) -> Table:
+    """A grid for the terminal."""
+    # Narrow, so that ten columns fit a terminal of 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, title=grid.title, title_justify="left", pad_edge=False, collapse_padding=True)
+    for place, heading in enumerate(grid.headings):
+        if place < grid.texts:
+            table.add_column(escape(heading), no_wrap=place == 0, overflow="fold")
+        else:
+            table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
+    for section in grid.sections:
+        for line in section:
+            table.add_row(*map(escape, line))
         table.add_section()
     return table
 
 
+def summary_table(results: Sequence[Result]) -> Table:
+    """:func:`summary_grid` for the terminal."""
+    return as_table(summary_grid(results))
+
+
 def ledger_table(result: Result) -> Table:
-    """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
-    rows = [DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
-    rows = list(dict.fromkeys(rows))
-    table = _table("Where every sent message went")
-    table.add_column("Topic", no_wrap=True)
-    for heading in ("sent", *rows):
-        table.add_column(escape(heading), justify="right")
-    for topic in result.topics:
-        table.add_row(topic.topic, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows))
-    return table
+    """:func:`ledger_grid` for the terminal."""
+    return as_table(ledger_grid(result))
 
 
 def notes(result: Result) -> list[str]:
@@ -64,22 +121,29 @@ def notes(result: Result) -> list[str]:
     return lines
 
 
-def _table(title: str) -> Table:
-    # Narrow, so that ten columns fit a terminal of 80 characters.
-    return Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", pad_edge=False, collapse_padding=True)
-
-
 def _path_note(topic: TopicResult) -> str:
-    rms = _number(topic.rms_error_m, "{:.3f} m")
+    rms = number(topic.rms_error_m, "{:.3f} m")
     return f"{topic.topic}: path error {topic.path_error_m:.3f} m along the path, RMS {rms} at equal times"
 
 
-def _milliseconds(seconds: float | None) -> str:
+def _table_6(result: Result, topic: TopicResult) -> tuple[str, ...]:
+    return (
+        f"{result.duration_s:.1f}",
+        str(topic.sent),
+        str(topic.delivered),
+        number(topic.pdr, "{:.2f}"),
+        number(topic.goodput_Bps, "{:.1f}"),
+    )
+
+
+def milliseconds(seconds: float | None) -> str:
+    """ms with three digits."""
     if seconds is None:
         return _DASH
     value = seconds * 1000
     return f"{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f}"
 
 
-def _number(value: float | None, form: str) -> str:
+def number(value: float | None, form: str) -> str:
+    """The value, or a dash where there is none."""
     return _DASH if value is None else form.format(value)

@@ -12,8 +12,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from gr_ros2.config import SinkConfig, build
+from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.codec import MessageCodec
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.ros_graph import resolve_domain_id
 from gr_ros2.registry import Registry
@@ -56,6 +57,18 @@ def read_registry(registry: str | Registry) -> Registry:
     if not registry:
         raise ConfigError("registry is missing; give the path of a CSV with rows of the form name,type")
     return Registry.from_csv(registry)
+
+
+def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> MessageCodec | None:
+    """The codec of a link that compresses, None of one that does not.
+
+    :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
+    """
+    if not config.compression:
+        return None
+    from gr_ros2.compression import LinkCodec  # only here: links that do not compress need none of it
+
+    return LinkCodec(registry.with_options(config.topic_options), config.dictionaries)
 
 
 class Graph:

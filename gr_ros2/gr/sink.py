@@ -18,7 +18,7 @@ from gnuradio import gr
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import GrRos2Error, MiddlewareError
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, replaced, settings
 from gr_ros2.gr.latency import CLOCK_TYPE, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import PDUS, packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
@@ -60,7 +60,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_sink", None, None)
         self.config = settings(SinkConfig, values, registry, middleware)
-        self._receiver = Receiver(read_registry(registry), self.config)
+        rows = read_registry(registry)
+        self._receiver = Receiver(rows, self.config, codec=message_codec(self.config, rows))
         self.registry = self._receiver.registry
         self._observer = observer
         self._packet_observer = packet_observer

@@ -6,6 +6,7 @@ go, by one pump thread; a callback of the middleware blocks only under ``backpre
 
 from __future__ import annotations
 
+import logging
 import random
 import threading
 import time
@@ -20,7 +21,7 @@ from gnuradio import gr
 
 from gr_ros2.config import SourceConfig
 from gr_ros2.errors import GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, replaced, settings
 from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Refused, Sender, SenderEvent
@@ -64,7 +65,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_source", None, None)
         self.config = settings(SourceConfig, values, registry, middleware)
-        self._sender = Sender(read_registry(registry), self.config, rng=random.Random(seed), observer=self._observe)
+        rows = read_registry(registry)
+        codec = message_codec(self.config, rows)
+        self._sender = Sender(rows, self.config, codec=codec, rng=random.Random(seed), observer=self._observe)
         self.registry = self._sender.registry
         self._observer = observer
         self._clock = clock
@@ -293,6 +296,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            self._log.warning("topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
+            level = logging.INFO if event.reason == "superseded" else logging.WARNING  # what `latest` is for
+            self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._observer(event)

@@ -1,9 +1,9 @@
 """When packets have the air: one after the other, each for its airtime, and when the next may be asked for.
 
 Laws: a packet starts at the later of its arrival and the end of the one before, and leaves when its airtime is
-over, never earlier; idle time is not saved up; the air is promised ahead (packets here plus credits not yet used)
-for less than ``lead`` before another credit is granted, so with an airtime above ``lead`` one packet is under way
-and at most one more is due. No IO, no clock: ``now`` is seconds, monotonic.
+over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air is free
+of all that is here or promised (credits not yet used), and while fewer than ``OUTSTANDING`` packets are. No IO, no
+clock: ``now`` is seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ T = TypeVar("T")
 
 LEAD_S = 0.005
 """s before the air is free that a source needs to compose and hand over the next packet."""
+OUTSTANDING = 2
+"""Packets here or promised at most: one on the air and one behind it; what waits further back is not yet composed."""
 
 
 class AirtimeClock(Generic[T]):
@@ -54,7 +56,7 @@ class AirtimeClock(Generic[T]):
     def grants(self, now: float) -> int:
         """Credits to give out at ``now``; they count as given."""
         given = 0
-        while self._promised_until(now) - self._lead <= now:
+        while self._may_grant(now):
             self._unused += 1
             given += 1
         return given
@@ -62,7 +64,7 @@ class AirtimeClock(Generic[T]):
     def next_timeout(self, now: float) -> float | None:
         """When ``due`` or ``grants`` next has something, None if only an arrival can change that."""
         times = [self._queue[0][0]] if self._queue else []
-        if self._free > now:
+        if self._free > now and self._outstanding < OUTSTANDING:
             times.append(max(now, self._promised_until(now) - self._lead))
         return min(times) if times else None
 
@@ -70,6 +72,13 @@ class AirtimeClock(Generic[T]):
     def backlog(self) -> int:
         """Packets here, the one on the air included."""
         return len(self._queue)
+
+    @property
+    def _outstanding(self) -> int:
+        return len(self._queue) + self._unused
+
+    def _may_grant(self, now: float) -> bool:
+        return self._outstanding < OUTSTANDING and self._promised_until(now) - self._lead <= now
 
     def _promised_until(self, now: float) -> float:
         return max(now, self._free) + self._unused * self._airtime

@@ -23,7 +23,8 @@ class Lost:
     """A message of which at least one fragment came will never be complete.
 
     ``reason`` is a ledger row: ``lost_fragments`` (overtaken, contradicted, or behind an outage), ``expired``
-    (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E).
+    (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E); or it is complete and
+    its codec says ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int
@@ -54,7 +55,11 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A submitted message will not be sent. ``reason`` is a ledger row: ``too_large`` or ``queue_bound``."""
+    """A submitted message will not be sent, or not to its end.
+
+    ``reason`` is a ledger row: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
+    a message whose first fragments have left, ``abandoned``.
+    """
 
     serial: int
     topic_id: int

@@ -1,7 +1,9 @@
-"""How a message is cut into fragments (the paper, section 5.2).
+"""How a message is cut into fragments (the paper, section 5.2), at fixed lengths or to fit what room there is.
 
-Law: the cut of a message is fixed when its first fragment is sent, since every entry carries ``total``; all fragments
-but the last have the same length.
+Laws: the number of fragments of a message is fixed when its first one is sent, since every entry carries ``total``;
+fragments are taken in order and together are the message. Version 0 gives each entry its own length, so only the
+paper's policy makes them equal (all but the last); a flexible cut may make each as long as the room found, as long as
+what remains can still go in the entries that remain, at most ``cut`` bytes each and at least one.
 """
 
 from __future__ import annotations
@@ -41,11 +43,15 @@ class Outgoing:
     """A message on its way out.
 
     :param serial: number of the submitted message; -1 for a repeat of a transient-local one
+    :param payload: what goes on the air: the message, coded where the link compresses
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
-    :param entry_id: its name on the air, -1 until it is cut
-    :param cut: bytes per fragment, 0 until it is cut
+    :param weight: what its age counts beside that of other topics
+    :param expires: time after which it is of no use, s
+    :param entry_id: its name on the air, -1 until its first fragment leaves
+    :param cut: most bytes that any fragment still to come needs to take, 0 until it is cut
     :param index: next fragment to send
+    :param offset: bytes sent
     """
 
     serial: int
@@ -53,10 +59,13 @@ class Outgoing:
     payload: bytes
     qos: int
     submitted: float
+    weight: float = 1.0
+    expires: float = float("inf")
     entry_id: int = -1
     cut: int = 0
     total: int = 0
     index: int = 0
+    offset: int = 0
 
     @property
     def started(self) -> bool:
@@ -64,25 +73,26 @@ class Outgoing:
         return self.index > 0
 
     def plan(self, cut: int) -> int:
-        """Fix the cut if it is still open; returns the payload length of the next fragment."""
-        if not self.started:
+        """Fix an equal cut if it is still open; returns the payload length of the next fragment."""
+        if not self.index:
             self.cut = cut
             self.total = max(-(-len(self.payload) // cut), 1)
-        return self.remaining if self.index == self.total - 1 else self.cut
+        return min(self.cut, len(self.payload) - self.offset)
 
     @property
     def remaining(self) -> int:
         """Bytes not yet sent."""
-        return len(self.payload) - self.index * self.cut
+        return len(self.payload) - self.offset
 
-    def next_entry(self) -> Entry:
-        """Take the next fragment."""
-        start = self.index * self.cut
-        entry = Entry(self.topic_id, self.entry_id, self.index, self.total, self.payload[start : start + self.cut])
+    def take(self, length: int) -> Entry:
+        """The next fragment, of that many bytes."""
+        payload = self.payload[self.offset : self.offset + length]
+        entry = Entry(self.topic_id, self.entry_id, self.index, self.total, payload)
         self.index += 1
+        self.offset += length
         return entry
 
     @property
     def done(self) -> bool:
         """Whether the last fragment has left."""
-        return self.started and self.index >= self.total
+        return 0 < self.total <= self.index

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from gr_ros2.config import BROADCAST, SinkConfig
-from gr_ros2.errors import WireError
+from gr_ros2.errors import CodecError, WireError
+from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, Rejected
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
@@ -58,13 +59,22 @@ class Receiver:
 
     :param registry: says which topic ids exist and which are transient-local
     :param observer: called with every ReceiverEvent, in order
+    :param codec: decodes messages from packets with C = 1, which without it are ``unsupported``
     """
 
-    def __init__(self, registry: Registry, config: SinkConfig, *, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        registry: Registry,
+        config: SinkConfig,
+        *,
+        observer: Observer | None = None,
+        codec: MessageCodec | None = None,
+    ) -> None:
         self.config = config
         self.registry = registry.with_options(config.topic_options)
         self.stats = ReceiverStats()
         self._observer = observer
+        self._codec = codec
         self._sources: dict[int, _Source] = {}
         self._partials: OrderedDict[Partial, int] = OrderedDict()
         """Everything incomplete and its source, longest without a new fragment first."""
@@ -171,9 +181,13 @@ class Receiver:
     def _deliver(
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
-        if packet.compressed or packet.encrypted:
-            self.stats.lost[packet.src_id, topic_id, "unsupported"] += 1
-            return [Lost(packet.src_id, topic_id, "unsupported", entry_id)]
+        if packet.encrypted or (packet.compressed and self._codec is None):
+            return [self._undone(packet, topic_id, entry_id, "unsupported")]
+        if packet.compressed and self._codec is not None:
+            try:
+                payload = self._codec.decode(topic_id, payload)
+            except CodecError as error:
+                return [self._undone(packet, topic_id, entry_id, error.row)]
         if self.registry[topic_id].latched:
             if source.latched.get(topic_id) == payload:
                 self.stats.repeats += 1
@@ -181,6 +195,11 @@ class Receiver:
             source.latched[topic_id] = payload
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
+
+    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: str) -> Lost:
+        """Book a message that came whole, but cannot be read here."""
+        self.stats.lost[packet.src_id, topic_id, row] += 1
+        return Lost(packet.src_id, topic_id, row, entry_id)
 
     def _bound(self, source: _Source, src_id: int) -> list[ReceiverEvent]:
         """Give up the oldest incomplete messages where memory is over its bounds."""

@@ -1,7 +1,7 @@
-"""Which fragments go into the next packet: the paper's policy (section 5.2), one class per policy.
+"""Which fragments go into the next packet: what a policy is, and the paper's (section 5.2); ``freshness`` is the other.
 
 Law: a scheduler plans, and changes nothing but its own order of topics and the still open cut of waiting messages; the
-sender carries the plan out or makes another.
+sender carries the last plan out or asks for another.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Protocol
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.config import SourceConfig
 from gr_ros2.link.fragment import Outgoing, fragment_len
+from gr_ros2.registry import Registry
 from gr_ros2.wire import ENTRY_HEADER_LEN, MAX_ENTRIES, overhead
 
 
@@ -21,15 +22,17 @@ class Plan:
     """The next packet: from each message, in this order, one further fragment.
 
     :param picks: messages to take one fragment of; a message may stand several times
+    :param lengths: bytes of each of these fragments
     :param full: no further entry of ``min_fragment`` bytes would fit, so waiting for company is no use
     """
 
     picks: tuple[Outgoing, ...]
+    lengths: tuple[int, ...]
     full: bool
 
 
 class Scheduler(Protocol):
-    """Chooses what goes into the next packet."""
+    """Chooses what goes into the next packet. Made of the source's configuration and its registry."""
 
     config: SourceConfig
 
@@ -37,7 +40,7 @@ class Scheduler(Protocol):
         """The next packet's content from the messages waiting per topic id, or None where nothing is waiting."""
 
     def sent(self, plan: Plan) -> None:
-        """The plan was carried out."""
+        """The last plan was carried out."""
 
 
 class PaperScheduler:
@@ -46,7 +49,7 @@ class PaperScheduler:
     A topic that got an entry goes to the end of the line; one whose next fragment did not fit keeps its place.
     """
 
-    def __init__(self, config: SourceConfig) -> None:
+    def __init__(self, config: SourceConfig, registry: Registry) -> None:  # noqa: ARG002 - all topics are alike
         self.config = config
         self._line: list[int] = []
 
@@ -57,12 +60,14 @@ class PaperScheduler:
         self._line += [topic_id for topic_id in pending if topic_id not in self._line]
         config = self.config
         picks: list[Outgoing] = []
+        chosen: list[int] = []
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
                 cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
+                chosen += lengths
                 payload += sum(lengths)
                 whole = message.index + len(lengths) == message.total
                 if not (config.greedy and lengths and whole):
@@ -70,7 +75,7 @@ class PaperScheduler:
             if len(picks) == MAX_ENTRIES:
                 break
         room = config.packet_len - overhead(len(picks) + 1) - (len(picks) + 1) * ENTRY_HEADER_LEN - payload
-        return Plan(tuple(picks), len(picks) == MAX_ENTRIES or room < config.min_fragment)
+        return Plan(tuple(picks), tuple(chosen), len(picks) == MAX_ENTRIES or room < config.min_fragment)
 
     def _fitting(self, message: Outgoing, cut: int, entries: int, payload: int) -> list[int]:
         """Lengths of the next fragments of a message that fit beside ``entries`` with ``payload`` bytes."""
@@ -97,5 +102,10 @@ class PaperScheduler:
 
 SCHEDULER = BackendTable(
     "scheduler",
-    {"paper": Backend("gr_ros2.link.schedule", "PaperScheduler", "round robin over topics, as in the paper")},
+    {
+        "paper": Backend("gr_ros2.link.schedule", "PaperScheduler", "round robin over topics, as in the paper"),
+        "freshness": Backend(
+            "gr_ros2.link.freshness", "FreshnessScheduler", "what lowers the weighted age most per airtime"
+        ),
+    },
 )

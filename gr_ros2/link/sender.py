@@ -1,7 +1,8 @@
 """The sending engine: messages in, packets out.
 
-Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason; a message
-whose first fragment has left is never dropped; packets come out only when the pace (rate or credit) allows; time is
+Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
+has them); a message whose first fragment has left is dropped only when its deadline cannot be met any more; packets
+come out only when the pace (rate or credit) allows; a packet is composed when it is asked for, never before; time is
 an argument and never goes back.
 """
 
@@ -9,21 +10,28 @@ from __future__ import annotations
 
 import random
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from math import inf
 from typing import Any
 
 from gr_ros2.config import SourceConfig, build
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing, largest_message, smallest_packet_len
+from gr_ros2.link.queues import Dropped, TopicQueue
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
-from gr_ros2.registry import Registry
-from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Packet, encode
+from gr_ros2.registry import Registry, Topic
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Packet, encode, single_entry_payload
 
 QOS_CODES = {"default": QOS_DEFAULT, "latency": QOS_LATENCY, "bulk": QOS_BULK}
 LIVE_SETTINGS = ("packet_rate", "flush_timeout", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that make sense to change while running."""
+
+_INTERVALS = 15
+"""Packet intervals from which the pace of credits is taken, as their median."""
 
 Observer = Callable[[SenderEvent], None]
 
@@ -45,6 +53,7 @@ class Sender:
     """Cuts, queues and packs messages of one source.
 
     :param registry: gives topic ids their options; ``config.topic_options`` go over them
+    :param codec: codes every message, which C = 1 says in every packet; events carry the message as submitted
     :param rng: seeds the start of sequence number and entry ids, and gives random ids where those are configured
     :param observer: called with every SenderEvent, in order
     """
@@ -54,6 +63,7 @@ class Sender:
         registry: Registry,
         config: SourceConfig,
         *,
+        codec: MessageCodec | None = None,
         rng: random.Random | None = None,
         observer: Observer | None = None,
     ) -> None:
@@ -63,21 +73,32 @@ class Sender:
         self.stats = SenderStats()
         self._rng = rng if rng is not None else random.Random()
         self._observer = observer
-        self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config)
-        self._queues: dict[int, deque[Outgoing]] = {topic.topic_id: deque() for topic in self.registry}
+        self._codec = codec
+        self._largest = largest_message(config.packet_len)
+        self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry)
+        self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
+        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        self._capped = any(topic.options.max_rate for topic in self.registry)
+        self._plan: Plan | None = None
+        self._plan_until = -inf
+        """When the plan is out of date though nothing has happened; -inf: something has."""
+        self._now = -inf
         self._next_id = [self._rng.randrange(256) for _ in self.registry]
         self._seq = self._rng.randrange(256)
         self._serial = 0
-        self._slot = float("-inf")
+        self._slot = -inf
         self._credits: int | None = None
+        self._busy_since = inf
+        """When the last packet left, if another was waiting for a credit then."""
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         self._latched: dict[int, bytes] = {}
         self._repeat_at: dict[int, float] = {}
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message.
 
-        It may be refused (``too_large``), and may push out the oldest waiting message of its topic
-        (``queue_bound``); both are counted and observed.
+        It may be refused (``too_large``), and may push out waiting messages of its topic (``queue_bound`` or
+        ``superseded``); all are counted and observed.
 
         :raises ConfigError: for a topic id that is not in the registry
         """
@@ -87,13 +108,16 @@ class Sender:
         self._serial += 1
         self.stats.submitted[topic_id] += 1
         self._observe(Accepted(serial, topic_id, payload, now))
-        if len(payload) > largest_message(self.config.packet_len):
+        if self._codec is not None:
+            payload = self._codec.encode(topic_id, payload)
+        if len(payload) > self._largest:
             self._refuse(serial, topic_id, "too_large", self._too_large(len(payload)))
             return
         topic = self.registry[topic_id]
-        queue = self._queues[topic_id]
-        self._make_room(topic_id)
-        queue.append(Outgoing(serial, topic_id, payload, QOS_CODES[topic.options.qos], now))
+        message = Outgoing(serial, topic_id, payload, QOS_CODES[topic.options.qos], now, topic.options.weight)
+        if dropped := self._queues[topic_id].admit(message, self._depth(topic_id)):
+            self._drop(dropped)
+        self._changed(now)
         if topic.latched:
             self._latched[topic_id] = payload
             self._repeat_at[topic_id] = now + self.config.repeat_s
@@ -102,13 +126,16 @@ class Sender:
         """The next packet that may go at ``now``, or None."""
         if self._credits == 0 or now < self._slot:
             return None
-        self._repeat(now)
-        plan = self._scheduler.plan(self._queues)
+        if self._repeat_at:
+            self._repeat(now)
+        if self._with_deadline:
+            self._expire(now)
+        plan = self._planned(now)
         if plan is None or now < self._departure(plan):
             return None
         data = self._compose(plan, now)
         if self._credits is not None:
-            self._credits -= 1
+            self._spend_credit(now)
         if self.config.packet_rate > 0:
             interval = 1 / self.config.packet_rate
             # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
@@ -120,9 +147,11 @@ class Sender:
         if self._credits == 0:
             return None
         times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
-        plan = self._scheduler.plan(self._queues)
+        plan = self._planned(self._now)
         if plan is not None:
             times.append(self._departure(plan))
+        if self._plan_until < inf:
+            times.append(self._plan_until)
         return max(min(times), self._slot) if times else None
 
     def use_credit(self) -> None:
@@ -136,8 +165,17 @@ class Sender:
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without pushing another out."""
-        depth = self._depth(topic_id)
-        return not depth or len(self._queues[topic_id]) < depth
+        return self._queues[topic_id].room(self._depth(topic_id))
+
+    @property
+    def interval(self) -> float:
+        """s from one packet to the next while the source is busy: set by ``packet_rate``, or as credits have come.
+
+        0 where neither is known.
+        """
+        if self.config.packet_rate > 0:
+            return 1 / self.config.packet_rate
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
 
     @property
     def idle(self) -> bool:
@@ -159,54 +197,92 @@ class Sender:
         current = {item.name: getattr(self.config, item.name) for item in fields(SourceConfig)}
         self.config = build(SourceConfig, {**current, **settings})
         self._scheduler.config = self.config
+        self._plan_until = -inf
         if "packet_rate" in settings:
-            self._slot = float("-inf")
+            self._slot = -inf
 
     def _depth(self, topic_id: int) -> int:
         depth = self.registry[topic_id].options.queue_depth
         return self.config.queue_depth if depth is None else depth
 
-    def _make_room(self, topic_id: int) -> None:
-        """Drop the oldest messages that have not started until one more fits the bound."""
-        queue = self._queues[topic_id]
-        depth = self._depth(topic_id)
-        while depth and len(queue) >= depth:
-            victim = next((message for message in queue if not message.started), None)
-            if victim is None:
-                return
-            queue.remove(victim)
-            if victim.serial >= 0:
-                self._refuse(victim.serial, topic_id, "queue_bound", f"{depth} messages were waiting")
+    def _changed(self, now: float) -> None:
+        """What waits is not what was planned for."""
+        self._now = now
+        self._plan_until = -inf
+
+    def _planned(self, now: float) -> Plan | None:
+        """The next packet's content; made anew only when something has changed."""
+        if now >= self._plan_until:
+            self._now = now
+            queues: Mapping[int, Sequence[Outgoing]] = self._queues
+            self._plan_until = inf
+            if self._capped:
+                queues = {topic_id: queue.open(now) for topic_id, queue in self._queues.items()}
+                self._plan_until = min(queue.opens(now) for queue in self._queues.values())
+            self._plan = self._scheduler.plan(queues)
+        return self._plan
+
+    def _expire(self, now: float) -> None:
+        """Drop what is too late, or would be."""
+        for queue in self._with_deadline:
+            if queue:
+                payload = single_entry_payload(self.config.packet_len)
+                late = list(queue.expire(now, self.interval, LEAD_S, payload))
+                if late:
+                    self._drop(late)
+                    self._changed(now)
+
+    def _drop(self, dropped: Iterable[Dropped]) -> None:
+        for item in dropped:
+            if item.message.serial >= 0:
+                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+
+    def _spend_credit(self, now: float) -> None:
+        """A packet left for a credit; where each had to wait for its own, learn how far apart they come."""
+        assert self._credits is not None
+        if self._busy_since < inf:
+            self._intervals.append(now - self._busy_since)
+        self._credits -= 1
+        busy = not self._credits and any(self._queues.values())
+        self._busy_since = now if busy else inf
 
     def _departure(self, plan: Plan) -> float:
         """When a planned packet may leave: at once if full, else after it has waited for company."""
         if plan.full or self.config.flush_timeout == 0:
-            return float("-inf")
+            return -inf
         return min(message.submitted for message in plan.picks) + self.config.flush_timeout
 
     def _compose(self, plan: Plan, now: float) -> bytes:
         config = self.config
         entries = []
         record = []
-        for message in plan.picks:
+        for message, length in zip(plan.picks, plan.lengths, strict=True):
             if not message.started:
                 message.entry_id = self._take_id(message.topic_id)
-            entry = message.next_entry()
+                self._queues[message.topic_id].started(now)
+            entry = message.take(length)
             entries.append(entry)
             record.append(SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total))
             if message.done:
-                self._queues[message.topic_id].remove(message)
+                self._queues[message.topic_id].popleft()
                 self.stats.sent[message.topic_id] += message.serial >= 0
-        data = encode(
-            Packet(self.src_id, config.dst_id, self._seq, config.hop, tuple(entries), qos=_packet_qos(plan)),
-            config.packet_len,
+        packet = Packet(
+            self.src_id,
+            config.dst_id,
+            self._seq,
+            config.hop,
+            tuple(entries),
+            qos=_packet_qos(plan),
+            compressed=self._codec is not None,
         )
+        data = encode(packet, config.packet_len)
         self._seq = (self._seq + 1) & 255
         self._scheduler.sent(plan)
+        self._changed(now)
         stats = self.stats
         stats.packets += 1
         stats.entries += len(entries)
-        stats.payload_bytes += sum(len(entry.payload) for entry in entries)
+        stats.payload_bytes += sum(plan.lengths)
         self._observe(SentPacket(data, tuple(record), now))
         return data
 
@@ -225,8 +301,11 @@ class Sender:
             if now >= at:
                 self._repeat_at[topic_id] = now + self.config.repeat_s
                 if not self._queues[topic_id]:
-                    self._queues[topic_id].append(Outgoing(-1, topic_id, self._latched[topic_id], QOS_BULK, now))
+                    weight = self.registry[topic_id].options.weight
+                    repeat = Outgoing(-1, topic_id, self._latched[topic_id], QOS_BULK, now, weight)
+                    self._queues[topic_id].append(repeat)
                     self.stats.repeats += 1
+                    self._changed(now)
 
     def _too_large(self, size: int) -> str:
         needed = smallest_packet_len(size)
@@ -242,8 +321,15 @@ class Sender:
             self._observer(event)
 
 
+def _queue(topic: Topic) -> TopicQueue:
+    options = topic.options
+    return TopicQueue(options.queue_policy, options.deadline_ms / 1e3, options.max_rate)
+
+
 def _packet_qos(plan: Plan) -> int:
     """Latency if any entry is, bulk only if all are."""
+    if len(plan.picks) == 1:
+        return plan.picks[0].qos
     classes = {message.qos for message in plan.picks}
     if QOS_LATENCY in classes:
         return QOS_LATENCY

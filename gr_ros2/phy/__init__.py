@@ -5,13 +5,16 @@ from __future__ import annotations
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.phy.base import Phy
 
+_GNURADIO = "GNU Radio 3.10 (apt install gnuradio)"
+
 PHY = BackendTable(
     "phy",
     {
         "direct": Backend("gr_ros2.phy.direct", "DirectPhy", "message loopback, no samples"),
-        "ofdm": Backend(
-            "gr_ros2.phy.ofdm", "OfdmPhy", "GNU Radio's stock OFDM", "GNU Radio 3.10 (apt install gnuradio)"
-        ),
+        "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "GNU Radio's stock OFDM", _GNURADIO),
+        "gfsk": Backend("gr_ros2.phy.gfsk", "GfskPhy", "GMSK bursts, constant envelope", _GNURADIO),
+        "psk": Backend("gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO),
+        "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format", _GNURADIO),
     },
 )
 

@@ -42,6 +42,13 @@ class Phy(ABC):
     def burst_power(self) -> float:
         """Mean of the squared magnitude of one packet's samples, gap excluded; 0 for a PHY without samples."""
 
+    def computed_pdr(self, snr_db: float) -> float:  # noqa: ARG002
+        """Share of packets an ideal receiver would deliver in white noise, 0..1; 1 for a PHY without samples.
+
+        :param snr_db: mean burst power over noise power in the sampled band, dB
+        """
+        return 1.0
+
     def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
         """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
 

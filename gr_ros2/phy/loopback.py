@@ -6,7 +6,9 @@ thread of the link runs, whatever state it was in.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+import weakref
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
@@ -17,6 +19,16 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy.airtime import AirtimeGate, Pace
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel, PacketLoss
+from gr_ros2.phy.tap import Samples, Tap
+
+TAP_SIZE = 1024
+"""Samples of one look at the received signal."""
+
+
+_START_ATTEMPTS = 20
+"""GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,6 +59,8 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
     :param pace: `airtime` as on the air, `flow` as fast as the flowgraph takes it (see :class:`AirtimeGate`)
     :param paced: the gate's credits pace the source; False offers every packet at once, as the paper does. With a PHY
         without samples there is nothing to pace by, except with pace `flow`
+    :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, and taps
+        for spectrum and constellation
     """
 
     def __init__(
@@ -58,6 +72,7 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         channel: ChannelConfig | None = None,
         pace: Pace = "airtime",
         paced: bool = True,
+        instrumented: bool = False,
     ) -> None:
         super().__init__("gr_ros2_loopback", catch_exceptions=True)
         channel = channel if channel is not None else ChannelConfig()
@@ -72,7 +87,11 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         self._gate = (
             AirtimeGate(phy.airtime(), pace, progress=self._progress) if phy.has_samples or pace == "flow" else None
         )
-        self._loss = PacketLoss(channel.packet_loss, channel.seed) if phy.has_samples or channel.packet_loss else None
+        lossy = phy.has_samples or channel.packet_loss or instrumented
+        self._loss = PacketLoss(channel.packet_loss, channel.seed) if lossy else None
+        self._config = channel
+        self._tap: Tap | None = None
+        self._symbols: Tap | None = None
         last = source
         if self._gate is not None:
             last = self._follow(last, self._gate)
@@ -80,7 +99,14 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
             receiver = phy.receiver()
             self.msg_connect(last, "pdus", self._transmitter, "pdus")
             self.connect(self._transmitter, self._channel, receiver)
+            if instrumented:
+                self._tap = Tap(TAP_SIZE)
+                self.connect(self._channel, self._tap)
+                self._symbols = receiver.tap_symbols() if hasattr(receiver, "tap_symbols") else None
             last = receiver
+            # A hier block with message ports holds itself, and 60 of the system's 4096 shared memory segments for OFDM.
+            for hier_block in (self._transmitter, receiver):
+                weakref.finalize(self, hier_block.disconnect_all)
         if self._loss is not None:
             last = self._follow(last, self._loss)
         self.msg_connect(last, "pdus", sink, "pdus")
@@ -95,8 +121,8 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         """
         self._running = True
         try:
-            super().start(max_noutput_items)
-        except RuntimeError as error:
+            self._start(max_noutput_items)
+        except (RuntimeError, MemoryError) as error:
             self.stop()
             raise PhyError(f"phy {self.phy.name}: the flowgraph does not start ({error})") from error
         if self._pace == "airtime":
@@ -121,19 +147,36 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
             dropped=self._dropped(),
         )
 
+    @property
+    def channel(self) -> ChannelConfig:
+        """The channel as it is set now."""
+        return self._config
+
+    def samples(self) -> Samples | None:
+        """Newest samples at the receiver's antenna, after the channel; None where there is no tap or nothing came."""
+        return None if self._tap is None else self._tap.samples()
+
+    def symbols(self) -> Samples | None:
+        """Newest equalised payload symbols, of an instrumented link whose PHY shows them; otherwise None."""
+        return None if self._symbols is None else self._symbols.samples()
+
     def set_snr_db(self, snr_db: float | None) -> None:
         """See :meth:`Channel.set_snr_db`.
 
         :raises PhyError: for a PHY without samples
         """
-        self._sampled("snr_db").set_snr_db(snr_db)
+        channel = self._sampled("snr_db")
+        channel.set_snr_db(snr_db)
+        self._config = replace(self._config, snr_db=channel.config.snr_db)
 
     def set_frequency_offset(self, frequency_offset: float) -> None:
         """See :meth:`Channel.set_frequency_offset`.
 
         :raises PhyError: for a PHY without samples
         """
-        self._sampled("frequency_offset").set_frequency_offset(frequency_offset)
+        channel = self._sampled("frequency_offset")
+        channel.set_frequency_offset(frequency_offset)
+        self._config = replace(self._config, frequency_offset=channel.config.frequency_offset)
 
     def set_packet_loss(self, probability: float) -> None:
         """Probability that a packet is dropped between PHY and sink.
@@ -144,6 +187,7 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         if self._loss is None:
             raise PhyError(f"packet_loss: phy {self.phy.name} was started without; start with packet_loss above 0")
         self._loss.set_probability(probability)
+        self._config = replace(self._config, packet_loss=probability)
 
     def __enter__(self) -> LoopbackLink:
         self.start()
@@ -153,6 +197,15 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+    def _start(self, max_noutput_items: int) -> None:
+        for _ in range(_START_ATTEMPTS - 1):
+            try:
+                super().start(max_noutput_items)
+                return
+            except MemoryError:
+                _log.debug("phy %s: GNU Radio could not map a buffer; starting again", self.phy.name)
+        super().start(max_noutput_items)
 
     def _sampled(self, setting: str) -> Channel:
         if self._channel is None:

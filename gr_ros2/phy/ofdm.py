@@ -1,44 +1,48 @@
-"""The `ofdm` PHY: GNU Radio's stock OFDM transmitter and receiver, wired so that no packet is lost on the way.
+"""The `ofdm` PHY: GNU Radio's OFDM blocks, wired so that no packet is lost on the way.
 
 Laws: every packet is followed by ``gap`` zero samples, so that the receiver never sees two frames back to back
 (its header/payload demultiplexer then swallows a trigger now and then) and the last frame is pushed out of it at
 once; transmitter and receiver use different tag keys, so that a loopback cannot leak a length past the channel;
-every buffer holds a whole frame, since a tagged stream block that cannot get one stalls the flowgraph.
+every buffer holds a whole frame, since a tagged stream block that cannot get one stalls the flowgraph; frames whose
+bits do not fill whole points are filled up with bytes the receiver takes off again, since the stock header cannot
+tell it of parts of a point.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import pmt
-from gnuradio import blocks, digital, gr, pdu
+from gnuradio import blocks, gr, pdu
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import build
+from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import Phy
+from gr_ros2.phy.ofdm_wiring import BITS, Layout, OfdmDemodulator, OfdmModulator, only_warnings, point_power
+from gr_ros2.phy.tap import Tap
+from gr_ros2.phy.theory import packet_success, psk_symbol_error, qam_symbol_error
 
-FFT_LEN, CP_LEN = 64, 16
-DATA_CARRIERS, PILOT_CARRIERS = 48, 4
 HEAD_SYMBOLS = 3
 """Two sync words and one header symbol."""
+STOCK_THRESHOLD = 0.9
+"""What GNU Radio's ``ofdm_rx`` uses: 4 to 5 dB less sensitive in white noise."""
 
 _CRC32_LEN = 4
 _MAX_FRAME_LEN = 4095
 """The stock header counts the bytes of its frame, CRC-32 included, in 12 bits."""
-_BITS = {"bpsk": 1, "qpsk": 2}
-_POINT_POWER = {"bpsk": 1, "qpsk": 4}
-"""Squared magnitude of a constellation point: GNU Radio's ``constellation_qpsk`` is not normalised."""
-_TX_KEY, _RX_KEY, _RX_FRAME_KEY = "gr_ros2_tx_len", "gr_ros2_rx_len", "gr_ros2_rx_frame"
+_TX_KEY, _RX_KEY, _RX_FRAME_KEY, _RX_PACKET_KEY = (
+    f"gr_ros2_{name}" for name in ("tx_len", "rx_len", "rx_frame", "rx_packet")
+)
 _SPINNING_THREAD = "header_pay"
 """How the name of the demultiplexer's thread begins: the kernel keeps 15 characters, GNU Radio's block number too."""
 _THREADS_WAIT_S = 0.2
+_SYMBOLS_SHOWN = 480
 _SMALLEST_BUFFER = 32768
 """Bytes GNU Radio gives every buffer anyway."""
 
@@ -48,17 +52,26 @@ class OfdmOptions:
     """Settings of this PHY beside packet length and sample rate.
 
     :param payload_modulation: of the payload symbols; preamble and header are BPSK always
-    :param gap: zero samples after each packet, 1..100000; below 112 the last packet stays in the receiver
+    :param fft_len: carriers, used or not; about 13 of 16 are used
+    :param cp_len: samples of the cyclic prefix, a quarter to a half of ``fft_len``; None = a quarter. With a shorter
+        one the stock synchroniser loses packets even without noise
+    :param gap: zero samples after each packet; None = two symbols. Below one symbol and half an FFT length, which is
+        refused, the last packet would stay in the receiver
     :param scramble: scramble header and payload bits (measured: makes no difference to loss)
+    :param detection_threshold: of the preamble's metric, 0.5..0.95, or stock = 0.9 as in GNU Radio's ``ofdm_rx``, which
+        is 4 to 5 dB less sensitive in white noise; lower ones trigger on noise
     """
 
-    payload_modulation: Literal["bpsk", "qpsk"] = "bpsk"
-    gap: Annotated[int, Field(ge=1, le=100_000)] = 160
+    payload_modulation: Literal["bpsk", "qpsk", "8psk", "16qam", "64qam"] = "bpsk"
+    fft_len: Literal[64, 128, 256, 512] = 64
+    cp_len: Annotated[int, Field(ge=16, le=256)] | None = None
+    gap: Annotated[int, Field(ge=1, le=100_000)] | None = None
     scramble: bool = False
+    detection_threshold: Annotated[float, Field(ge=0.5, le=0.95)] | Literal["stock"] = 0.6
 
 
 class OfdmPhy(Phy):
-    """GNU Radio's stock OFDM: FFT 64, cyclic prefix 16, 48 data carriers, CRC-32 per frame.
+    """GNU Radio's stock OFDM: by default FFT 64, cyclic prefix 16, 48 data carriers, CRC-32 per frame.
 
     A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames go without
     it: the packet's own CRC-16 alone protects them, and damaged ones reach the sink, which refuses and counts them.
@@ -73,31 +86,62 @@ class OfdmPhy(Phy):
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate)
         self.options = build(OfdmOptions, options, "phy ofdm")
-        self.with_crc32 = packet_len + _CRC32_LEN <= _MAX_FRAME_LEN
+        bytes_per_points = 3 if self.bits_per_carrier in (3, 6) else 1
+        self.with_crc32 = True
+        self.fill = -(packet_len + _CRC32_LEN) % bytes_per_points
+        """Bytes a packet is filled up with, so that its frame takes whole constellation points."""
+        if packet_len + self.fill + _CRC32_LEN > _MAX_FRAME_LEN:
+            self.with_crc32 = False
+            self.fill = -packet_len % bytes_per_points
+        fft_len = self.options.fft_len
+        cp_len = fft_len // 4 if self.options.cp_len is None else self.options.cp_len
+        if not fft_len <= 4 * cp_len <= 2 * fft_len:
+            raise ConfigError(
+                f"phy ofdm: cp_len = {cp_len}: {fft_len // 4} to {fft_len // 2} samples with fft_len = {fft_len}"
+            )
+        self.layout = Layout(fft_len, cp_len, self.options.payload_modulation, self.options.scramble, self.with_crc32)
+        least = self.symbol_samples + self.options.fft_len // 2
+        self.gap = 2 * self.symbol_samples if self.options.gap is None else self.options.gap
+        if self.gap < least:
+            raise ConfigError(f"phy ofdm: gap = {self.gap}: below {least} the last packet stays in the receiver")
+
+    @property
+    def symbol_samples(self) -> int:
+        """Samples of one OFDM symbol, cyclic prefix included."""
+        return self.layout.fft_len + self.layout.cp_len
 
     @property
     def bits_per_carrier(self) -> int:
         """Payload bits on one carrier of one symbol."""
-        return _BITS[self.options.payload_modulation]
+        return BITS[self.options.payload_modulation]
 
     def frame_bits(self) -> int:
-        """Payload bits of one frame, CRC-32 included."""
-        return 8 * (self.packet_len + (_CRC32_LEN if self.with_crc32 else 0))
+        """Payload bits of one frame, CRC-32 and filling included."""
+        return 8 * (self.packet_len + self.fill + (_CRC32_LEN if self.with_crc32 else 0))
 
     def frame_symbols(self) -> int:
         """OFDM symbols of one frame: sync words, header, payload."""
-        return HEAD_SYMBOLS + -(-self.frame_bits() // (self.bits_per_carrier * DATA_CARRIERS))
+        return HEAD_SYMBOLS + -(-self.frame_bits() // (self.bits_per_carrier * len(self.layout.data[0])))
 
     def airtime_samples(self) -> int:
-        return self.frame_symbols() * (FFT_LEN + CP_LEN) + self.options.gap
+        return self.frame_symbols() * self.symbol_samples + self.gap
 
     def burst_power(self) -> float:
         # The transmitter's inverse FFT is not normalised, so a symbol's mean power is the sum over its carriers.
         # The first sync word has every other carrier, at twice the power; unused carriers of the last symbol are 0.
-        head = HEAD_SYMBOLS * (DATA_CARRIERS + PILOT_CARRIERS)
-        pilots = (self.frame_symbols() - HEAD_SYMBOLS) * PILOT_CARRIERS
+        data, pilots = len(self.layout.data[0]), len(self.layout.pilots[0])
+        head = 3 * (data + pilots)
+        tail = (self.frame_symbols() - HEAD_SYMBOLS) * pilots
         points = -(-self.frame_bits() // self.bits_per_carrier)
-        return (head + pilots + points * _POINT_POWER[self.options.payload_modulation]) / self.frame_symbols()
+        return (head + tail + points * point_power(self.options.payload_modulation)) / self.frame_symbols()
+
+    def computed_pdr(self, snr_db: float) -> float:
+        noise = self.burst_power() / 10 ** (snr_db / 10)
+        power = point_power(self.options.payload_modulation)
+        snr, points = power * self.options.fft_len / noise, self.frame_bits() // self.bits_per_carrier
+        order = 1 << self.bits_per_carrier
+        error = psk_symbol_error(order, snr) if order <= 8 else qam_symbol_error(order, snr)
+        return packet_success(error, points)
 
     def prefer_latency(self) -> None:
         """Run the receiver's demultiplexers when nothing else wants to run: they spin while waiting for their header.
@@ -120,16 +164,6 @@ class OfdmPhy(Phy):
     def receiver(self) -> OfdmReceiver:
         return OfdmReceiver(self)
 
-    def stock_arguments(self) -> dict[str, Any]:
-        """What GNU Radio's transmitter and receiver must agree on."""
-        return {
-            "fft_len": FFT_LEN,
-            "cp_len": CP_LEN,
-            "bps_header": 1,
-            "bps_payload": self.bits_per_carrier,
-            "scramble_bits": self.options.scramble,
-        }
-
     def fit_buffers(self, parts: list[Any]) -> None:
         """Give each block room for two frames where GNU Radio's own size would not do.
 
@@ -140,7 +174,9 @@ class OfdmPhy(Phy):
             if not signature.max_streams():
                 continue
             size = signature.sizeof_stream_item(0)
-            items = self.frame_symbols() if size >= FFT_LEN else max(self.airtime_samples(), self.frame_bits())
+            items = (
+                self.frame_symbols() if size >= self.options.fft_len else max(self.airtime_samples(), self.frame_bits())
+            )
             if 2 * items * size > _SMALLEST_BUFFER:
                 # Port by port: on blocks with any number of outputs the setter for all ports does nothing.
                 for port in range(max(1, signature.max_streams())):
@@ -155,14 +191,22 @@ class OfdmTransmitter(gr.hier_block2):  # type: ignore[misc]
         self.message_port_register_hier_in("pdus")
         self._airtime_samples = phy.airtime_samples()
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
-        modulator = _StockTransmitter(phy.with_crc32, packet_length_tag_key=_TX_KEY, **phy.stock_arguments())
-        zeros = blocks.vector_source_c([0j] * phy.options.gap, True, 1, [_length_tag(phy.options.gap)])
+        modulator = OfdmModulator(phy.layout, _TX_KEY)
+        zeros = blocks.vector_source_c([0j] * phy.gap, True, 1, [_length_tag(phy.gap)])
         self._mux = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY)
+        parts = [to_stream, *modulator.parts, zeros, self._mux]
         self.msg_connect((self, "pdus"), (to_stream, "pdus"))
-        self.connect(to_stream, modulator, (self._mux, 0))
+        last = to_stream
+        if phy.fill:
+            filling = blocks.vector_source_b([0] * phy.fill, True, 1, [_length_tag(phy.fill)])
+            last = blocks.tagged_stream_mux(1, _TX_KEY)
+            self.connect(to_stream, (last, 0))
+            self.connect(filling, (last, 1))
+            parts += [filling, last]
+        self.connect(last, modulator, (self._mux, 0))
         self.connect(zeros, (self._mux, 1))
         self.connect(self._mux, self)
-        phy.fit_buffers([to_stream, *modulator.parts, zeros, self._mux])
+        phy.fit_buffers(parts)
 
     def packets_sent(self) -> int:
         """Packets that have left as samples; 0 before the flowgraph runs."""
@@ -178,51 +222,31 @@ class OfdmReceiver(gr.hier_block2):  # type: ignore[misc]
     def __init__(self, phy: OfdmPhy) -> None:
         super().__init__("gr_ros2_ofdm_rx", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
         self.message_port_register_hier_out("pdus")
-        demodulator = _StockReceiver(
-            phy.with_crc32,
-            packet_length_tag_key=_RX_KEY,
-            frame_length_tag_key=_RX_FRAME_KEY,
-            **phy.stock_arguments(),
-        )
-        to_pdu = pdu.tagged_stream_to_pdu(gr.types.byte_t, _RX_KEY)
-        self.connect(self, demodulator, to_pdu)
+        threshold = phy.options.detection_threshold
+        self._phy = phy
+        level = STOCK_THRESHOLD if threshold == "stock" else float(threshold)
+        # Header parser and demultiplexer tell of every header lost in noise.
+        with only_warnings():
+            self._demodulator = OfdmDemodulator(phy.layout, level, _RX_KEY, _RX_FRAME_KEY)
+        self.connect(self, self._demodulator)
+        last, key, parts = self._demodulator, _RX_KEY, list(self._demodulator.parts)
+        if phy.fill:
+            # Frames come whole or not at all, so counting bytes is enough.
+            key = _RX_PACKET_KEY
+            packet = blocks.keep_m_in_n(1, phy.packet_len, phy.packet_len + phy.fill, 0)
+            last = blocks.stream_to_tagged_stream(1, 1, phy.packet_len, key)
+            self.connect(self._demodulator, packet, last)
+            parts += [packet, last]
+        to_pdu = pdu.tagged_stream_to_pdu(gr.types.byte_t, key)
+        self.connect(last, to_pdu)
         self.msg_connect((to_pdu, "pdus"), (self, "pdus"))
-        phy.fit_buffers(demodulator.parts)
+        phy.fit_buffers(parts)
 
-
-class _Wiring:
-    """Mixed into a stock hier block, this sees it wire itself: it notes the parts and can leave the CRC-32 out.
-
-    The stock blocks keep no reference to their parts, but each needs its buffer sized.
-    """
-
-    def __init__(self, with_crc32: bool, **arguments: Any) -> None:
-        self.parts: list[Any] = []
-        self._with_crc32 = with_crc32
-        with _numpy_state_kept(), _only_warnings():
-            super().__init__(**arguments)
-
-    def connect(self, *points: Any) -> None:
-        if not self._with_crc32:
-            points = tuple(self if _is_crc32(point) and i == 0 else point for i, point in enumerate(points))
-            points = tuple(point for point in points if not _is_crc32(point))
-        for point in points:
-            block = point[0] if isinstance(point, tuple) else point
-            if block is not self and all(block is not part for part in self.parts):
-                self.parts.append(block)
-        super().connect(*points)  # type: ignore[misc]
-
-
-class _StockTransmitter(_Wiring, digital.ofdm_tx):  # type: ignore[misc]
-    pass
-
-
-class _StockReceiver(_Wiring, digital.ofdm_rx):  # type: ignore[misc]
-    pass
-
-
-def _is_crc32(point: Any) -> bool:
-    return hasattr(point, "name") and point.name() == "crc32_bb"
+    def tap_symbols(self) -> Tap:
+        """Let the payload's symbols be seen, equalised and not yet decided. Before the start, once."""
+        tap = Tap(_SYMBOLS_SHOWN)
+        self._phy.fit_buffers(self._demodulator.show_symbols(tap))
+        return tap
 
 
 def _length_tag(length: int) -> Any:
@@ -231,25 +255,3 @@ def _length_tag(length: int) -> Any:
     tag.key = pmt.intern(_TX_KEY)
     tag.value = pmt.from_long(length)
     return tag
-
-
-@contextmanager
-def _numpy_state_kept() -> Iterator[None]:
-    """The stock blocks reseed numpy's global generator for their sync words; that is the user's, so put it back."""
-    state = np.random.get_state()
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
-
-
-@contextmanager
-def _only_warnings() -> Iterator[None]:
-    """Blocks made in here log warnings only: the synchroniser's parts announce each buffer set on them."""
-    logging = gr.logging()
-    level = logging.default_level()
-    logging.set_default_level(gr.log_levels.warn)
-    try:
-        yield
-    finally:
-        logging.set_default_level(level)

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.figures import SENT_EVERY, latency_figure, path_figure, save_figure
+from gr_ros2.experiment.figures import (
+    SENT_EVERY,
+    latency_figure,
+    ledger_figure,
+    path_figure,
+    row_colour,
+    row_order,
+    save_figure,
+)
 
 ANGLE = np.linspace(0, 6, 501)
 PATH = np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])
@@ -51,3 +59,25 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
         save_figure(latency_figure({}), tmp_path / "file", "latency")
+
+
+def test_ledger_bars_fill_the_width() -> None:
+    ledgers = {"a": {"delivered": 9, "lost_fragments": 1}, "b": {"in_flight": 5, "new_row": 5}, "c": {}}
+    axes = ledger_figure(ledgers).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["a (10)", "b (10)"]
+    widths = np.array([[bar.get_width() for bar in bars] for bars in axes.containers])
+    assert widths.sum(axis=0) == pytest.approx([100, 100])
+    assert [bars.get_label() for bars in axes.containers] == ["delivered", "lost fragments", "new row", "in flight"]
+    assert {"9", "1", "5"} <= {text.get_text() for text in axes.texts}
+
+
+def test_no_ledger_can_be_drawn(tmp_path: Path) -> None:
+    save_figure(ledger_figure({"a": {}}), tmp_path, "ledger")
+
+
+def test_a_row_keeps_its_place_and_colour() -> None:
+    assert row_order([{"in_flight": 1, "b": 1, "none": 0}, {"delivered": 1, "a": 1}]) == [
+        *("delivered", "a", "b", "in_flight"),
+    ]
+    assert row_colour("delivered") != row_colour("in_flight")
+    assert row_colour("never heard of") == row_colour("never heard of")

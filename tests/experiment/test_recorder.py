@@ -53,8 +53,15 @@ def test_a_run_over_the_engines() -> None:
     assert at.rms_error_m == pytest.approx(0.05 * 10 * 5**0.5, rel=1e-3)
     assert at.goodput_Bps == pytest.approx(90 * len(_point_stamped(0, 0)) / 10)
     assert (imu.sent, imu.pdr, imu.path_error_m, imu.latency_clock) == (0, None, None, None)
-    sent, received = recorder.tracks()["/robot_4/at"]
-    assert (len(sent.xy), len(received.xy)) == (100, 90)
+    trace = recorder.trace(100, 110, {"/robot_4/at": "/rx_robot_4/at"})
+    (path,) = trace.paths()
+    assert (path.topic, path.published_as) == ("/robot_4/at", "/rx_robot_4/at")
+    assert (len(path.sent), len(path.received)) == (100, 90)
+    assert path.sent[3].tolist() == [3, 6]
+    (messages,) = trace.messages()
+    assert messages.t_sent[[0, -1]] == pytest.approx([0, 9.9])
+    assert (messages.row != "delivered").nonzero()[0].tolist() == list(range(20, 30))
+    assert set(messages.row[20:30]) == {"lost_fragments"}
     packets = recorder.ledger.packets()["sent"]
     assert recorder.airtime(0.5) == {
         "airtime_s": 0.5,

@@ -20,7 +20,7 @@ BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
 
 
 def test_the_built_in_ones() -> None:
-    assert set(BUILTIN) == {"demo", "paper-direct", "paper-ofdm", "paper-ofdm-paced"}
+    assert {"demo", "paper-direct", "paper-ofdm", "paper-ofdm-paced"} <= set(BUILTIN)
     demo, direct, ofdm = BUILTIN["demo"], BUILTIN["paper-direct"], BUILTIN["paper-ofdm"]
     assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", 0, 1.2)
     assert (direct.packet_len, direct.sim.odom_rate, direct.duration_s, direct.phy.name) == (64, 30, 15, "direct")
@@ -119,5 +119,5 @@ def test_a_file_with_a_registry_beside_it(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_neither_a_file_nor_built_in() -> None:
-    with pytest.raises(ConfigError, match="'dmeo' is neither a file nor built in; built in are demo, paper-direct"):
+    with pytest.raises(ConfigError, match="'dmeo' is neither a file nor built in; built in are demo, .*paper-direct"):
         load_scenario("dmeo")

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gr_ros2.experiment.result import LatencyResult, Result
-from gr_ros2.experiment.table import ledger_table, notes, summary_table
+from gr_ros2.experiment.table import as_table, ledger_table, notes, paper_grid, summary_table
 
 
 def _text(table: Table, width: int = 140) -> str:
@@ -52,3 +52,14 @@ def test_notes_say_what_must_not_be_missed(result: Result) -> None:
     bad = replace(result, topics=(replace(result.topics[0], corrupt=2),), interrupted=True)
     assert "2 messages arrived altered" in notes(bad)[0]
     assert "stopped after 15.0 s" in notes(bad)[-1]
+
+
+def test_the_papers_own_line_stands_above_ours(result: Result) -> None:
+    text = _text(as_table(paper_grid([result, replace(result, scenario="x", phy={"name": "ofdm"})])))
+    lines = [line.split() for line in text.splitlines()]
+    assert [line for line in lines if line and line[0] in ("OFDM", "Direct")] == [
+        ["OFDM", "the", "paper", "38.0", "1328", "12", "0.01", "228.6"],
+        ["OFDM", "x", "15.0", "10", "9", "0.90", "123.5"],
+        ["Direct", "the", "paper", "15.0", "452", "452", "1.00", "21767.9"],
+        ["Direct", "paper-direct", "15.0", "10", "9", "0.90", "123.5"],
+    ]

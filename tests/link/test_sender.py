@@ -5,16 +5,19 @@ from __future__ import annotations
 import random
 from collections import Counter
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import SourceConfig, TopicOptions, build
+from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError
-from gr_ros2.link import Accepted, Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Accepted, Receiver, Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link.freshness import Queues
+from gr_ros2.link.schedule import PaperScheduler
 from gr_ros2.registry import Registry
-from tests.link.engines import drain, read, sender, trace
+from tests.link.engines import delivered, drain, read, registry, sender, trace
 
 
 def test_one_topic_fills_packets_alone() -> None:
@@ -274,3 +277,71 @@ def test_every_message_leaves_whole_once_in_topic_order(
     assert engine.idle
     assert sum(isinstance(event, Accepted) for event in events) == len(sent)
     assert sum(isinstance(event, SentPacket) for event in events) == engine.stats.packets
+
+
+class Halving:
+    """A codec that keeps every other byte, behind a byte that names it; its messages hold each byte twice."""
+
+    def encode(self, topic_id: int, payload: bytes) -> bytes:
+        return bytes([topic_id]) + payload[::2]
+
+    def decode(self, topic_id: int, coded: bytes) -> bytes:
+        assert coded[0] == topic_id
+        return bytes(byte for byte in coded[1:] for _ in range(2))
+
+
+def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> None:
+    events: list[SenderEvent] = []
+    engine = Sender(
+        registry(2),
+        build(SourceConfig, {"robot_id": 1, "packet_len": 64}),
+        codec=Halving(),
+        rng=random.Random(0),
+        observer=events.append,
+    )
+    message = bytes(byte for byte in range(50) for _ in range(2))
+    engine.submit(1, message, 0.0)
+    (data,) = drain(engine)
+    packet = read(data)
+    assert packet.compressed
+    assert packet.entries[0].payload == b"\1" + bytes(range(50))
+    assert isinstance(events[0], Accepted)
+    assert events[0].payload == message
+    sink = Receiver(registry(2), SinkConfig(packet_len=64), codec=Halving())
+    assert delivered(sink.receive(data, 0.0)) == [message]
+
+
+def test_a_message_that_fits_only_coded_is_sent() -> None:
+    engine = Sender(registry(1), build(SourceConfig, {"robot_id": 1, "packet_len": 64}), codec=Halving())
+    engine.submit(0, bytes(255 * 51 + 100), 0.0)
+    assert len(drain(engine)) == 129
+
+
+def test_nothing_is_composed_before_it_is_asked_for() -> None:
+    """What came last before the credit goes, whatever was waiting when the credit before was used."""
+    engine = sender(topics=1, packet_len=64, scheduler="freshness", topic_options={"t0": TopicOptions(queue="latest")})
+    engine.use_credit()
+    engine.submit(0, b"old", 0.0)
+    assert engine.next_packet(0.0) is None
+    engine.submit(0, b"new", 0.1)
+    engine.credit()
+    data = engine.next_packet(0.1)
+    assert data is not None
+    assert read(data).entries[0].payload == b"new"
+
+
+def test_a_plan_is_made_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = sender(topics=1, packet_len=64)
+    made = []
+
+    def plan(self: PaperScheduler, queues: Queues, plan: Any = PaperScheduler.plan) -> Any:
+        made.append(plan(self, queues))
+        return made[-1]
+
+    monkeypatch.setattr(PaperScheduler, "plan", plan)
+    engine.submit(0, bytes(80), 0.0)
+    for _ in range(5):
+        engine.next_timeout()
+    drain(engine)
+    engine.next_timeout()
+    assert len(made) == 3, "for each of two packets, and once to see that nothing is left"

@@ -6,6 +6,7 @@ import random
 import threading
 import time
 
+import numpy as np
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -96,6 +97,43 @@ def test_a_paced_source_is_told_and_gets_credits() -> None:
     with LoopbackLink(make("ofdm"), source, Probe(), paced=False):
         pass
     assert not source.uses_credit
+
+
+@pytest.mark.parametrize("name", list(PHY))
+def test_an_instrumented_link_loses_nothing_and_can_lose_what_it_is_told(name: str) -> None:
+    source, sink = Probe(), Probe()
+    sent = packets(100)
+    with LoopbackLink(make(name), source, sink, instrumented=True) as link:
+        assert link.channel == ChannelConfig()
+        for packet in sent:
+            source.post(packet)
+        wait_for(lambda: sink.handled == len(sent), "every packet")
+        link.set_packet_loss(1.0)
+        source.post(bytes(64))
+        wait_for(lambda: link.counts().dropped == 1, "a packet lost on purpose")
+        assert link.channel.packet_loss == 1.0
+    assert sink.packets == sent
+
+
+def test_an_instrumented_link_shows_the_received_signal() -> None:
+    source = Probe()
+    with LoopbackLink(make("ofdm"), source, Probe(), channel=ChannelConfig(snr_db=30), instrumented=True) as link:
+        assert link.samples() is None
+        for packet in packets(10):
+            source.post(packet)
+        wait_for(lambda: link.samples() is not None and link.symbols() is not None, "samples and symbols")
+        symbols = link.symbols()
+        assert symbols is not None
+        # BPSK in little noise: two clouds on the real axis, and the unused carriers of a last symbol.
+        assert (abs(symbols.imag) < 0.5).all()
+        assert np.median(abs(abs(symbols.real) - 1)) < 0.1
+        assert {-1, 1} <= set(np.sign(symbols.real))
+
+
+def test_a_link_that_is_not_instrumented_shows_nothing() -> None:
+    link = LoopbackLink(make("ofdm"), Probe(), Probe())
+    assert link.samples() is None
+    assert link.symbols() is None
 
 
 def test_what_has_no_samples_has_no_noise() -> None:

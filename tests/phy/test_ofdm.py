@@ -63,8 +63,8 @@ def test_every_length_passes_back_to_back_and_the_air_is_as_long_and_as_strong_a
     assert loop.probe.packets == sent
     samples = np.array(loop.samples.data())
     assert len(samples) == len(sent) * phy.airtime_samples()
-    burst = samples.reshape(len(sent), -1)[:, : -phy.options.gap]
-    assert np.all(samples.reshape(len(sent), -1)[:, -phy.options.gap :] == 0)
+    burst = samples.reshape(len(sent), -1)[:, : -phy.gap]
+    assert np.all(samples.reshape(len(sent), -1)[:, -phy.gap :] == 0)
     assert np.mean(np.abs(burst) ** 2) == pytest.approx(phy.burst_power(), rel=0.03)
 
 

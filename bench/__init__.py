@@ -1,0 +1,1 @@
+"""What gr-ros2 promises in numbers, measured: `python -m bench [NAME …]`."""

@@ -1,0 +1,45 @@
+"""`python -m bench [NAME …]`: measure, print a table, exit with 1 if a target was missed."""
+
+from __future__ import annotations
+
+import sys
+import time
+from importlib import import_module
+
+from rich.console import Console
+
+from bench.report import Row, table
+
+BENCHMARKS = {
+    "codec": "bench.codec",
+    "port": "bench.port",
+    "direct": "bench.runs",
+    "fast": "bench.runs",
+    "ofdm": "bench.runs",
+    "husky": "bench.runs",
+    "stop": "bench.stop",
+    "compression": "bench.compression",
+}
+"""Name of each benchmark, which is a function of the module it stands in."""
+
+
+def main(names: list[str]) -> int:
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        print(f"bench: no {unknown[0]!r}; known are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)
+    rows: list[Row] = []
+    for name in names or BENCHMARKS:
+        begin = time.monotonic()
+        with console.status(f"{name} …"):
+            rows += getattr(import_module(BENCHMARKS[name]), name)()
+        console.print(f"{name}: {time.monotonic() - begin:.0f} s")
+    console.print(table(rows))
+    return 0 if all(row.met for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,66 @@
+"""Message compression: bytes per message, and microseconds per message on one core."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from statistics import mean
+
+from bench.report import Row, median_of
+from gr_ros2.compression import LinkCodec
+from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.registry import Registry
+from gr_ros2.sim import Fleet, SimSettings
+
+HUSKY = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
+TWO_PACKETS = 102
+"""Bytes of payload in two packets of 64 B."""
+REPEATS = 9
+_TYPES = {"odom": "nav_msgs/msg/Odometry", "imu": "sensor_msgs/msg/Imu"}
+
+
+def compression() -> list[Row]:
+    """The recording where it is, and the simulator; dictionaries were trained on neither."""
+    rows = []
+    if HUSKY.exists():
+        odometry = [message.payload for message in read_bag(HUSKY, ["/robot_1/odom"])]
+        imu = [message.payload for message in read_bag(HUSKY, ["/robot_1/imu"])]
+        sizes = _sizes("odom", odometry)
+        rows += [
+            Row("compression: recorded odometry, mean of 724 B", mean(sizes), "B", "≤", 85, "{:,.1f}"),
+            Row("compression: recorded odometry, 99 %", _p99(sizes), "B", "≤", TWO_PACKETS, note=_one_packet(sizes)),
+            Row("compression: recorded imu, mean of 324 B", mean(_sizes("imu", imu)), "B", "≤", 110, "{:,.1f}"),
+        ]
+    settings = SimSettings(robots=1, seed=7, prefix_frames=True)
+    simulated = [m.payload for m in Fleet(settings).messages(30.0, 1.7e9) if m.topic.endswith("/odom")]
+    sizes = _sizes("odom", simulated)
+    return [
+        *rows,
+        Row("compression: simulated odometry, 99 %", _p99(sizes), "B", "≤", TWO_PACKETS, note=_one_packet(sizes)),
+        Row("compression: encode + decode of an odometry", _microseconds(simulated), "µs", "≤", 60, "{:,.1f}"),
+    ]
+
+
+def _sizes(topic: str, payloads: list[bytes]) -> list[int]:
+    codec = LinkCodec(Registry.from_rows({topic: _TYPES[topic]}))
+    return sorted(len(codec.encode(0, payload)) for payload in payloads)
+
+
+def _p99(sizes: list[int]) -> int:
+    return sizes[int(0.99 * len(sizes))]
+
+
+def _one_packet(sizes: list[int]) -> str:
+    return f"{sum(size <= TWO_PACKETS // 2 for size in sizes) / len(sizes):.1%} fit one packet of 64 B"
+
+
+def _microseconds(payloads: list[bytes]) -> float:
+    codec = LinkCodec(Registry.from_rows({"odom": _TYPES["odom"]}))
+
+    def once() -> float:
+        begin = time.perf_counter()
+        for payload in payloads:
+            codec.decode(0, codec.encode(0, payload))
+        return (time.perf_counter() - begin) / len(payloads) * 1e6
+
+    return median_of(REPEATS, once)

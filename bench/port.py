@@ -1,0 +1,167 @@
+"""Source -> message port -> sink, against a bare message port between two Python blocks measured in the same run.
+
+The ROS side is a stand-in that feeds one thread into the source and counts what the sink publishes: the blocks are
+measured, not a middleware.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from statistics import median
+from typing import Any
+
+import pmt
+from gnuradio import gr
+
+from bench.report import Row
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback
+from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.registry import Registry
+
+PACKET_LEN, REPEATS = 64, 5
+PACKETS = 45_000
+ODOMETRY_BYTES, SMALL_BYTES = 724, 48
+TARGET = 20_000
+PATIENCE_S = 60.0
+
+_IN, _OUT = pmt.intern("in"), pmt.intern("out")
+
+
+class _Subscription(Subscription):
+    def matched(self) -> int:
+        return 1
+
+    def close(self) -> None:
+        pass
+
+
+class _Counter(Publisher):
+    def __init__(self) -> None:
+        self.published = 0
+
+    def publish(self, payload: bytes) -> None:
+        del payload
+        self.published += 1
+
+    def matched(self) -> int:
+        return 1
+
+    def close(self) -> None:
+        pass
+
+
+class _Graph(Middleware):
+    """One topic, either way."""
+
+    name = "memory"
+
+    def __init__(self, domain_id: int) -> None:
+        super().__init__()
+        self.domain_id = domain_id
+        self.counter = _Counter()
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
+        del topic, type_name, qos
+        self.callback = callback
+        return _Subscription()
+
+    def advertise(self, topic: str, type_name: str, qos: Qos) -> Publisher:
+        del topic, type_name, qos
+        return self.counter
+
+    def discover(self) -> list[TopicInfo]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+class _Poster(gr.basic_block):  # type: ignore[misc]
+    def __init__(self) -> None:
+        super().__init__("poster", None, None)
+        self.message_port_register_out(_OUT)
+
+
+class _Taker(gr.basic_block):  # type: ignore[misc]
+    def __init__(self) -> None:
+        super().__init__("taker", None, None)
+        self.taken = 0
+        self.message_port_register_in(_IN)
+        self.set_msg_handler(_IN, self._take)
+
+    def _take(self, _pdu: Any) -> None:
+        self.taken += 1
+
+
+def _wait(what: Any, until: int) -> None:
+    deadline = time.perf_counter() + PATIENCE_S
+    while what() < until:
+        if time.perf_counter() > deadline:
+            raise SystemExit(f"bench port: {what()} of {until} after {PATIENCE_S:g} s")
+        time.sleep(0.001)
+
+
+def bare_rate() -> float:
+    """PDUs/s from one Python block to another."""
+    quicken_threads()
+    poster, taker = _Poster(), _Taker()
+    graph = gr.top_block()
+    graph.msg_connect(poster, "out", taker, "in")
+    graph.start()
+    pdu = pmt.cons(pmt.make_dict(), pmt.init_u8vector(PACKET_LEN, [0] * PACKET_LEN))
+    begin = time.perf_counter()
+    for _ in range(PACKETS):
+        poster.message_port_pub(_OUT, pdu)
+    _wait(lambda: taker.taken, PACKETS)
+    rate = PACKETS / (time.perf_counter() - begin)
+    graph.stop()
+    graph.wait()
+    return rate
+
+
+def blocks_rate(size: int) -> float:
+    """Packets/s through RosSource and RosSink, for messages of one size."""
+    registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    robot, base = _Graph(1), _Graph(2)
+    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=PACKET_LEN, backpressure=True)
+    sink = RosSink(registry, middleware=base, packet_len=PACKET_LEN)
+    graph = gr.top_block()
+    graph.msg_connect(source, "pdus", sink, "pdus")
+    messages = PACKETS // -(-size // (PACKET_LEN - 13))
+    payloads = [b"\0\1\0\0" + number.to_bytes(4, "little") + bytes(size - 8) for number in range(messages)]
+    graph.start()
+    begin = time.perf_counter()
+    feeder = threading.Thread(target=lambda: [robot.callback(payload) for payload in payloads])
+    feeder.start()
+    _wait(lambda: base.counter.published, messages)
+    elapsed = time.perf_counter() - begin
+    feeder.join()
+    packets: int = sink.stats()["packets"]
+    graph.stop()
+    graph.wait()
+    source.close()
+    sink.close()
+    return packets / elapsed
+
+
+def port() -> list[Row]:
+    """Bare port and blocks in turn, so that a slow moment of the machine hits both."""
+    bare, odometry, small = [], [], []
+    for _ in range(REPEATS):
+        bare.append(bare_rate())
+        odometry.append(blocks_rate(ODOMETRY_BYTES))
+        small.append(blocks_rate(SMALL_BYTES))
+    reference = median(bare)
+
+    def row(what: str, rates: list[float]) -> Row:
+        ratio = f"{median(rates) / reference:.2f} of the bare port"
+        return Row(what, median(rates), "packets/s", "≥", TARGET, note=ratio)
+
+    return [
+        Row("bare port, Python to Python, 64 B", reference, "PDUs/s"),
+        row("source → port → sink, 724 B in 15 packets of 64 B", odometry),
+        row("source → port → sink, 48 B in one packet of 64 B", small),
+    ]

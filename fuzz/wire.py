@@ -1,0 +1,46 @@
+"""The packet decoder: whatever the bytes, a packet or a WireError; and a packet it takes can be written again."""
+
+from __future__ import annotations
+
+import random
+
+from fuzz.loop import main
+from gr_ros2.errors import WireError
+from gr_ros2.wire import CRC_LEN, Entry, Packet, crc16, decode, encode
+
+_NO_SOURCE = 255
+"""A source id that decoders take and encoders refuse."""
+
+
+def wire(data: bytes) -> None:
+    """Decode the bytes as they are, and again with the CRC made right, which random bytes hardly ever are."""
+    check(data)
+    check(data + crc16(data).to_bytes(CRC_LEN, "big"))
+
+
+def check(data: bytes) -> None:
+    try:
+        packet = decode(data, len(data))
+    except WireError as error:
+        assert error.kind != "encode"
+        return
+    assert 1 <= len(packet.entries) <= 15
+    if packet.src_id == _NO_SOURCE:
+        return
+    again = encode(packet, len(data))
+    assert len(again) == len(data)
+    assert decode(again, len(data)) == packet
+
+
+def corpus() -> list[bytes]:
+    """Packets of 1 to 15 entries without their CRC, and next to nothing."""
+    rng = random.Random(1)
+    found = [b"", bytes(5), bytes(12), bytes(64)]
+    for count in range(1, 16):
+        entries = [Entry(n % 16, n, 0, 1 + n, rng.randbytes(n)) for n in range(count)]
+        found.append(encode(Packet(1, 255, count, 1, tuple(entries), qos=count % 3), 300)[:-CRC_LEN])
+    return found
+
+
+if __name__ == "__main__":
+    main(wire, corpus())

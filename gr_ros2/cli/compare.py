@@ -1,0 +1,27 @@
+"""`gr-ros2 compare`: runs side by side."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from gr_ros2.cli.console import console
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.compare import compare_grid, write_comparison
+from gr_ros2.experiment.report import read_runs
+from gr_ros2.experiment.table import as_table
+
+
+@click.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR DIR...", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default results/compare-TIME.")
+def compare(directories: tuple[Path, ...], out: Path | None) -> None:
+    """Print the runs in these folders side by side; write compare.html, figures and tables."""
+    if len(directories) < 2:
+        raise ConfigError(f"{directories[0]}: nothing to compare it with; give two folders or more")
+    runs = read_runs(directories)
+    written = write_comparison(runs, out or Path("results") / f"compare-{time.strftime('%Y%m%d-%H%M%S')}")
+    console().print(as_table(compare_grid(runs)))
+    print(f"Written: {written[0]} and {len(written) - 1} files beside it")

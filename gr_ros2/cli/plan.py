@@ -1,0 +1,93 @@
+"""`gr-ros2 plan`: does this traffic fit this radio, how fresh will it be, and what to change."""
+
+from __future__ import annotations
+
+import click
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from gr_ros2.experiment.plan import Advice, Forecast, Planner
+from gr_ros2.experiment.scenario import load_scenario
+
+_WIDTH = 110
+_ADVICE = 3
+_HEADINGS = ("offered [1/s]", "message [B]", "on air [B]", "load", "rate [1/s]", "PDR", "age [ms]", "p99 [ms]")
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("--seed", type=int, help="Seed of robots and sender.")
+@click.option("--duration", type=float, help="Seconds of traffic that are looked at; 0 = to the end of a bag.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@click.option("--no-advice", is_flag=True, help="Only the forecast.")
+def plan(scenario: str, seed: int | None, duration: float | None, overrides: tuple[str, ...], no_advice: bool) -> None:
+    """Forecast SCENARIO, a built-in name or a YAML file, without running it, and propose changes."""
+    planner = Planner(load_scenario(scenario, overrides, seed=seed, duration_s=duration))
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=_WIDTH)
+    forecast = planner.forecast()
+    console.print(
+        f"{planner.phy.name} at {planner.phy.sample_rate:,.0f} samples/s: a packet of {forecast.packet_len} B takes "
+        f"{forecast.airtime_s * 1e3:.2f} ms, {forecast.capacity:.1f} packets/s\n",
+        soft_wrap=True,
+    )
+    console.print(_table(forecast))
+    console.print(_verdict(forecast), soft_wrap=True)
+    if not no_advice:
+        found = planner.advice()
+        for advice in found[:_ADVICE]:
+            console.print(_line(advice), soft_wrap=True)
+        if not found:
+            console.print("No change of packet_len, compression, scheduler or pacing makes it better.", soft_wrap=True)
+
+
+def _table(forecast: Forecast) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    table.add_column("Topic", no_wrap=True)
+    for heading in _HEADINGS:
+        table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
+    for topic in forecast.topics:
+        result = topic.result
+        table.add_row(
+            topic.topic,
+            f"{topic.offered_hz:.1f}",
+            f"{topic.message_bytes:.0f}",
+            f"{topic.air_bytes:.0f}",
+            f"{topic.load:.0%}",
+            f"{topic.rate_hz:.1f}",
+            _number(result.pdr, 1, ".2f"),
+            _number(result.age_s.mean, 1e3, ".0f"),
+            _number(result.latency_s.p99, 1e3, ".0f"),
+        )
+    return table
+
+
+def _verdict(forecast: Forecast) -> str:
+    per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
+    fits = "it fits"
+    if forecast.load > 1:
+        heaviest = max(forecast.topics, key=lambda topic: topic.load)
+        fits = f"it does not fit, most of it is {heaviest.topic}; max_rate and weight of a topic say what is dropped"
+    return (
+        f"Load {forecast.load:.0%}: {fits}. {forecast.used:.0%} of the airtime is used, {forecast.pad:.0%} of it for "
+        f"PAD; {per_message} bytes on the air per message delivered."
+    )
+
+
+def _line(advice: Advice) -> str:
+    forecast = advice.forecast
+    rates = ", ".join(f"{topic.topic} {topic.rate_hz:.1f}/s" for topic in forecast.topics)
+    ages = [topic.result.age_s.mean for topic in forecast.topics if topic.result.sent > 1]
+    known = [age for age in ages if age is not None]
+    age = f", mean age {sum(known) / len(known) * 1e3:.0f} ms" if known else ""
+    return (
+        f"Better: --set {advice.setting.replace(' ', ' --set ')}: {forecast.used:.0%} of the airtime{age}, "
+        f"{_number(forecast.air_bytes_per_message, 1, '.0f')} bytes per message ({rates})"
+    )
+
+
+def _number(value: float | None, factor: float, form: str) -> str:
+    return "–" if value is None else format(value * factor, form)

@@ -1,0 +1,12 @@
+"""Message compression inside version 0: fewer bytes per message, each message by itself (the C bit of the header).
+
+``LinkCodec(registry)`` is what a sender and a receiver take as their message codec; ``docs/compression.md`` has the
+format.
+"""
+
+from __future__ import annotations
+
+from gr_ros2.compression.codec import CODECS, MAX_MESSAGE, LinkCodec
+from gr_ros2.compression.dictionary import Dictionary, load, shipped
+
+__all__ = ["CODECS", "MAX_MESSAGE", "Dictionary", "LinkCodec", "load", "shipped"]

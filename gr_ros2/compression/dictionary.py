@@ -1,0 +1,158 @@
+"""Dictionaries: what both ends know beforehand about the messages of some types.
+
+A dictionary is one JSON file: words (frame names and the like), constants (numbers that covariances are made of), and
+for each type the float class of its fields, whole ballasts that are frequent, a zstd dictionary, and the definition
+where ROS has none.
+
+Laws: a dictionary never changes; another content is another dictionary with another id. The sets shipped with gr-ros2
+are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A user's own are named by
+the first two bytes of their SHA-256. A file that is no dictionary is a ConfigError that names it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from gr_ros2.compression.ballast import Words
+from gr_ros2.compression.floats import CLASSES, Constants
+from gr_ros2.compression.prepared import Model
+from gr_ros2.errors import ConfigError
+
+FORMAT = 1
+SHIPPED = (1,)
+"""Numbers 1..14 of the shipped sets, the last one being what senders use."""
+OWN = 15
+"""Stands in the first byte for a user's own dictionary; its id follows."""
+
+
+@dataclass(frozen=True)
+class TypeEntry:
+    """What is known about one type.
+
+    :param classes: float class letter by path of the field
+    :param templates: (sequence lengths, coded ballast), most frequent first, at most 15
+    :param zstd: a zstd dictionary over its payloads, b'' = none
+    :param definition: ``.msg`` text, '' for types of ROS 2 Humble
+    """
+
+    classes: Mapping[str, str] = field(default_factory=dict)
+    templates: Sequence[tuple[tuple[int, ...], int]] = ()
+    zstd: bytes = b""
+    definition: str = ""
+
+
+@dataclass(frozen=True)
+class Dictionary:
+    """A set of what is known.
+
+    :param name: for people
+    :param number: 1..14 for a shipped set, OWN for a user's
+    :param words: strings without terminator, most frequent first
+    :param constants: bits of doubles, most frequent first
+    """
+
+    name: str
+    number: int
+    words: Sequence[str]
+    constants: Sequence[int]
+    types: Mapping[str, TypeEntry]
+
+    @property
+    def digest(self) -> str:
+        """64 hex digits over all that coding depends on; the name is not part of it."""
+        content = {key: value for key, value in self._as_json().items() if key != "name"}
+        return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+    @property
+    def prefix(self) -> bytes:
+        """What follows the first byte of a message: the id of a user's own dictionary."""
+        return bytes.fromhex(self.digest[:4]) if self.number == OWN else b""
+
+    def model(self, type_name: str) -> Model:
+        """For the codec ``fields``; the words and constants serve types without an entry too."""
+        entry = self.types.get(type_name, TypeEntry())
+        words = Words([word.encode() + b"\0" for word in self.words])
+        return Model(words, Constants(self.constants), entry.classes, entry.templates)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file.
+
+        :raises ConfigError: when it cannot be written
+        """
+        text = json.dumps(self._as_json(), indent=1, ensure_ascii=True)
+        try:
+            Path(path).write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"dictionary {path}: cannot be written ({error.strerror})") from error
+
+    def _as_json(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "name": self.name,
+            "words": list(self.words),
+            "constants": [f"{bits:016x}" for bits in self.constants],
+            "types": {
+                name: {
+                    "classes": dict(entry.classes),
+                    "templates": [[list(counts), f"{coded:x}"] for counts, coded in entry.templates],
+                    "zstd": base64.b64encode(entry.zstd).decode(),
+                    "definition": entry.definition,
+                }
+                for name, entry in sorted(self.types.items())
+            },
+        }
+
+
+def load(path: str | Path, number: int = OWN) -> Dictionary:
+    """Read a dictionary from its file.
+
+    :raises ConfigError: when it is none; names the file
+    """
+    try:
+        return _parse(json.loads(Path(path).read_text(encoding="utf-8")), number)
+    except OSError as error:
+        raise ConfigError(f"dictionary {path}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"dictionary {path}: no dictionary of format {FORMAT} ({reason})") from error
+
+
+@cache
+def shipped(number: int = SHIPPED[-1]) -> Dictionary:
+    """A shipped set by its number.
+
+    :raises ConfigError: when there is none of that number
+    """
+    if number not in SHIPPED:
+        raise ConfigError(f"no shipped dictionaries of number {number}; there are {', '.join(map(str, SHIPPED))}")
+    text = files("gr_ros2.compression").joinpath(f"dictionaries/shipped-{number}.json").read_text(encoding="utf-8")
+    return _parse(json.loads(text), number)
+
+
+def _parse(data: Any, number: int) -> Dictionary:
+    if data["format"] != FORMAT:
+        raise ValueError(f"it is of format {data['format']!r}")
+    types = {
+        str(name): TypeEntry(
+            {str(path): str(letter) for path, letter in entry["classes"].items()},
+            tuple((tuple(map(int, counts)), int(coded, 16)) for counts, coded in entry["templates"]),
+            base64.b64decode(entry["zstd"], validate=True),
+            str(entry["definition"]),
+        )
+        for name, entry in data["types"].items()
+    }
+    unknown = {letter for entry in types.values() for letter in entry.classes.values()} - set(CLASSES)
+    if unknown:
+        raise ValueError(f"float classes {', '.join(sorted(unknown))} are unknown")
+    constants = [int(bits, 16) for bits in data["constants"]]
+    if not all(0 <= bits < 1 << 64 for bits in constants):
+        raise ValueError("a constant is not of 64 bits")
+    return Dictionary(str(data["name"]), number, [str(word) for word in data["words"]], constants, types)

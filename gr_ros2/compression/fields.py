@@ -1,0 +1,392 @@
+"""The codec ``fields``: a message taken apart by its type, each value coded for what it is.
+
+A message becomes one number (see ``number``). Popped off it come, in order: byte order, options and tail; sequence
+lengths; live values (stamps, numbers); and what is left of the number is the ballast (strings, matrices, flags), which
+therefore can be remembered under the number itself. Long arrays and strings follow as a second part.
+
+Laws: exact but for alignment gaps, which become zero; no message needs another; what is remembered only saves time;
+memory is bounded; decoding arbitrary bytes ends in a message or in a DamagedError.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+from gr_ros2.compression import bulk
+from gr_ros2.compression.ballast import Value, pop_ballast, push_ballast
+from gr_ros2.compression.floats import (
+    pop_double,
+    pop_quaternion,
+    pop_single,
+    push_double,
+    push_quaternion,
+    push_single,
+)
+from gr_ros2.compression.frames import Zstd, read_varint, varint
+from gr_ros2.compression.number import Table, from_bytes, pop_natural, push_natural, to_bytes
+from gr_ros2.compression.plan import (
+    DOUBLE,
+    INTEGER,
+    MATRIX,
+    MAX_CODED_ITEMS,
+    MAX_SLOTS,
+    OCTETS,
+    QUATERNION,
+    SINGLE,
+    STRING,
+    TIME,
+    Layout,
+    outline,
+)
+from gr_ros2.compression.prepared import PARTS, TEMPLATES, Model, Prepared
+from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, Repeat, Shape, is_open, shape_of
+from gr_ros2.compression.stamps import pop_stamp, push_stamp
+from gr_ros2.errors import DamagedError
+
+MAX_NUMBER = 8192
+"""Bytes of the number part: what MAX_SLOTS values can need; more is damage."""
+_REMEMBERED = 128
+"""Things of a kind that are remembered; then memory starts anew."""
+_LAYOUTS_TRIED = 4
+
+_HEADERS = [bytes((0, order, 0, options)) for order in (1, 0) for options in range(4)]
+_HEADS = Table([3000, *[150] * 3, *([20, 40, 40, 40] * 3), *[4] * 16])
+"""Symbol: 4 * (index of the header) + tail; little endian without options and tail is by far the likeliest."""
+_RAW, _ZSTD = range(2)
+_BLOB = Table([1, 3])
+
+_K = TypeVar("_K")
+_V = TypeVar("_V")
+
+
+class _Array(NamedTuple):
+    """A piece of the second part: item, bytes, bytes of an element, and how it was turned."""
+
+    item: int
+    length: int
+    size: int
+    way: int
+    parameter: int
+
+
+class FieldsCodec:
+    """Codes the messages of one type.
+
+    :param tree: the type
+    :param max_size: bytes of a message, more is not decoded
+    """
+
+    def __init__(self, tree: Composite, model: Model, zstd: Zstd, max_size: int) -> None:
+        self._tree, self._model, self._zstd, self._max_size = tree, model, zstd, max_size
+        self._open = tree.open
+        self._recent: dict[int, list[Layout]] = {}
+        self._layouts: dict[tuple[tuple[int, ...], tuple[int, ...], bytes, int], Layout] = {}
+        self._prepared: dict[tuple[int, ...], Prepared] = {}
+        self._coded: dict[tuple[Any, ...], int] = {}
+        self._values: dict[tuple[tuple[int, ...], int], tuple[Value, ...]] = {}
+
+    def layout(self, payload: bytes) -> tuple[Layout, tuple[Any, ...]] | None:
+        """The layout of a payload and its values; None where it is no message of the type, or one of too many parts."""
+        recent = self._recent.get(len(payload))
+        if recent is not None:
+            for layout in recent:
+                values = layout.unpack(payload)
+                if layout.fits(values):
+                    return layout, values
+        shape = shape_of(payload, self._tree)
+        if shape is None or payload[:4] not in _HEADERS:
+            return None
+        found = self._layout(shape, payload[:4])
+        if found is None or found.size != len(payload):
+            return None
+        if recent is None:
+            recent = _remember(self._recent, len(payload), [])
+        recent.insert(0, found)
+        del recent[_LAYOUTS_TRIED:]
+        return found, found.unpack(payload)
+
+    def encode(self, payload: bytes) -> tuple[bytes, bool] | None:
+        """The coded message, and whether it has a second part; None where the payload cannot be taken apart."""
+        found = self.layout(payload)
+        if found is None:
+            return None
+        layout, values = found
+        prepared = self._prepare(layout.shape.counts)
+        if prepared is None or not prepared.codable:
+            return None
+        blob = b""
+        ways: list[tuple[int, int]] = []
+        packed = _RAW
+        if prepared.bulk or layout.long_texts:
+            blob, ways, packed = self._blob(layout, prepared, values)
+        x = self._push_ballast(prepared, layout, values)
+        x = self._push_live(x, prepared, values, layout.unpack_reals(payload), ways)
+        if self._open:
+            for count in reversed(layout.shape.counts):
+                x = push_natural(x, count)
+        if blob:
+            x = _BLOB.push(x, packed)
+        x = _HEADS.push(x, 4 * _HEADERS.index(layout.header) + layout.shape.tail)
+        number = to_bytes(x)
+        if len(number) > MAX_NUMBER:
+            return None
+        return (varint(len(number)) + number + blob, True) if blob else (number, False)
+
+    def decode(self, coded: bytes, with_blob: bool) -> bytes:
+        """The message.
+
+        :raises DamagedError: no such message, or a larger one than is taken
+        """
+        try:
+            return self._decode(coded, with_blob)
+        except (IndexError, ValueError, OverflowError, struct.error) as error:
+            if isinstance(error, DamagedError):
+                raise
+            raise DamagedError(f"damaged message: {' '.join(str(error).split())}") from error
+
+    def ballast(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
+        """What a template of this message would be (``Model.templates``); None where it has no use for one."""
+        found = self.layout(payload)
+        if found is None or found[0].long_texts or (prepared := self._prepare(found[0].shape.counts)) is None:
+            return None
+        values = self._ballast_values(prepared, *found)
+        return found[0].shape.counts, push_ballast(
+            0, values, prepared.plan.ballast, self._model.words, self._model.constants
+        )
+
+    # Preparation, remembered
+
+    def _prepare(self, counts: tuple[int, ...], max_items: int = 4 * MAX_PARTS) -> Prepared | None:
+        made = self._prepared.get(counts)
+        if made is None:
+            plan = outline(self._tree, counts, max_items)
+            if plan is None:
+                return None
+            made = Prepared(plan, self._model, counts)
+            if made.codable:
+                _remember(self._prepared, counts, made)
+        return made
+
+    def _layout(self, shape: Shape, header: bytes) -> Layout | None:
+        key = (shape.counts, shape.texts, header, shape.tail)
+        found = self._layouts.get(key)
+        if found is None:
+            prepared = self._prepare(shape.counts)
+            if prepared is None:
+                return None
+            found = _remember(self._layouts, key, Layout(prepared.plan, shape, header))
+        return found
+
+    # Encoding
+
+    def _ballast_values(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> tuple[Value, ...]:
+        picked = [values[index] for index in prepared.ballast_indexes]
+        if layout.shape.order == BIG:
+            for n, slot in enumerate(prepared.plan.ballast):
+                if slot.kind == MATRIX:
+                    picked[n] = bulk.swapped(picked[n], 8)
+        if layout.long_texts:
+            for n, index in enumerate(prepared.ballast_indexes):
+                if index in layout.long_texts:
+                    picked[n] = layout.long_texts[index]
+        return tuple(picked)
+
+    def _push_ballast(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> int:
+        key = self._ballast_values(prepared, layout, values)
+        known = (prepared.counts, key)
+        x = self._coded.get(known)
+        if x is None:
+            number = prepared.templates.get(key, PARTS)
+            x = 0
+            if number == PARTS:
+                x = push_ballast(0, key, prepared.plan.ballast, self._model.words, self._model.constants)
+            if self._model.templates:
+                x = TEMPLATES.push(x, number)
+            _remember(self._coded, known, x)
+        return x
+
+    def _push_live(
+        self,
+        x: int,
+        prepared: Prepared,
+        values: Sequence[Any],
+        reals: Sequence[float],
+        ways: list[tuple[int, int]],
+    ) -> int:
+        constants = self._model.constants
+        for slot, table in prepared.backward:
+            kind, index = slot.kind, slot.index
+            if kind == DOUBLE:
+                x = push_double(x, values[index], reals[slot.real], table, constants)
+            elif kind == QUATERNION:
+                x = push_quaternion(x, values[index : index + 4], reals[slot.real : slot.real + 4], table, constants)
+            elif kind == TIME:
+                x = push_stamp(x, values[index], values[index + 1])
+            elif kind == SINGLE:
+                x = push_single(x, values[index], reals[slot.real], table)
+            elif kind == INTEGER:
+                value = values[index]
+                x = push_natural(x, (value << 1 if value >= 0 else ~(value << 1)) if slot.size < 0 else value)
+            elif kind == OCTETS:
+                x = x << 8 * slot.size | int.from_bytes(values[index], "big")
+            else:
+                way, parameter = ways.pop()
+                x = push_natural(push_natural(x, parameter), way)
+        return x
+
+    def _blob(
+        self, layout: Layout, prepared: Prepared, values: Sequence[Any]
+    ) -> tuple[bytes, list[tuple[int, int]], int]:
+        """(second part, way of each array, whether it is compressed)"""
+        ways, parts = [], []
+        for slot in prepared.bulk:
+            data = values[slot.index]
+            if layout.shape.order == BIG:
+                data = bulk.swapped(data, slot.size)
+            way, parameter, turned = bulk.turn(data, slot.size, slot.real >= 0, self._measure)
+            ways.append((way, parameter))
+            parts.append(turned)
+        parts += [values[index] for index in layout.long_texts]
+        raw = b"".join(parts)
+        packed = self._zstd.compress(raw, sized=False)
+        return (packed, ways, _ZSTD) if len(packed) < len(raw) else (raw, ways, _RAW)
+
+    def _measure(self, data: bytes) -> int:
+        return len(self._zstd.compress(data, sized=False))
+
+    # Decoding
+
+    def _decode(self, coded: bytes, with_blob: bool) -> bytes:
+        blob = b""
+        if with_blob:
+            length, start = read_varint(coded, 0)
+            if length > len(coded) - start:
+                raise DamagedError("damaged message: its number is cut off")
+            coded, blob = coded[start : start + length], coded[start + length :]
+        if len(coded) > MAX_NUMBER:
+            raise DamagedError(f"damaged message: a number of {len(coded)} bytes")
+        x, head = _HEADS.pop(from_bytes(coded))
+        header, tail = _HEADERS[head >> 2], head & 3
+        packed = _RAW
+        if with_blob:
+            x, packed = _BLOB.pop(x)
+        counts: tuple[int, ...] = ()
+        if self._open:
+            taken: list[int] = []
+            x = self._pop_counts(x, self._tree, taken)
+            counts = tuple(taken)
+        prepared = self._prepare(counts, MAX_CODED_ITEMS)
+        if prepared is None or not prepared.codable:
+            raise DamagedError("damaged message: too many parts")
+        values = prepared.blank.copy()
+        values[0], values[-1] = header, bytes(tail)
+        x, ways = self._pop_live(x, prepared, values)
+        ballast = self._pop_ballast(x, prepared)
+        big = header[1] == 0
+        texts: list[int] = []
+        arrays = [
+            _Array(slot.index, prepared.plan.items[slot.index][2], slot.size, way, parameter)
+            for slot, (way, parameter) in zip(prepared.bulk, ways, strict=True)
+        ]
+        for slot, value in zip(prepared.plan.ballast, ballast, strict=True):
+            index = slot.index
+            if slot.kind == STRING:
+                length = value if isinstance(value, int) else len(value)
+                values[index - 1] = length
+                texts.append(length)
+                if isinstance(value, int):
+                    arrays.append(_Array(index, length, 1, bulk.PLAIN, 0))
+            values[index] = (
+                bulk.swapped(value, 8) if big and slot.kind == MATRIX and isinstance(value, bytes) else value
+            )
+        self._take_blob(blob, packed, arrays, values)
+        layout = self._layout(Shape(BIG if big else LITTLE, counts, tuple(texts), tail), header)
+        if layout is None or layout.size > self._max_size:
+            raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
+        return layout.pack(*values)
+
+    def _pop_counts(self, x: int, node: Node, taken: list[int]) -> int:
+        if isinstance(node, Composite):
+            for _, member in node.members:
+                x = self._pop_counts(x, member, taken)
+        elif isinstance(node, Repeat):
+            count = node.count
+            if count is None:
+                x, count = pop_natural(x)
+                if count > self._max_size:
+                    raise DamagedError(f"damaged message: a sequence of {count} elements")
+                taken.append(count)
+            if is_open(node.element):
+                for _ in range(count):
+                    if len(taken) > MAX_SLOTS:
+                        raise DamagedError("damaged message: too many sequences")
+                    x = self._pop_counts(x, node.element, taken)
+        return x
+
+    def _pop_live(self, x: int, prepared: Prepared, values: list[Any]) -> tuple[int, list[tuple[int, int]]]:
+        constants = self._model.constants
+        ways = []
+        for slot, table in prepared.forward:
+            kind, index = slot.kind, slot.index
+            if kind == DOUBLE:
+                x, values[index] = pop_double(x, table, constants)
+            elif kind == QUATERNION:
+                x, values[index : index + 4] = pop_quaternion(x, table, constants)
+            elif kind == TIME:
+                x, values[index], values[index + 1] = pop_stamp(x)
+            elif kind == SINGLE:
+                x, values[index] = pop_single(x, table)
+            elif kind == INTEGER:
+                x, value = pop_natural(x)
+                if slot.size < 0:
+                    value = ~(value >> 1) if value & 1 else value >> 1
+                values[index] = value
+            elif kind == OCTETS:
+                values[index] = (x & ((1 << 8 * slot.size) - 1)).to_bytes(slot.size, "big")
+                x >>= 8 * slot.size
+            else:
+                x, way = pop_natural(x)
+                x, parameter = pop_natural(x)
+                ways.append((way, parameter))
+        return x, ways
+
+    def _pop_ballast(self, x: int, prepared: Prepared) -> Sequence[Value]:
+        known = (prepared.counts, x)
+        values = self._values.get(known)
+        if values is not None:
+            return values
+        rest, number = TEMPLATES.pop(x) if self._model.templates else (x, PARTS)
+        if number != PARTS:
+            if number not in prepared.template_values:
+                raise DamagedError("damaged message: a template of another shape")
+            found = prepared.template_values[number]
+        else:
+            rest, found = pop_ballast(rest, prepared.plan.ballast, self._model.words, self._model.constants)
+        if rest:
+            raise DamagedError("damaged message: more than was wanted")
+        return _remember(self._values, known, tuple(found))
+
+    def _take_blob(self, blob: bytes, packed: int, arrays: Sequence[_Array], values: list[Any]) -> None:
+        """Put the arrays and long strings of the second part into their places."""
+        size = sum(array.length for array in arrays)
+        if size > self._max_size:
+            raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
+        raw = self._zstd.decompress(blob, self._max_size, size) if packed == _ZSTD else blob
+        if len(raw) != size:
+            raise DamagedError(f"damaged message: {len(raw)} bytes of arrays instead of {size}")
+        big = values[0][1] == 0
+        at = 0
+        for array in arrays:
+            data = bulk.turn_back(array.way, array.parameter, raw[at : at + array.length], array.size)
+            values[array.item] = bulk.swapped(data, array.size) if big else data
+            at += array.length
+
+
+def _remember(memory: dict[_K, _V], key: _K, value: _V) -> _V:
+    """Keep something that can always be made again."""
+    if len(memory) >= _REMEMBERED:
+        memory.clear()
+    memory[key] = value
+    return value

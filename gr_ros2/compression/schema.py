@@ -1,0 +1,211 @@
+"""Message types as trees, and the shape of one serialized message: what the type leaves open, read off its bytes.
+
+Laws: XCDR1 as ROS 2 writes it (alignment counts from behind the 4-byte encapsulation header; an empty sequence has no
+padding before its elements); a payload that is not exactly such a message, up to 3 bytes behind it, has no shape, which
+is no error; nothing here trusts a length before checking it against the bytes at hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from struct import Struct
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+HEADER = 4
+"""Bytes of the encapsulation header."""
+LITTLE, BIG = "<", ">"
+MAX_PARTS = 4096
+"""Strings and sequences in one message; one with more has no shape, which bounds the time a walk takes."""
+
+_CODES = {
+    "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "B",
+    "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q",
+    "float32": "f", "float64": "d",
+}  # fmt: skip
+"""struct codes; bool and int8 as plain bytes, since any byte may stand there and has to come back."""
+SIZES = {code: Struct("<" + code).size for code in "BHhIiQqfd"}
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar:
+    """One number; ``code`` is its struct code."""
+
+    code: str
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A string."""
+
+
+@dataclass(frozen=True, slots=True)
+class Composite:
+    """Members in order; ``type_name`` lets times and quaternions be recognised, ``open`` = a sequence is within."""
+
+    type_name: str
+    members: tuple[tuple[str, Node], ...]
+    open: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """``count`` elements; None = a sequence, whose length is in the message."""
+
+    element: Node
+    count: int | None
+    open: bool
+
+
+Node = Scalar | Text | Composite | Repeat
+
+
+def is_open(node: Node) -> bool:
+    """Whether the type leaves a sequence length to the message."""
+    return isinstance(node, Composite | Repeat) and node.open
+
+
+class Types:
+    """Message definitions: those of ROS 2 Humble, and a user's own.
+
+    :param definitions: ``.msg`` texts by ``package/msg/Type``; one that cannot be read is left out
+    """
+
+    def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
+        self._store = _humble()
+        self.definitions = {
+            name: text for name, text in (definitions or {}).items() if name not in self._store.fielddefs
+        }
+        if self.definitions:
+            self._store = get_typestore(Stores.ROS2_HUMBLE)
+            for name, text in self.definitions.items():
+                try:
+                    found = get_types_from_msg(text, name)
+                    self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
+                except TypesysError:
+                    continue
+        self._trees: dict[str, Composite | None] = {}
+
+    def tree(self, type_name: str) -> Composite | None:
+        """The tree of a type; None where it is unknown or has a member of a kind we do not know (wstring)."""
+        if type_name not in self._trees:
+            try:
+                self._trees[type_name] = self._composite(type_name, ())
+            except KeyError:
+                self._trees[type_name] = None
+        return self._trees[type_name]
+
+    def _composite(self, type_name: str, above: tuple[str, ...]) -> Composite:
+        if type_name in above:
+            raise KeyError(type_name)  # a type within itself has no tree
+        _, members = self._store.fielddefs[type_name]
+        if not members:
+            raise KeyError(type_name)
+        above = (*above, type_name)
+        nodes = tuple((name, self._node(kind, above)) for name, kind in members)
+        return Composite(type_name, nodes, any(is_open(node) for _, node in nodes))
+
+    def _node(self, kind: Any, above: tuple[str, ...]) -> Node:
+        node_type, detail = kind
+        if node_type is Nodetype.BASE:
+            return Text() if detail[0] == "string" else Scalar(_CODES[detail[0]])
+        if node_type is Nodetype.NAME:
+            return self._composite(detail, above)
+        element, length = detail
+        node, count = self._node(element, above), length if node_type is Nodetype.ARRAY else None
+        return Repeat(node, count, count is None or is_open(node))
+
+
+@cache
+def _humble() -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What one message adds to its type.
+
+    :param order: ``<`` or ``>``
+    :param counts: lengths of its sequences, in order of appearance
+    :param texts: stored lengths of its strings, terminator included
+    :param tail: bytes behind the message, 0..3
+    """
+
+    order: str
+    counts: tuple[int, ...]
+    texts: tuple[int, ...]
+    tail: int
+
+
+def shape_of(payload: bytes, tree: Composite) -> Shape | None:
+    """Read off the shape of a payload; None where it is no message of that type."""
+    if len(payload) < HEADER or payload[0] or payload[1] > 1:
+        return None
+    reader = _Reader(payload, LITTLE if payload[1] else BIG)
+    if not reader.walk(tree):
+        return None
+    tail = len(payload) - HEADER - reader.at
+    if not 0 <= tail <= 3 or any(payload[len(payload) - tail :]):
+        return None
+    return Shape(reader.order, tuple(reader.counts), tuple(reader.texts), tail)
+
+
+class _Reader:
+    """Walks along a message; ``at`` counts from behind the encapsulation header."""
+
+    def __init__(self, payload: bytes, order: str) -> None:
+        self.order = order
+        self.counts: list[int] = []
+        self.texts: list[int] = []
+        self.at = 0
+        self._payload = payload
+        self._end = len(payload) - HEADER
+        self._length = Struct(order + "I")
+
+    def walk(self, node: Node) -> bool:
+        """Step over one value; whether the message is long enough for it."""
+        if isinstance(node, Scalar):
+            self._skip(SIZES[node.code], 1)
+        elif isinstance(node, Text):
+            length = self._read_length()
+            self.texts.append(length)
+            self.at += length
+            return self.at <= self._end and len(self.texts) + len(self.counts) <= MAX_PARTS
+        elif isinstance(node, Composite):
+            return all(self.walk(member) for _, member in node.members)
+        else:
+            return self._walk_repeat(node)
+        return self.at <= self._end
+
+    def _walk_repeat(self, node: Repeat) -> bool:
+        count = node.count
+        if count is None:
+            count = self._read_length()
+            self.counts.append(count)
+        if isinstance(node.element, Scalar):
+            self._skip(SIZES[node.element.code], count)
+            return self.at <= self._end
+        # Every element takes at least a byte, so the walk ends with the payload, whatever the count says.
+        return (
+            self.at <= self._end
+            and len(self.counts) <= MAX_PARTS
+            and all(self.walk(node.element) for _ in range(count))
+        )
+
+    def _skip(self, size: int, count: int) -> None:
+        if count:
+            self.at += -self.at % size + size * count
+
+    def _read_length(self) -> int:
+        self.at += -self.at % 4
+        start = HEADER + self.at
+        self.at += 4
+        if self.at > self._end:
+            return 0
+        length: int = self._length.unpack_from(self._payload, start)[0]
+        return length

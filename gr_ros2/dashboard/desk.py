@@ -1,0 +1,158 @@
+"""What all viewers of a dashboard share: the run being watched, its newest snapshot, and the knobs of its channel.
+
+Laws: there is one state per run, whoever looks; what a viewer sets acts on the running flowgraph at once and is seen
+by all; a setting that the link refuses leaves it as it was and says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+import numpy.typing as npt
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.dashboard.spectrum import Spectrum
+from gr_ros2.dashboard.state import DashboardState
+from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.dashboard.windows import Floats
+from gr_ros2.errors import GrRos2Error
+from gr_ros2.experiment.result import Result
+from gr_ros2.experiment.watch import LiveRun
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.phy.loopback import LoopbackLink
+
+TICK_S = 0.5
+"""s between two snapshots."""
+
+
+@dataclass(frozen=True)
+class Radio:
+    """The radio side of a link at one moment.
+
+    :param channel: as it was set then, None without a run
+    :param has_samples: whether there is anything between the antennas to set
+    :param backlog: packets between source and antenna
+    :param frequencies: Hz, of each power in ``spectrum_db``; None where there is no signal
+    :param symbols: equalised payload symbols, None where the PHY shows none
+    """
+
+    channel: ChannelConfig | None = None
+    has_samples: bool = False
+    backlog: int | None = None
+    frequencies: Floats | None = None
+    spectrum_db: Floats | None = None
+    symbols: npt.NDArray[np.complex64] | None = None
+
+
+class Desk:
+    """A :class:`gr_ros2.experiment.watch.Watcher` that keeps a snapshot for others to draw."""
+
+    def __init__(self) -> None:
+        self.snapshot = Snapshot()
+        self.radio = Radio()
+        self.refused = ""
+        """Why the last change to the channel was not made; '' if it was."""
+        self._run: LiveRun | None = None
+        self._state: DashboardState | None = None
+        self._spectrum: Spectrum | None = None
+        self._ticking = Lock()
+
+    # -- the run's side -----------------------------------------------------------------------------------------
+
+    def run_started(self, run: LiveRun) -> None:
+        phy = run.links[0].phy
+        self._spectrum = Spectrum(phy.sample_rate) if phy.has_samples else None
+        self._state = DashboardState(
+            run.registry,
+            run.topics,
+            run.packet_len,
+            name=run.name,
+            duration_s=run.duration_s,
+            ledger=run.ledger.rows,
+            tick_s=TICK_S,
+        )
+        self._run = run
+        self.refused = ""
+
+    def run_ended(self, result: Result | None) -> None:
+        if self._state is not None:
+            self._state.finish(result)
+            self.tick()
+        with self._ticking:
+            self._run = None  # its flowgraph may go
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        if self._state is not None:
+            self._state.sender_event(src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        if self._state is not None:
+            self._state.packet_received(data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        if self._state is not None:
+            self._state.receiver_event(event, now)
+
+    # -- the viewers' side --------------------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Take one look at the received signal."""
+        run, spectrum = self._run, self._spectrum
+        samples = None if run is None or spectrum is None else run.links[0].samples()
+        if spectrum is not None and samples is not None:
+            spectrum.add(samples)
+
+    def tick(self) -> Snapshot:
+        """Make the next snapshot; without a run the last one stands."""
+        with self._ticking:
+            if self._run is not None and self._state is not None:
+                self._tick(self._run, self._state)
+        return self.snapshot
+
+    def _tick(self, run: LiveRun, state: DashboardState) -> None:
+        queued = {
+            (src_id, topic["topic_id"]): topic["queued"]
+            for src_id, source in run.sources.items()
+            for topic in source.stats()["topics"].values()
+        }
+        self.snapshot = state.tick(run.clock(), queued)
+        spectrum = self._spectrum
+        counts = [link.counts() for link in run.links]
+        self.radio = Radio(
+            channel=run.links[0].channel,
+            has_samples=run.links[0].phy.has_samples,
+            backlog=sum(count.backlog + max(count.passed - count.transmitted, 0) for count in counts),
+            frequencies=None if spectrum is None else spectrum.frequencies,
+            spectrum_db=None if spectrum is None else spectrum.decibels(),
+            symbols=run.links[0].symbols(),
+        )
+
+    @property
+    def channel(self) -> ChannelConfig | None:
+        """The channel as it is set at this very moment; after the run as it was last, None before the first."""
+        run = self._run
+        return self.radio.channel if run is None else run.links[0].channel
+
+    def set_snr_db(self, snr_db: float | None) -> None:
+        """Noise on every link; dB, None = none."""
+        self._change(lambda link: link.set_snr_db(snr_db))
+
+    def set_frequency_offset(self, offset: float) -> None:
+        """Carrier frequency offset on every link, fraction of the sample rate."""
+        self._change(lambda link: link.set_frequency_offset(offset))
+
+    def set_packet_loss(self, probability: float) -> None:
+        """Loss of whole packets on every link, 0..1."""
+        self._change(lambda link: link.set_packet_loss(probability))
+
+    def _change(self, change: Callable[[LoopbackLink], None]) -> None:
+        self.refused = ""
+        try:
+            run = self._run
+            for link in () if run is None else run.links:
+                change(link)
+        except GrRos2Error as error:
+            self.refused = str(error)

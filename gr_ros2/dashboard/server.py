@@ -1,0 +1,181 @@
+"""The dashboard's web server: one thread of its own beside a run, any number of viewers.
+
+Laws: without a viewer it does little more than count; on a loopback address unless told otherwise, and only pages it
+served itself may talk to it; closing it shows every viewer the last picture first and leaves no thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import uuid
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Any
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.web import RequestHandler
+
+from gr_ros2.dashboard.desk import TICK_S, Desk
+from gr_ros2.dashboard.page import Page
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.result import Result
+
+_LOOK_S = 0.1
+_LAST_PICTURE_S = 2.0
+"""s a viewer gets to draw the last picture before the server goes."""
+_POLL_S = 0.02
+_UNUSED_MS = 5000
+"""ms a page that was closed is kept, in case its viewer comes back."""
+_ANY = ("0.0.0.0", "::")
+
+
+class Dashboard(Desk):
+    """A desk with a web page.
+
+    :param address: to serve on; 0.0.0.0 for every interface
+    :param port: 1..65535, 0 = any free one
+    """
+
+    def __init__(self, address: str = "127.0.0.1", port: int = 5006) -> None:
+        super().__init__()
+        self.address = address
+        self.port = port
+        self._instance = uuid.uuid4().hex
+        self._pages: set[Page] = set()
+        self._loop: IOLoop | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds the page."""
+        return f"http://{_in_url('127.0.0.1' if self.address in _ANY else self.address)}:{self.port}/"
+
+    @property
+    def viewers(self) -> int:
+        """Pages open now."""
+        return len(self._pages)
+
+    def start(self) -> None:
+        """Serve.
+
+        :raises ConfigError: when address and port cannot be had
+        """
+        started: Future[None] = Future()
+        self._thread = threading.Thread(target=self._serve, args=(started,), name="gr-ros2-dashboard", daemon=True)
+        self._thread.start()
+        try:
+            started.result()
+        except OSError as error:
+            self._thread.join()
+            raise ConfigError(
+                f"dashboard = {self.address}:{self.port}: cannot be served there ({error.strerror or error}); "
+                "choose another port"
+            ) from error
+
+    def close(self) -> None:
+        """Let every viewer draw the last picture, then stop serving. Idempotent."""
+        if self._loop is not None and self._thread is not None:
+            loop, self._loop = self._loop, None
+            loop.add_callback(self._leave, loop)
+            self._thread.join()
+
+    def run_ended(self, result: Result | None) -> None:
+        super().run_ended(result)
+        if self._loop is not None:
+            self._loop.add_callback(self._show, always=True)
+
+    def __enter__(self) -> Dashboard:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _serve(self, started: Future[None]) -> None:
+        asyncio.set_event_loop(asyncio.new_event_loop())
+        loop = IOLoop.current()
+        try:
+            sockets, self.port = bind_sockets(self.address, self.port)
+        except OSError as error:
+            loop.close(all_fds=True)
+            started.set_exception(error)
+            return
+        pages = BokehTornado(
+            {"/": Application(FunctionHandler(self._open))},
+            extra_websocket_origins=self._origins(),
+            extra_patterns=[("/alive", _Alive, {"instance": self._instance})],
+            check_unused_sessions_milliseconds=_UNUSED_MS,
+            unused_session_lifetime_milliseconds=_UNUSED_MS,
+        )
+        http = HTTPServer(pages)
+        http.add_sockets(sockets)
+        server = BaseServer(loop, pages, http)
+        server.start()
+        for callback, seconds in ((self._beat, TICK_S), (self._glance, _LOOK_S)):
+            PeriodicCallback(callback, seconds * 1000).start()
+        self._loop = loop
+        started.set_result(None)
+        loop.start()
+        server.stop()
+        loop.close(all_fds=True)
+
+    def _origins(self) -> list[str]:
+        """Hosts by which the page may be opened."""
+        hosts = {self.address, "localhost"} if self.address in ("127.0.0.1", "::1") else {self.address}
+        if self.address in _ANY:
+            name = socket.gethostname()
+            hosts = {"localhost", "127.0.0.1", name, socket.getfqdn(), *socket.gethostbyname_ex(name)[2]}
+        return [f"{_in_url(host)}:{self.port}" for host in sorted(hosts)]
+
+    def _open(self, document: Document) -> None:
+        """A viewer comes."""
+        page = Page(document, self, self._instance)
+        self._pages.add(page)
+        document.on_session_destroyed(lambda _context: self._pages.discard(page))
+
+    def _beat(self) -> None:
+        self.tick()
+        self._show()
+
+    def _glance(self) -> None:
+        if self._pages:
+            self.look()
+
+    def _show(self, always: bool = False) -> None:
+        for page in list(self._pages):
+            page.offer(self.snapshot, self.radio, always)
+
+    async def _leave(self, loop: IOLoop) -> None:
+        self._show(always=True)
+        await asyncio.sleep(_POLL_S)
+        deadline = loop.time() + _LAST_PICTURE_S
+        while any(page.behind for page in self._pages) and loop.time() < deadline:
+            await asyncio.sleep(_POLL_S)
+        loop.stop()
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+class _Alive(RequestHandler):  # type: ignore[misc]
+    """Tells a page whether the server that made it is still there."""
+
+    def initialize(self, instance: str) -> None:
+        self._instance = instance
+
+    def get(self) -> None:
+        self.set_header("Cache-Control", "no-store")
+        answer: dict[str, Any] = {"instance": self._instance}
+        self.finish(answer)

@@ -1,0 +1,403 @@
+"""What a dashboard knows of one link: fed by the events of both ends, asked for a snapshot now and then. Sans-IO.
+
+Laws: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock of
+the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
+Counts are exact while it runs; once the result is in, every number is the result's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Mapping
+from hashlib import blake2b
+from math import nan
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from gr_ros2.dashboard.packets import packet_views
+from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
+from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
+from gr_ros2.experiment.ledger import DELIVERED, IN_FLIGHT
+from gr_ros2.experiment.metrics import Latency, latency, latency_cdf
+from gr_ros2.experiment.positions import PositionReader, position_reader
+from gr_ros2.experiment.result import Result, TopicResult
+from gr_ros2.link.events import Accepted, Delivered, Lost, ReceiverEvent, Refused, Rejected, SenderEvent, SentPacket
+from gr_ros2.registry import Registry
+
+Key = tuple[int, int]
+"""Source id and topic id."""
+
+HISTORY_S = 180.0
+"""How far back curves and paths go, s."""
+RATE_S = 5.0
+"""The window of everything called "now", s."""
+LATENCIES = 2000
+"""Deliveries of a topic that its latency is taken from."""
+UNDER_WAY = 4096
+"""Messages of a source whose delivery is waited for; the oldest is forgotten first and then has no latency."""
+PACKETS_SHOWN = 12
+
+_PATH_STEP_S = 0.1
+_DIGEST_SIZE = 16
+
+
+class _Topic:
+    """One topic of one source."""
+
+    def __init__(self, read_position: PositionReader | None, history: int) -> None:
+        self.sent = 0
+        self.delivered = 0
+        self.delivered_bytes = 0
+        self.ended: Counter[str] = Counter()
+        self.sent_rate = Rate(RATE_S)
+        self.delivered_rate = Rate(RATE_S)
+        self.latencies: deque[float] = deque(maxlen=LATENCIES)
+        self.age = AgeMeter()
+        self.read_position = read_position
+        self.belief = Belief(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
+        self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
+
+    def rows(self) -> dict[str, int]:
+        """What the events alone say: who sees both ends asks the ledger instead."""
+        rows = {row: count for row, count in {DELIVERED: self.delivered, **self.ended}.items() if count}
+        rest = self.sent - sum(rows.values())
+        return {**rows, IN_FLIGHT: rest} if rest > 0 else rows
+
+
+class _Source:
+    """Messages of one sender on their way, so that a delivery finds its submission."""
+
+    def __init__(self) -> None:
+        self.last_serial = -1
+        self.open: OrderedDict[int, tuple[int, float, bytes]] = OrderedDict()
+        """Serial -> topic id, time of submission, digest; until the first fragment leaves."""
+        self.away: OrderedDict[tuple[int, int, bytes], float] = OrderedDict()
+        """Topic id, entry id, digest -> time of submission."""
+        self.repeats: OrderedDict[Key, None] = OrderedDict()
+        """Topic id and entry id whose latest use was a repeat."""
+
+
+class DashboardState:
+    """Everything the page shows of one link.
+
+    :param registry: types of the topic ids
+    :param topics: names of the topics to show from the start, by source id and topic id
+    :param packet_len: bytes of a packet
+    :param name: what the link is called
+    :param duration_s: s during which messages will be submitted, 0 = unknown
+    :param ledger: where every message stands, from who sees both ends; None shows what the events alone tell
+    :param tick_s: s between two calls of :meth:`tick`, for the length of the history
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        topics: Mapping[Key, str],
+        packet_len: int,
+        *,
+        name: str = "",
+        duration_s: float = 0.0,
+        ledger: Callable[[], Mapping[Key, Mapping[str, int]]] | None = None,
+        tick_s: float = 0.5,
+    ) -> None:
+        self._lock = Lock()
+        self._registry = registry
+        self._names = dict(topics)
+        self._packet_len = packet_len
+        self._name = name
+        self._duration_s = duration_s
+        self._ledger = ledger
+        self._history = int(HISTORY_S / tick_s)
+        self._start: float | None = None
+        self._sources: dict[int, _Source] = {}
+        self._topics: dict[Key, _Topic] = {}
+        self._received: deque[tuple[float, bytes]] = deque(maxlen=PACKETS_SHOWN + 1)
+        self._packets: Counter[str] = Counter()
+        self._packets_sent, self._packets_received = Rate(RATE_S), Rate(RATE_S)
+        self._phase = "waiting"
+        self._result: Result | None = None
+        for key in topics:
+            self._topic(key)
+
+    # -- feeding ------------------------------------------------------------------------------------------------
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """What the sender with this source id reports."""
+        with self._lock:
+            source = self._sources.setdefault(src_id, _Source())
+            if isinstance(event, SentPacket):
+                self._packets["sent"] += 1
+                self._packets_sent.add(event.now)
+                self._left(source, event)
+            elif isinstance(event, Accepted):
+                self._accepted(source, src_id, event)
+            else:
+                self._refused(source, src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        """Bytes the PHY handed to the sink, whatever they are."""
+        with self._lock:
+            self._begin(now)
+            self._packets["handed_up"] += 1
+            self._packets_received.add(now)
+            self._received.append((now, data))
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What the receiver reports."""
+        with self._lock:
+            if isinstance(event, Delivered):
+                self._delivered(event, now)
+            elif isinstance(event, Lost):
+                source = self._sources.get(event.src_id)
+                if source is None or (event.topic_id, event.entry_id) not in source.repeats:
+                    self._topic((event.src_id, event.topic_id)).ended[event.reason] += 1
+            elif isinstance(event, Rejected):
+                self._packets[f"rejected_{event.error.kind}"] += 1
+                self._packets["rejected"] += 1
+
+    def finish(self, result: Result | None) -> None:
+        """The run is over; None where it failed."""
+        with self._lock:
+            self._result = result
+            self._phase = "ended" if result is not None else "failed"
+
+    # -- asking -------------------------------------------------------------------------------------------------
+
+    def tick(self, now: float, queued: Mapping[Key, int] | None = None) -> Snapshot:
+        """The link at this moment, which also becomes the newest point of its history until the run is over.
+
+        :param queued: messages waiting at the source, by source and topic id
+        """
+        ledger = {} if self._ledger is None else self._ledger()
+        with self._lock:
+            over = self._phase in ("ended", "failed")
+            start = now if self._start is None else self._start
+            elapsed = max(now - start, 0.0)
+            keys = sorted(self._topics)
+            if not over and self._start is not None:
+                for key in keys:
+                    self._remember(self._topics[key], now, elapsed, (queued or {}).get(key))
+            views = tuple(
+                self._view(place, key, now, elapsed=elapsed, queued=queued or {}, ledger=ledger)
+                for place, key in enumerate(keys)
+            )
+            colours = {key: place for place, key in enumerate(keys)}
+            received = self._packets["handed_up"] - self._packets["rejected"]
+            rejected = {kind: n for kind, n in sorted(self._packets.items()) if kind.startswith("rejected_")}
+            heard = list(self._received)
+            return Snapshot(
+                phase=self._phase,
+                name=self._name,
+                elapsed_s=elapsed if self._result is None else self._result.duration_s,
+                duration_s=self._duration_s,
+                sent=sum(view.sent for view in views),
+                delivered=sum(view.delivered for view in views),
+                topics=views,
+                series=tuple(self._series(place, key) for place, key in enumerate(keys)),
+                paths=tuple(
+                    self._path(place, key, start) for place, key in enumerate(keys) if self._topics[key].read_position
+                ),
+                packets={"sent": self._packets["sent"], "received": received, **rejected},
+                packets_now=(
+                    self._packets_sent.totals(now)[0] / RATE_S,
+                    self._packets_received.totals(now)[0] / RATE_S,
+                ),
+                last_packets=packet_views(heard, self._packet_len, self._registry, colours, start)[-PACKETS_SHOWN:],
+            )
+
+    def _remember(self, topic: _Topic, now: float, elapsed: float, queued: int | None) -> None:
+        age = topic.age.read(now)
+        topic.history.append(
+            (
+                elapsed,
+                nan if (pdr := _pdr_now(topic, now)) is None else pdr,
+                topic.delivered_rate.totals(now)[1] / RATE_S,
+                nan if age is None else age[0],
+                nan if queued is None else queued,
+            )
+        )
+
+    def _view(
+        self,
+        place: int,
+        key: Key,
+        now: float,
+        *,
+        elapsed: float,
+        queued: Mapping[Key, int],
+        ledger: Mapping[Key, Mapping[str, int]],
+    ) -> TopicView:
+        topic = self._topics[key]
+        final = self._final(key)
+        if final is not None:
+            return _final_view(place, key, final)
+        # What the ledger knows wins: it has heard every event, also those from before there was a state.
+        rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
+        sent, delivered = (
+            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(DELIVERED, 0))
+        )
+        seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
+        latencies = np.sort(np.array(topic.latencies, dtype=float))
+        age_now, age_mean, age_peak = topic.age.read(now) or (None, None, None)
+        return TopicView(
+            name=self._topic_name(key),
+            type_name=self._registry[key[1]].type_name if key[1] < len(self._registry) else "",
+            src_id=key[0],
+            topic_id=key[1],
+            colour=place,
+            sent=sent,
+            delivered=delivered,
+            pdr=delivered / sent if sent else None,
+            pdr_now=_pdr_now(topic, now),
+            goodput_Bps=topic.delivered_bytes / seconds if seconds > 0 else None,
+            goodput_now_Bps=topic.delivered_rate.totals(now)[1] / RATE_S,
+            latency_s=latency(latencies),
+            latency_cdf_s=latency_cdf(latencies),
+            age_now_s=age_now,
+            age_mean_s=age_mean,
+            age_peak_s=age_peak,
+            queued=queued.get(key),
+            ledger=rows,
+        )
+
+    def _series(self, place: int, key: Key) -> SeriesView:
+        points = np.array(self._topics[key].history, dtype=float).reshape(-1, 5)
+        t, pdr, goodput, age, queued = points.T
+        return SeriesView(self._topic_name(key), place, t, pdr, goodput, age, queued)
+
+    def _path(self, place: int, key: Key, start: float) -> PathView:
+        belief = self._topics[key].belief
+        t, errors = belief.errors()
+        return PathView(
+            self._topic_name(key),
+            place,
+            *belief.sent.xy(),
+            *belief.received.xy(),
+            truth=belief.sent.latest,
+            belief=belief.received.latest,
+            error_m=belief.error(),
+            error_t=t - start,
+            errors_m=errors,
+        )
+
+    def _final(self, key: Key) -> TopicResult | None:
+        if self._result is None:
+            return None
+        name = self._topic_name(key)
+        return next((t for t in self._result.topics if (t.src_id, t.topic) == (key[0], name)), None)
+
+    def _topic_name(self, key: Key) -> str:
+        known = self._registry[key[1]].name if key[1] < len(self._registry) else f"topic_{key[1]}"
+        return self._names.get(key) or f"/source_{key[0]}/{known.lstrip('/')}"
+
+    # -- events -------------------------------------------------------------------------------------------------
+
+    def _begin(self, now: float) -> None:
+        if self._start is None:
+            self._start = now
+            if self._phase == "waiting":
+                self._phase = "running"
+
+    def _topic(self, key: Key) -> _Topic:
+        topic = self._topics.get(key)
+        if topic is None:
+            read = position_reader(self._registry[key[1]].type_name) if key[1] < len(self._registry) else None
+            topic = self._topics[key] = _Topic(read, self._history)
+        return topic
+
+    def _accepted(self, source: _Source, src_id: int, event: Accepted) -> None:
+        self._begin(event.now)
+        topic = self._topic((src_id, event.topic_id))
+        topic.sent += 1
+        source.last_serial = event.serial
+        topic.sent_rate.add(event.now, len(event.payload))
+        source.open[event.serial] = (event.topic_id, event.now, _digest(event.payload))
+        _bound(source.open)
+        if topic.read_position is not None:
+            point = topic.read_position(event.payload)
+            if point is not None:
+                topic.belief.moved(event.now, point)
+
+    def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
+        topic = self._topic((src_id, event.topic_id))
+        topic.ended[event.reason] += 1
+        source.open.pop(event.serial, None)
+        if event.serial > source.last_serial:  # refused before it was queued
+            source.last_serial = event.serial
+            topic.sent += 1
+
+    def _left(self, source: _Source, event: SentPacket) -> None:
+        for entry in event.entries:
+            if entry.serial < 0:
+                source.repeats[entry.topic_id, entry.entry_id] = None
+                _bound(source.repeats)
+                continue
+            message = source.open.pop(entry.serial, None)
+            if message is not None:  # its first fragment
+                topic_id, t_sent, digest = message
+                source.repeats.pop((topic_id, entry.entry_id), None)
+                source.away[topic_id, entry.entry_id, digest] = t_sent
+                _bound(source.away)
+
+    def _delivered(self, event: Delivered, now: float) -> None:
+        key = (event.src_id, event.topic_id)
+        source = self._sources.get(event.src_id)
+        t_sent = None
+        if source is not None:
+            t_sent = source.away.pop((event.topic_id, event.entry_id, _digest(event.payload)), None)
+            if t_sent is None and (event.topic_id, event.entry_id) in source.repeats:
+                return
+        topic = self._topic(key)
+        topic.delivered += 1
+        topic.delivered_bytes += len(event.payload)
+        topic.delivered_rate.add(now, len(event.payload))
+        if t_sent is not None:
+            topic.latencies.append(now - t_sent)
+            topic.age.delivered(t_sent, now)
+        if topic.read_position is not None:
+            point = topic.read_position(event.payload)
+            if point is not None:
+                topic.belief.heard(now, point)
+
+
+def _pdr_now(topic: _Topic, now: float) -> float | None:
+    sent = topic.sent_rate.totals(now)[0]
+    return topic.delivered_rate.totals(now)[0] / sent if sent else None
+
+
+def _final_view(place: int, key: Key, final: TopicResult) -> TopicView:
+    q = final.latency_s
+    known = [value for value in (q.p50, q.p95, q.p99, q.max) if value is not None]
+    return TopicView(
+        name=final.topic,
+        type_name=final.type,
+        src_id=key[0],
+        topic_id=key[1],
+        colour=place,
+        sent=final.sent,
+        delivered=final.delivered,
+        pdr=final.pdr,
+        pdr_now=None,
+        goodput_Bps=final.goodput_Bps,
+        goodput_now_Bps=0.0,
+        latency_s=Latency(*known) if len(known) == 4 else None,
+        latency_cdf_s=final.latency_cdf_s,
+        age_now_s=None,
+        age_mean_s=final.age_s.mean,
+        age_peak_s=final.age_s.peak,
+        queued=None,
+        ledger=dict(final.ledger),
+        path_error_m=final.path_error_m,
+        rms_error_m=final.rms_error_m,
+    )
+
+
+def _digest(payload: bytes) -> bytes:
+    return blake2b(payload, digest_size=_DIGEST_SIZE).digest()
+
+
+def _bound(index: OrderedDict[Any, Any]) -> None:
+    while len(index) > UNDER_WAY:
+        index.popitem(last=False)

@@ -1,0 +1,212 @@
+"""Numbers and packets as HTML.
+
+Laws: every text that comes from outside is escaped; a number that does not apply is a dash; the exact value stands
+beside the rounded one in ``data-value``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+
+from gr_ros2.dashboard.packets import NO_COLOUR
+from gr_ros2.dashboard.views import PacketView, Snapshot, TopicView
+from gr_ros2.experiment.figures import COLOURS, row_colour, row_order
+from gr_ros2.wire import CRC_LEN, ENTRY_HEADER_LEN, HEADER_LEN
+
+Number = float | int | None
+
+_GREY = "#9aa5b1"
+_PHASES = {"waiting": "waiting for messages", "running": "live", "ended": "ended", "failed": "failed"}
+
+
+def colour(place: int) -> str:
+    """Colour of the topic at this place of the palette."""
+    return _GREY if place == NO_COLOUR else COLOURS[place % len(COLOURS)]
+
+
+def tiles_html(snapshot: Snapshot, backlog: int | None) -> str:
+    """The line on top: where the run is, and the few numbers that sum it up.
+
+    :param backlog: packets between source and antenna
+    """
+    time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
+    sent_now, received_now = snapshot.packets_now
+    refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
+    tiles = [
+        _tile("phase", _PHASES[snapshot.phase], snapshot.name or "no run", css=f"phase {snapshot.phase}"),
+        _tile("elapsed", time, "time"),
+        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, "main"),
+        _tile("sent", f"{snapshot.sent:,}", "messages sent", snapshot.sent),
+        _tile("delivered", f"{snapshot.delivered:,}", "delivered", snapshot.delivered),
+        _tile(
+            "packets_sent", f"{sent_now:.0f}/s", f"packets out, {snapshot.packets.get('sent', 0):,} in all", sent_now
+        ),
+        _tile(
+            "packets_received",
+            f"{received_now:.0f}/s",
+            f"packets in, {snapshot.packets.get('received', 0):,} in all",
+            received_now,
+        ),
+        _tile("refused", f"{refused:,}", "packets refused", refused),
+        _tile("backlog", "–" if backlog is None else f"{backlog:,}", "packets queued in the PHY", backlog),
+    ]
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _tile(name: str, text: str, label: str, value: Number = None, css: str = "") -> str:
+    data = "" if value is None else f' data-value="{value!r}"'
+    return f'<div class="tile {css}"><b data-field="{name}"{data}>{escape(text)}</b><span>{escape(label)}</span></div>'
+
+
+_Column = tuple[str, str, Callable[[TopicView], Number], Callable[[Number], str]]
+
+
+def _ratio(value: Number) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _count(value: Number) -> str:
+    return "–" if value is None else f"{value:,.0f}"
+
+
+def _ms(value: Number) -> str:
+    return "–" if value is None else f"{value * 1000:,.1f}" if abs(value) < 10 else f"{value * 1000:,.0f}"
+
+
+def _s(value: Number) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _latency(name: str) -> Callable[[TopicView], Number]:
+    def read(topic: TopicView) -> Number:
+        value: Number = getattr(topic.latency_s, name, None)
+        return value
+
+    return read
+
+
+_GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
+    (
+        "messages",
+        (
+            ("sent", "sent", lambda topic: topic.sent, _count),
+            ("delivered", "delivered", lambda topic: topic.delivered, _count),
+        ),
+    ),
+    (
+        "PDR",
+        (
+            ("pdr", "all", lambda topic: topic.pdr, _ratio),
+            ("pdr_now", "last 5 s", lambda topic: topic.pdr_now, _ratio),
+        ),
+    ),
+    ("goodput", (("goodput_Bps", "B/s", lambda topic: topic.goodput_Bps, _count),)),
+    ("latency [ms]", tuple((f"latency_{q}", q, _latency(q), _ms) for q in ("p50", "p95", "p99", "max"))),
+    (
+        "age [s]",
+        (
+            ("age_now", "now", lambda topic: topic.age_now_s, _s),
+            ("age_mean", "mean", lambda topic: topic.age_mean_s, _s),
+            ("age_peak", "peak", lambda topic: topic.age_peak_s, _s),
+        ),
+    ),
+    ("queue", (("queued", "now", lambda topic: topic.queued, _count),)),
+)
+
+
+def topics_html(snapshot: Snapshot) -> str:
+    """One line per topic, with the ledger as a bar."""
+    rows = row_order([topic.ledger for topic in snapshot.topics])
+    groups = "".join(f'<th colspan="{len(columns)}">{name}</th>' for name, columns in _GROUPS)
+    heads = "".join(f"<th>{column[1]}</th>" for _, columns in _GROUPS for column in columns)
+    body = "".join(_topic_row(topic, rows) for topic in snapshot.topics)
+    legend = "".join(
+        f'<span class="key"><i style="background:{row_colour(row)}"></i>{escape(row.replace("_", " "))}</span>'
+        for row in rows
+    )
+    return (
+        f'<table class="topics"><thead><tr><th class="name" rowspan="2">topic</th>{groups}'
+        f'<th class="ledger">where every message is <span class="keys">{legend}</span></th></tr>'
+        f"<tr>{heads}<th></th></tr></thead><tbody>{body}</tbody></table>"
+    )
+
+
+def _topic_row(topic: TopicView, rows: list[str]) -> str:
+    cells = ""
+    for _, columns in _GROUPS:
+        for place, (name, _head, read, write) in enumerate(columns):
+            value = read(topic)
+            first = ' class="first"' if place == 0 else ""
+            data = "" if value is None else f' data-value="{value!r}"'
+            cells += f'<td{first} data-field="{name}"{data}>{write(value)}</td>'
+    bar = "".join(
+        f'<i data-row="{escape(row)}" data-value="{count}" title="{escape(row)}: {count}" '
+        f'style="flex:{count};background:{row_colour(row)}">{count if count * 12 > topic.sent else ""}</i>'
+        for row in rows
+        if (count := topic.ledger.get(row, 0))
+    )
+    return (
+        f'<tr data-topic="{escape(topic.name)}"><td class="name"><i style="background:{colour(topic.colour)}"></i>'
+        f'{escape(topic.name)}</td>{cells}<td class="first ledger"><div class="bar">{bar}</div></td></tr>'
+    )
+
+
+def paths_html(snapshot: Snapshot) -> str:
+    """What the map cannot say: the error as a number, per topic with positions."""
+    final = {topic.name: topic for topic in snapshot.topics}
+    lines = []
+    for path in snapshot.paths:
+        topic = final.get(path.name)
+        text = [f"error now <b>{_metres(path.error_m)}</b>"]
+        if topic is not None and topic.path_error_m is not None:
+            text = [
+                f"path error <b>{_metres(topic.path_error_m)}</b>",
+                f"RMS error at equal times <b>{_metres(topic.rms_error_m)}</b>",
+            ]
+        lines.append(f'<div data-topic="{escape(path.name)}">{escape(path.name)}: {", ".join(text)}</div>')
+    return f'<div class="paths">{"".join(lines) or "no topic carries positions"}</div>'
+
+
+def _metres(value: Number) -> str:
+    return "–" if value is None else f"{value:.3f} m"
+
+
+def packets_html(snapshot: Snapshot) -> str:
+    """The last packets, newest first, each with its bytes to scale."""
+    lines = []
+    for packet in reversed(snapshot.last_packets):
+        lines.append(_packet(packet))
+        if packet.missing:
+            lines.append(f'<div class="gap">{packet.missing} missing</div>')
+    head = (
+        '<div class="packet head"><span>time</span><span>ver</span><span>from → to</span><span>seq</span>'
+        "<span>hop</span><span>QoS</span><span>flags</span><span>E</span>"
+        "<span>header · topic ids · entries (topic, id, index/total, bytes) · PAD · CRC</span></div>"
+    )
+    return f'<div class="packets">{head}{"".join(lines) or "<div class=gap>no packet yet</div>"}</div>'
+
+
+def _packet(packet: PacketView) -> str:
+    time = f"{packet.t:.3f}"
+    if packet.refused:
+        return (
+            f'<div class="packet refused"><span>{time}</span><span></span><span></span><span></span><span></span>'
+            f'<span></span><span></span><span></span><div class="bytes"><i style="flex:1">{escape(packet.refused)}</i>'
+            "</div></div>"
+        )
+    flags = ("C" if packet.compressed else "") + ("E" if packet.encrypted else "") or "–"
+    to = "all" if packet.dst_id == 255 else str(packet.dst_id)
+    ids = (len(packet.entries) + 1) // 2
+    chips = "".join(
+        f'<i class="entry" style="flex:{entry.size + ENTRY_HEADER_LEN};background:{colour(entry.colour)}">'
+        f"{escape(entry.topic)} #{entry.entry_id} {entry.index + 1}/{entry.total} {entry.size} B</i>"
+        for entry in packet.entries
+    )
+    pad = f'<i class="pad" style="flex:{packet.pad}"></i>' if packet.pad > 0 else ""
+    return (
+        f'<div class="packet"><span>{time}</span><span>{packet.version}</span><span>{packet.src_id} → {to}</span>'
+        f"<span>{packet.seq}</span><span>{packet.hop}</span><span>{packet.qos}</span><span>{flags}</span>"
+        f'<span>{len(packet.entries)}</span><div class="bytes"><i class="head" style="flex:{HEADER_LEN}"></i>'
+        f'<i class="ids" style="flex:{ids}"></i>{chips}{pad}<i class="crc" style="flex:{CRC_LEN}"></i></div></div>'
+    )

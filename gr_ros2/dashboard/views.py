@@ -1,0 +1,146 @@
+"""What the page draws: values only.
+
+Law: a number that does not apply is None, as in ``result.json``; nothing here grows with the length of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gr_ros2.dashboard.windows import Floats, Point
+from gr_ros2.experiment.metrics import Latency
+
+
+@dataclass(frozen=True)
+class TopicView:
+    """One topic of one source.
+
+    :param colour: place in the palette
+    :param pdr: delivered / sent of the whole run
+    :param pdr_now: deliveries per submission in the last seconds; above 1 while a backlog arrives
+    :param goodput_Bps: delivered bytes / duration of the whole run, B/s
+    :param goodput_now_Bps: of the last seconds
+    :param latency_s: of the last deliveries, of all of them once the run is over
+    :param latency_cdf_s: likewise, at 0 %, 1 %, … 100 %
+    :param age_now_s: s since the newest delivered message was submitted
+    :param queued: messages waiting at the source
+    :param ledger: row -> messages; the rows add up to ``sent``
+    """
+
+    name: str
+    type_name: str
+    src_id: int
+    topic_id: int
+    colour: int
+    sent: int
+    delivered: int
+    pdr: float | None
+    pdr_now: float | None
+    goodput_Bps: float | None
+    goodput_now_Bps: float
+    latency_s: Latency | None
+    latency_cdf_s: tuple[float, ...]
+    age_now_s: float | None
+    age_mean_s: float | None
+    age_peak_s: float | None
+    queued: int | None
+    ledger: Mapping[str, int]
+    path_error_m: float | None = None
+    rms_error_m: float | None = None
+
+
+@dataclass(frozen=True)
+class PathView:
+    """A topic that carries positions: both paths, m, and the error between them, m over s since the start."""
+
+    name: str
+    colour: int
+    sent_x: Floats
+    sent_y: Floats
+    received_x: Floats
+    received_y: Floats
+    truth: Point | None
+    belief: Point | None
+    error_m: float | None
+    error_t: Floats
+    errors_m: Floats
+
+
+@dataclass(frozen=True)
+class SeriesView:
+    """One topic's numbers over time; NaN where one does not apply. Times are s since the start."""
+
+    name: str
+    colour: int
+    t: Floats
+    pdr: Floats
+    goodput_Bps: Floats
+    age_s: Floats
+    queued: Floats
+
+
+@dataclass(frozen=True)
+class EntryView:
+    """One entry of a packet."""
+
+    topic: str
+    colour: int
+    entry_id: int
+    index: int
+    total: int
+    size: int
+
+
+@dataclass(frozen=True)
+class PacketView:
+    """One packet as the sink got it.
+
+    :param t: s since the start
+    :param refused: why it is no packet of ours, '' where it is
+    :param missing: packets of this source that should have come between the one shown before and this one
+    """
+
+    t: float
+    size: int
+    refused: str = ""
+    version: int = 0
+    qos: str = ""
+    compressed: bool = False
+    encrypted: bool = False
+    src_id: int = 0
+    dst_id: int = 0
+    seq: int = 0
+    hop: int = 0
+    entries: tuple[EntryView, ...] = ()
+    pad: int = 0
+    missing: int = 0
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A link at one moment.
+
+    :param phase: waiting, running, ended (result is in) or failed
+    :param elapsed_s: s since the first message
+    :param packets: sent, received and each refusal by name
+    :param packets_now: packets/s sent and received in the last seconds
+    """
+
+    phase: str = "waiting"
+    name: str = ""
+    elapsed_s: float = 0.0
+    duration_s: float = 0.0
+    sent: int = 0
+    delivered: int = 0
+    topics: tuple[TopicView, ...] = ()
+    series: tuple[SeriesView, ...] = ()
+    paths: tuple[PathView, ...] = ()
+    last_packets: tuple[PacketView, ...] = ()
+    packets: Mapping[str, int] = field(default_factory=dict)
+    packets_now: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def pdr(self) -> float | None:
+        """Delivered / sent, over all topics."""
+        return self.delivered / self.sent if self.sent else None

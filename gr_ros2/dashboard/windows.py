@@ -1,0 +1,138 @@
+"""Bounded memories of what goes on: rates, ages, paths.
+
+Laws: each holds a fixed number of items however long it is fed; times are seconds on one clock, given by the caller,
+and never run backwards within one object.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import hypot
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Point = tuple[float, float]
+
+
+class Rate:
+    """Count and bytes of what happened in the last ``window_s`` seconds.
+
+    :param window_s: s
+    :param slots: how finely the window moves; memory is one item per slot
+    """
+
+    def __init__(self, window_s: float, slots: int = 20) -> None:
+        self._slot_s = window_s / slots
+        self._slots: deque[tuple[int, int, int]] = deque(maxlen=slots + 1)
+
+    def add(self, now: float, size: int = 0) -> None:
+        """One thing of this many bytes happened."""
+        slot = int(now / self._slot_s)
+        if self._slots and self._slots[-1][0] >= slot:
+            last, count, total = self._slots.pop()
+            self._slots.append((last, count + 1, total + size))
+        else:
+            self._slots.append((slot, 1, size))
+
+    def totals(self, now: float) -> tuple[int, int]:
+        """Count and bytes in the window that ends now."""
+        oldest = int(now / self._slot_s) - (self._slots.maxlen or 1) + 1
+        recent = [slot for slot in self._slots if slot[0] > oldest]
+        return sum(slot[1] for slot in recent), sum(slot[2] for slot in recent)
+
+
+class AgeMeter:
+    """Age of information of one topic, exactly as :func:`gr_ros2.experiment.metrics.age` has it, kept as a sum."""
+
+    def __init__(self) -> None:
+        self._start: float | None = None
+        self._since = self._newest = self._area = self._peak = 0.0
+
+    def delivered(self, t_sent: float, now: float) -> None:
+        """A message submitted at ``t_sent`` was delivered."""
+        if self._start is None:
+            self._start = self._since = now
+            self._newest = t_sent
+            return
+        if t_sent > self._newest:
+            self._area, self._peak = self._until(now)
+            self._since, self._newest = max(now, self._since), t_sent
+
+    def read(self, now: float) -> tuple[float, float, float] | None:
+        """Age now, mean and peak since the first delivery, s; None before that."""
+        if self._start is None:
+            return None
+        area, peak = self._until(now)
+        length = max(now, self._since) - self._start
+        return now - self._newest, area / length if length > 0 else now - self._newest, peak
+
+    def _until(self, now: float) -> tuple[float, float]:
+        low, high = self._since - self._newest, max(now, self._since) - self._newest
+        return self._area + (low + high) / 2 * (high - low), max(self._peak, high)
+
+
+class Trail:
+    """The last stretch of a path, thinned in time, and where it ends exactly.
+
+    :param points: most points kept
+    :param apart_s: s between two kept points, at least
+    """
+
+    def __init__(self, points: int, apart_s: float) -> None:
+        self._points: deque[tuple[float, float, float]] = deque(maxlen=points)
+        self._apart_s = apart_s
+        self.latest: Point | None = None
+
+    def add(self, now: float, point: Point) -> None:
+        """The path goes on to this point."""
+        self.latest = point
+        if not self._points or now - self._points[-1][0] >= self._apart_s:
+            self._points.append((now, *point))
+
+    def xy(self) -> tuple[Floats, Floats]:
+        """x and y, up to the very end."""
+        ends = [] if self.latest is None else [self.latest]
+        points = np.array([*((x, y) for _, x, y in self._points), *ends], dtype=float).reshape(-1, 2)
+        return points[:, 0], points[:, 1]
+
+
+class Belief:
+    """One robot's true path beside the path another one knows of, and how far apart they are at each moment.
+
+    The error at an instant is the distance from where the robot last said it was to where the other believes it is.
+
+    :param points: most points of each memory
+    :param apart_s: s between two points, at least
+    """
+
+    def __init__(self, points: int, apart_s: float) -> None:
+        self.sent = Trail(points, apart_s)
+        self.received = Trail(points, apart_s)
+        self._errors: deque[tuple[float, float]] = deque(maxlen=points)
+        self._apart_s = apart_s
+
+    def moved(self, now: float, point: Point) -> None:
+        """The robot said where it is."""
+        self.sent.add(now, point)
+        self._compare(now)
+
+    def heard(self, now: float, point: Point) -> None:
+        """The other robot was told."""
+        self.received.add(now, point)
+
+    def error(self) -> float | None:
+        """m, now; None before both are known."""
+        one, other = self.sent.latest, self.received.latest
+        return None if one is None or other is None else hypot(one[0] - other[0], one[1] - other[1])
+
+    def errors(self) -> tuple[Floats, Floats]:
+        """Times in s and errors in m."""
+        points = np.array(self._errors, dtype=float).reshape(-1, 2)
+        return points[:, 0], points[:, 1]
+
+    def _compare(self, now: float) -> None:
+        error = self.error()
+        if error is not None and (not self._errors or now - self._errors[-1][0] >= self._apart_s):
+            self._errors.append((now, error))

@@ -1,0 +1,84 @@
+"""What a run shows to whoever looks on, such as a dashboard: the events of both ends, and the parts while they run.
+
+Law: the run never depends on an onlooker; without one nothing of this costs anything.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from gr_ros2.experiment.ledger import Ledger
+from gr_ros2.experiment.result import Result
+from gr_ros2.gr import RosSource
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.registry import Registry
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """A run whose link has been built.
+
+    :param name: of the scenario
+    :param duration_s: s during which messages will be submitted; 0 = until a bag ends
+    :param topics: absolute name at the source, by source id and topic id
+    :param sources: sending block by source id
+    :param links: every direction's flowgraph
+    :param ledger: where every message sent so far stands
+    :param clock: s, the clock of the run's events
+    """
+
+    name: str
+    duration_s: float
+    packet_len: int
+    registry: Registry
+    topics: Mapping[tuple[int, int], str]
+    sources: Mapping[int, RosSource]
+    links: Sequence[LoopbackLink]
+    ledger: Ledger
+    clock: Callable[[], float] = time.monotonic
+
+
+class EventSink(Protocol):
+    """What hears both ends. It is called from the run's threads, in causal order, and must be quick and never raise."""
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """What the sender with this source id reports."""
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        """Bytes the PHY handed to the sink, before the sink reads them."""
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What the receiver reports; of a delivery once it is republished."""
+
+
+class Watcher(EventSink, Protocol):
+    """An onlooker."""
+
+    def run_started(self, run: LiveRun) -> None:
+        """Before the first event of a run."""
+
+    def run_ended(self, result: Result | None) -> None:
+        """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
+
+
+class Fanout:
+    """Hands every event to several, in their order."""
+
+    def __init__(self, sinks: Sequence[EventSink]) -> None:
+        self._sinks = tuple(sinks)
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        for sink in self._sinks:
+            sink.sender_event(src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        for sink in self._sinks:
+            sink.packet_received(data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        for sink in self._sinks:
+            sink.receiver_event(event, now)

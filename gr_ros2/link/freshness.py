@@ -1,0 +1,204 @@
+"""Which fragments go into the next packet so that what is known at the far end is young.
+
+*Value.* Sending a message of ``c`` bytes of air makes its topic younger by ``g``, the time between its submission and
+that of the newest one sent whole before. Topics that all want more than the air has are best off, in weighted mean
+age, when each comes every T with T^2 proportional to c / weight; sending the greatest ``weight * g^2 / c`` first does
+that.
+
+*Classes.* Messages of class latency go first, then default, then bulk in what is left.
+
+*Turns.* Every ``TURN``-th packet belongs to the topic whose last turn is longest ago, whatever its class: it gets the
+room it needs there, of which ``reserve`` bytes stay free for a message of class latency.
+
+*Cuts.* A fragment takes the room there is. ``total`` is fixed at the first one, so it leaves slack: what remains of a
+message never needs fragments of more than ``cut`` bytes, with ``cut`` below a packet's room by that reserve.
+
+Laws: a message of class latency that waits alone in its class has an entry in the next packet; a topic that always
+has something waiting gets a turn within TURN times the number of topics, and a message needs no more turns than it
+has fragments, at most 1 + ceil(size / cut): nothing starves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from heapq import heapify, heappop, heappush
+
+from gr_ros2.config import SourceConfig
+from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.schedule import Plan
+from gr_ros2.registry import Registry
+from gr_ros2.wire import (
+    ENTRY_HEADER_LEN,
+    MAX_ENTRIES,
+    MAX_TOTAL,
+    QOS_BULK,
+    QOS_DEFAULT,
+    QOS_LATENCY,
+    equal_entry_payload,
+    overhead,
+    single_entry_payload,
+)
+
+TURN = 4
+"""Every so manieth packet belongs to the topic that has waited longest for one."""
+FIRST_AGE_S = 1.0
+"""s that a topic counts as old when its first message comes."""
+LARGE = 4
+"""Packets from which on a message is cut with slack, to fill what others leave in packets."""
+
+_SHARE = ENTRY_HEADER_LEN + 1
+"""Bytes a second entry costs a packet beside its payload."""
+_RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
+
+Queues = Mapping[int, Sequence[Outgoing]]
+
+
+class _Packing:
+    """A packet being filled. ``keep``: payload bytes of one more entry that what is added must leave room for."""
+
+    def __init__(self, packet_len: int) -> None:
+        self._packet_len = packet_len
+        self.picks: list[Outgoing] = []
+        self.lengths: list[int] = []
+        self._payload = 0
+        self.keep = 0
+
+    def room(self) -> int:
+        """Payload bytes a further entry may have; not above 0 where none fits."""
+        entries = len(self.picks) + (2 if self.keep else 1)
+        if entries > MAX_ENTRIES:
+            return 0
+        return self._packet_len - overhead(entries) - entries * ENTRY_HEADER_LEN - self._payload - self.keep
+
+    def add(self, message: Outgoing, length: int) -> None:
+        self.picks.append(message)
+        self.lengths.append(length)
+        self._payload += length
+
+
+class FreshnessScheduler:
+    """See the module's first lines.
+
+    :param registry: says which topics are of class latency
+    """
+
+    def __init__(self, config: SourceConfig, registry: Registry) -> None:
+        self.config = config
+        self._single = single_entry_payload(config.packet_len)
+        self._half = max(equal_entry_payload(config.packet_len, 2), 0)
+        self._alone = len(registry) == 1
+        self._latency = {topic.topic_id for topic in registry if topic.options.qos == "latency"}
+        self._urgent = min(config.min_fragment, self._half)
+        """Bytes of the largest message of class latency so far, as far as half a packet goes."""
+        self._newest: dict[int, float] = {}
+        """Per topic, submission time of the newest message sent whole."""
+        self._line: list[int] = []
+        """Topics in the order of their turns."""
+        self._holder = -1
+        """Topic whose turn the planned packet is."""
+        self._packets = 0
+
+    def plan(self, queues: Queues) -> Plan | None:
+        pending = [topic_id for topic_id, queue in queues.items() if queue]
+        if not pending:
+            return None
+        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        for topic_id in self._latency.intersection(pending):
+            self._urgent = max(self._urgent, min(len(queues[topic_id][0].payload), self._half))
+        packing = _Packing(self.config.packet_len)
+        self._holder = -1
+        if self._packets % TURN == TURN - 1:
+            holder = self._holder = next(topic_id for topic_id in self._line if topic_id in pending)
+            others = [topic_id for topic_id in pending if topic_id != holder]
+            packing.keep = self._needs(queues[holder][0])
+            self._fill(packing, queues, [topic_id for topic_id in others if queues[topic_id][0].qos == QOS_LATENCY])
+            packing.keep = 0
+            self._fill(packing, queues, [holder])
+            self._fill(packing, queues, [topic_id for topic_id in others if queues[topic_id][0].qos != QOS_LATENCY])
+        else:
+            self._fill(packing, queues, pending)
+        full = packing.room() < self.config.min_fragment
+        return Plan(tuple(packing.picks), tuple(packing.lengths), full)
+
+    def sent(self, plan: Plan) -> None:
+        self._packets += 1
+        if self._holder >= 0:
+            self._line.remove(self._holder)
+            self._line.append(self._holder)
+        for message in plan.picks:
+            if message.done:
+                self._newest[message.topic_id] = max(message.submitted, self._newest.get(message.topic_id, 0.0))
+
+    def _fill(self, packing: _Packing, queues: Queues, topic_ids: Iterable[int]) -> None:
+        """Add fragments, the most valuable messages of the most urgent class first, those of a topic in order."""
+        heap = []
+        for topic_id in topic_ids:
+            head = queues[topic_id][0]
+            before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
+            heap.append((_RANK[head.qos], -_value(head, before), topic_id, 0))
+        heapify(heap)
+        while heap and packing.room() > 0:
+            _, _, topic_id, position = heappop(heap)
+            queue = queues[topic_id]
+            message = queue[position]
+            if self._add(packing, message) and position + 1 < len(queue):
+                following = queue[position + 1]
+                value = _value(following, message.submitted)
+                heappush(heap, (_RANK[following.qos], -value, topic_id, position + 1))
+
+    def _add(self, packing: _Packing, message: Outgoing) -> bool:
+        """Add what fits of a message; whether that was all of it."""
+        if not message.started and not self._cut(packing, message):
+            return False
+        remaining = message.remaining
+        left = message.total - message.index
+        while left:
+            # Each fragment still to come takes `cut` bytes at most and one at least, so this one must, and may, take:
+            least = max(remaining - (left - 1) * message.cut, min(remaining, 1))
+            most = remaining - (left - 1)
+            length = min(packing.room(), most)
+            if length < least or length < min(most, message.cut, self.config.min_fragment) or packing.room() < 0:
+                return False
+            packing.add(message, length)
+            remaining -= length
+            left -= 1
+        return True
+
+    def _cut(self, packing: _Packing, message: Outgoing) -> bool:
+        """Fix ``total`` and ``cut`` of a message that would start in this packet; False where it had better not."""
+        size, room = len(message.payload), packing.room()
+        if size <= room:
+            message.total, message.cut = 1, size
+            return True
+        if room < self.config.min_fragment:
+            return False
+        chosen = message.qos == QOS_LATENCY or message.topic_id == self._holder or not packing.picks
+        packets = -(-size // self._single)
+        if not chosen and 1 < packets < LARGE and -(-(size - room) // self._single) == packets:
+            return False  # it would be older when it is complete, and need as many packets
+        cut = self._most(message)
+        if -(-(size - room) // cut) >= MAX_TOTAL:
+            cut = -(-(size - room) // (MAX_TOTAL - 1))
+        message.total, message.cut = 1 + -(-(size - room) // cut), cut
+        return cut <= self._single
+
+    def _most(self, message: Outgoing) -> int:
+        """Most bytes that a later fragment of a message should need."""
+        cut = self._single
+        if self._latency - {message.topic_id} and self._half:
+            cut -= self._urgent + _SHARE
+        if not self._alone and len(message.payload) > (LARGE - 1) * self._single:
+            cut = min(cut, 3 * self._single // 4)
+        return max(cut, 1)
+
+    def _needs(self, message: Outgoing) -> int:
+        """Bytes that the next fragment of a message is to have room for in its turn."""
+        if message.started:
+            return min(message.cut, message.remaining - (message.total - message.index - 1))
+        return max(min(len(message.payload), self._most(message)), 1)
+
+
+def _value(message: Outgoing, before: float) -> float:
+    """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
+    younger = message.submitted - before
+    return message.weight * younger * younger / (message.remaining + _SHARE)

@@ -1,0 +1,104 @@
+"""What waits at the source, topic by topic, and which of it is dropped: whole messages, never fragments.
+
+Laws: a message under way stands first and no newer one pushes it out; every message dropped is handed back with the
+ledger row it ends in. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest, when full),
+``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
+``abandoned`` (under way, and the same).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import inf
+
+from gr_ros2.config import QueuePolicy
+from gr_ros2.link.fragment import Outgoing
+
+
+@dataclass(frozen=True, slots=True)
+class Dropped:
+    """A message that will not be sent: its ledger row, and why in words."""
+
+    message: Outgoing
+    row: str
+    detail: str
+
+
+class TopicQueue(deque[Outgoing]):
+    """The messages of one topic, in the order in which they go.
+
+    :param policy: see ``TopicOptions.queue``
+    :param deadline_s: s a message may take from submission to the far end, 0 no limit
+    :param max_rate: messages/s that may start, 0 unlimited
+    """
+
+    def __init__(self, policy: QueuePolicy, deadline_s: float = 0.0, max_rate: float = 0.0) -> None:
+        super().__init__()
+        self.policy = policy
+        self.deadline_s = deadline_s
+        self._interval = 1 / max_rate if max_rate else 0.0
+        self._opens = float("-inf")
+
+    def room(self, depth: int) -> bool:
+        """Whether one more would push none out. ``depth``: messages that may wait, 0 unbounded."""
+        if self.policy == "latest":
+            return not self or (len(self) == 1 and self[0].started)
+        return not depth or len(self) < depth
+
+    def admit(self, message: Outgoing, depth: int) -> list[Dropped]:
+        """Put a message in; returns those that make room for it."""
+        dropped: list[Dropped] = []
+        if self.policy == "latest":
+            while self and not self[-1].started:
+                dropped.append(Dropped(self.pop(), "superseded", "a newer message came before it could start"))
+        elif depth and len(self) >= depth:
+            for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
+                self.remove(victim)
+                dropped.append(Dropped(victim, "queue_bound", f"{depth} messages were waiting"))
+        if self.deadline_s:
+            message.expires = message.submitted + self.deadline_s
+        self.append(message)
+        return dropped
+
+    def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
+        """Drop what cannot be across in time, even if it had the link to itself.
+
+        :param interval: s from one packet to the next, 0 where not known
+        :param lead: s between composing a packet and its first sample
+        :param payload: bytes of a message that fit a packet
+        """
+        if not self.deadline_s:
+            return
+        for message in list(self):
+            packets = max(-(-message.remaining // payload), 1)
+            late = now + packets * interval + lead * bool(interval) > message.expires
+            if not late and now < message.expires:
+                return  # what follows is younger, and waits for this one
+            self.remove(message)
+            yield Dropped(message, *self._reason(message, now, packets * interval))
+
+    def started(self, now: float) -> None:
+        """A message began: when may the next one?"""
+        if self._interval:
+            # What a start was late by is not added to the next, unless it was late by a whole interval.
+            self._opens = (self._opens if now - self._opens < self._interval else now) + self._interval
+
+    def open(self, now: float) -> Sequence[Outgoing]:
+        """The messages that may go on or start."""
+        if not self._interval:
+            return self
+        return [self[0]] if self and (self[0].started or now >= self._opens) else []
+
+    def opens(self, now: float) -> float:
+        """When the next message may start, if one waits for that; otherwise infinite."""
+        return self._opens if self and now < self._opens and not self[0].started else inf
+
+    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[str, str]:
+        limit = f"deadline_ms {self.deadline_s * 1e3:g}"
+        if message.started:
+            return "abandoned", f"{message.remaining} bytes could not follow within {limit}"
+        if now >= message.expires:
+            return "stale", f"it waited longer than {limit}"
+        return "cannot_complete", f"{needs * 1e3:.0f} ms on the air end after {limit}"

@@ -1,0 +1,210 @@
+"""Single-carrier bursts: phase-shift keying with a known preamble, synchronised feed-forward.
+
+Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it; frequency,
+phase and timing of each burst are measured on its preamble and followed along its payload in blocks, with no loop that
+could be locked wrongly from the burst before.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gr_ros2.phy.burst import BurstModem, Octets, Samples, Search
+
+Reals = NDArray[np.float64]
+_T = TypeVar("_T", np.complex128, np.float64)
+
+PREAMBLE = 64
+"""Symbols: a first one and the 63 phase steps of a maximum-length sequence."""
+_SLACK = 4
+"""Samples after the last symbol that interpolation and a late start may need."""
+_THRESHOLD = 0.45
+"""Correlation over power: 63 steps of noise alone pass once in 10^6 samples, a burst that can be read has 0.7."""
+_RISE = 16
+"""Symbols before its summit at which the correlation of a strong burst may pass the threshold."""
+_CHUNK = 256
+"""Symbols between two looks at the timing: clocks may differ by 100 ppm."""
+_BLOCK = 32
+"""Symbols per estimate of the phase."""
+_TINY = 1e-20
+
+
+def preamble_steps() -> NDArray[np.int8]:
+    """63 signs, the maximum-length sequence of x^6 + x^5 + 1."""
+    state, steps = 0x3F, []
+    for _ in range(PREAMBLE - 1):
+        steps.append(1 if state & 1 else -1)
+        state = state >> 1 | ((state ^ state >> 1) & 1) << 5
+    return np.array(steps, np.int8)
+
+
+class LinearModem(BurstModem):
+    """Bursts whose matched-filtered samples hold one phase of ``order`` per symbol.
+
+    Samples to :meth:`find` and :meth:`demodulate` have passed a filter with :attr:`taps`. The reference sample is that
+    of the preamble's first symbol.
+
+    :param packet_len: bytes per packet
+    :param order: phases, a power of 2
+    :param sps: samples per symbol, 2 or more
+    :param turn: phase steps beside data and carrier, radians per symbol
+    """
+
+    def __init__(self, packet_len: int, order: int, sps: int, turn: float = 0.0) -> None:
+        super().__init__(packet_len)
+        self.order, self.sps = order, sps
+        self.bits_per_symbol = order.bit_length() - 1
+        self.payload_symbols = -(-8 * self.frame.length // self.bits_per_symbol)
+        self.symbols = PREAMBLE + self.payload_symbols
+        self.margin = sps + _SLACK
+        self._turn = turn
+        self._steps = preamble_steps().astype(np.float32)
+        known = np.concatenate(([1], np.cumprod(preamble_steps()))) * np.exp(1j * turn * np.arange(PREAMBLE))
+        self._known = known.astype(np.complex64)
+        gray = np.arange(order) ^ np.arange(order) >> 1
+        self._value_of = gray.astype(np.uint8)
+        self._phase_of = np.argsort(gray).astype(np.uint8)
+
+    taps: Samples | NDArray[np.float32]
+    """The receiver's filter."""
+
+    @property
+    def span(self) -> int:
+        return (self.symbols - 1) * self.sps + 1 + _SLACK
+
+    @property
+    def preamble_samples(self) -> int:
+        return (PREAMBLE + _RISE) * self.sps
+
+    @property
+    def peak_samples(self) -> int:
+        return 2 * self.sps
+
+    def phases(self, packet: bytes) -> NDArray[np.uint8]:
+        """The payload's phases, in units of a turn / ``order``."""
+        bits = np.unpackbits(self.frame.wrap(packet))
+        return self._phase_of[_chunks(bits, self.bits_per_symbol, self.payload_symbols)]
+
+    def octets(self, phases: NDArray[np.int64]) -> Octets:
+        """The frame that such phases mean."""
+        values = self._value_of[phases]
+        bits = (values[:, None] >> np.arange(self.bits_per_symbol - 1, -1, -1)) & 1
+        return np.packbits(bits.reshape(-1)[: 8 * self.frame.length].astype(np.uint8))
+
+    def find(self, samples: Samples) -> Search:
+        sps = self.sps
+        positions = len(samples) - (PREAMBLE - 1) * sps
+        if positions <= 0:
+            return Search(0)
+        steps = samples[sps:] * samples[:-sps].conj()
+        match = np.empty(positions, np.float32)
+        for phase in range(min(sps, positions)):
+            real = np.correlate(np.ascontiguousarray(steps[phase::sps].real), self._steps)
+            imag = np.correlate(np.ascontiguousarray(steps[phase::sps].imag), self._steps)
+            length = len(match[phase::sps])
+            match[phase::sps] = np.hypot(real, imag)[:length]
+        power = np.concatenate(([0.0], np.cumsum(np.abs(samples) ** 2, dtype=np.float64)))
+        width = (PREAMBLE - 1) * sps + 1
+        energy = (power[width:] - power[:-width]) / sps
+        head = (power[width // 4 : width // 4 + positions] - power[:positions]) / sps
+        # A window that still reaches into silence holds few steps, and few steps match by chance.
+        above = np.flatnonzero((match > _THRESHOLD * energy + _TINY) & (head > energy / 8))
+        if not len(above):
+            return Search(positions)
+        first = int(above[0])
+        if first + _RISE * sps > positions:  # the highest point may still be to come
+            return Search(first)
+        return Search(first, first + int(np.argmax(match[first : first + _RISE * sps])))
+
+    def demodulate(self, samples: Samples, start: int) -> bytes | None:
+        sps, order = self.sps, self.order
+        start, frequency, phase = self._measure(samples, start)
+        late = 0.0
+        start_exact = start + self._lateness(samples, start, frequency)
+        phases = np.empty(self.payload_symbols, np.int64)
+        known_at, known = float(PREAMBLE - 1) / 2, 0.0
+        for first in range(0, self.payload_symbols, _CHUNK):
+            count = min(_CHUNK, self.payload_symbols - first)
+            symbols = first + PREAMBLE + np.arange(count)
+            at = start_exact + late + (first + PREAMBLE) * sps
+            turned = np.exp(-1j * (phase + frequency * symbols))
+            points = _at(samples, at, sps, count) * turned
+            angles, weights = np.angle(points), np.abs(points)
+            edges = np.arange(0, max(1, count // _BLOCK)) * _BLOCK
+            raised = np.add.reduceat(weights * np.exp(1j * order * angles), edges)
+            centres = first + PREAMBLE + (edges + np.append(edges[1:], count) - 1) / 2
+            drift = np.unwrap(np.concatenate(([known * order], np.angle(raised))))[1:] / order
+            drift = np.interp(symbols, np.concatenate(([known_at], centres)), np.concatenate(([known], drift)))
+            index = np.rint((angles - drift) * (order / (2 * np.pi))).astype(np.int64)
+            phases[first : first + count] = index % order
+            known_at, known = float(symbols[-1]), float(drift[-1])
+            if first + count < self.payload_symbols:
+                model = turned * np.exp(-1j * (drift + index * (2 * np.pi / order)))
+                late += summit(*(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1)))
+        return self.frame.unwrap(self.octets(self.decided(phases)))
+
+    def decided(self, phases: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The data that received phases mean; the phases themselves unless the modulation has memory."""
+        return phases
+
+    def _measure(self, samples: Samples, start: int) -> tuple[int, float, float]:
+        """Reference sample, carrier frequency and phase from the preamble, in radians per symbol and radians.
+
+        The turn of the modulation counts as carrier here.
+        """
+        size = 4 * PREAMBLE
+        known = samples[start : start + PREAMBLE * self.sps : self.sps] * self._known.conj()
+        spectrum = np.fft.fft(known, size)
+        height = np.abs(spectrum)
+        peak = int(np.argmax(height))
+        place = peak + summit(height[peak - 1], height[peak], height[(peak + 1) % size])
+        frequency = 2 * np.pi * ((place + size / 2) % size - size / 2) / size
+        phase = float(np.angle((known * np.exp(-1j * frequency * np.arange(PREAMBLE))).sum()))
+        return start, frequency + self._turn, phase
+
+    def _lateness(self, samples: Samples, start: int, frequency: float) -> float:
+        """Samples by which the preamble's symbols lie behind ``start``, -0.5..0.5."""
+        model = self._known.conj() * np.exp(-1j * (frequency - self._turn) * np.arange(PREAMBLE))
+        heights = (
+            abs((samples[at : at + PREAMBLE * self.sps : self.sps] * model).sum())
+            for at in (start - 1, start, start + 1)
+        )
+        return summit(*(float(height) for height in heights))
+
+
+def shape(symbols: NDArray[_T], taps: Reals, sps: int) -> NDArray[_T]:
+    """Symbols one pulse each, ``sps`` samples apart: (symbols - 1) * sps + taps samples."""
+    out = np.zeros((len(symbols) - 1) * sps + len(taps), symbols.dtype)
+    for phase in range(sps):
+        part = np.convolve(symbols, taps[phase::sps])
+        out[phase::sps][: len(part)] += part
+    return out
+
+
+def _chunks(bits: Octets, width: int, count: int) -> NDArray[np.uint8]:
+    """Bits as numbers of ``width`` bits, filled up with zeros."""
+    padded = np.zeros(width * count, np.uint8)
+    padded[: len(bits)] = bits
+    return padded.reshape(count, width) @ (1 << np.arange(width - 1, -1, -1)).astype(np.uint8)
+
+
+def _at(samples: Samples, at: float, step: int, count: int) -> NDArray[np.complex64]:
+    """``count`` values ``step`` samples apart from a fractional place on, by cubic interpolation."""
+    base = int(np.floor(at))
+    x = at - base
+    weights = (-x * (x - 1) * (x - 2) / 6, (x + 1) * (x - 1) * (x - 2) / 2, -(x + 1) * x * (x - 2) / 2,
+               (x + 1) * x * (x - 1) / 6)  # fmt: skip
+    total = np.zeros(count, np.complex64)
+    for offset, weight in zip((-1, 0, 1, 2), weights, strict=True):
+        part = samples[base + offset :: step][:count]
+        total[: len(part)] += np.float32(weight) * part
+    return total
+
+
+def summit(before: float, at: float, after: float) -> float:
+    """Where the parabola through three neighbours is highest, -0.5..0.5 from the middle one."""
+    bend = before - 2 * at + after
+    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0 else 0.0

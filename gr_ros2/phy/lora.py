@@ -1,0 +1,295 @@
+"""The `lora` PHY: chirp spread spectrum after LoRa's example, for links far below the noise.
+
+Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame of known length; the
+format is our own (it has LoRa's chirps, Gray code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no
+header), so it does not talk to LoRa modems.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.config import build
+from gr_ros2.errors import ConfigError
+from gr_ros2.phy.burst import BurstModem, Octets, Samples, Search
+from gr_ros2.phy.burst_blocks import BurstPhy
+from gr_ros2.phy.linear import summit
+from gr_ros2.phy.theory import at_least, orthogonal_symbol_error, packet_success
+
+MAX_BURST = 1 << 22
+"""Samples; a longer burst would take more memory than small computers have."""
+_UP, _SYNC, _DOWN = 8, (24, 32), 2
+"""Symbols of the preamble: plain up-chirps, a sync word, plain down-chirps."""
+_HEAD = _UP + len(_SYNC) + _DOWN
+_LOOK = 6
+"""Up-chirps added up to see a burst."""
+_LIMIT, _THRESHOLD = 10.0, 36.0
+"""Powers over the mean of all bins: what one chirp counts at most, and what a burst's chirps add up to. A burst that
+can be read has 50, noise alone passes once in 10^6 symbols."""
+_TINY = 1e-20
+_FINE = 4
+"""Parts of a bin that peaks are searched in."""
+_CHUNK = 2048
+"""Samples between two looks at the timing, at least a symbol."""
+_GAIN, _PACE_GAIN = 0.3, 0.05
+"""Of the timing loop, per look: place, and speed of its change."""
+_SINC = 12
+"""Samples to either side that a value between two samples is made from."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LoraOptions:
+    """Settings of this PHY beside packet length and sample rate.
+
+    :param spreading_factor: bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and
+        2.5 dB less SNR
+    :param coding_rate: check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none
+    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
+    """
+
+    spreading_factor: Annotated[int, Field(ge=7, le=12)] = 7
+    coding_rate: Annotated[int, Field(ge=1, le=4)] = 4
+    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
+
+
+class LoraModem(BurstModem):
+    """See :class:`LoraOptions`. The reference sample is the first of an up-chirp early in the preamble, about."""
+
+    def __init__(self, packet_len: int, options: LoraOptions) -> None:
+        super().__init__(packet_len)
+        self.spreading_factor, self.code_bits = options.spreading_factor, 4 + options.coding_rate
+        self.chips = 1 << options.spreading_factor
+        self.blocks = -(-2 * self.frame.length // options.spreading_factor)
+        self.symbols = self.blocks * self.code_bits
+        n = np.arange(self.chips)
+        self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)
+        self._down = self._up.conj()
+        self._roots = np.exp(2j * np.pi * n / self.chips).astype(np.complex64)
+        self._words = code_words(options.coding_rate)
+        self._nibbles = nearest_nibbles(options.coding_rate)
+        self.margin = 2 * self.chips
+
+    @property
+    def burst_samples(self) -> int:
+        return (_HEAD + self.symbols) * self.chips
+
+    @property
+    def span(self) -> int:
+        return (_HEAD + 1) * self.chips
+
+    @property
+    def preamble_samples(self) -> int:
+        return (2 * _LOOK + 1) * self.chips
+
+    @property
+    def peak_samples(self) -> int:
+        return _LOOK * self.chips
+
+    def modulate(self, packet: bytes) -> Samples:
+        values = self._spread(self.frame.wrap(packet))
+        starts = np.concatenate((np.zeros(_UP, np.int64), _SYNC, values))
+        chips = (np.arange(self.chips) + starts[:, None]) % self.chips
+        ups = self._up[chips]
+        head = _UP + len(_SYNC)
+        return np.concatenate((ups[:head].reshape(-1), np.tile(self._down, _DOWN), ups[head:].reshape(-1)))
+
+    def find(self, samples: Samples) -> Search:
+        count = len(samples) // self.chips
+        if count < _LOOK + 1:
+            return Search(0)
+        powers = np.abs(np.fft.fft(samples[: count * self.chips].reshape(count, -1) * self._down)) ** 2
+        powers = powers / np.maximum(powers.mean(axis=1, keepdims=True), _TINY)
+        # However strong, one chirp counts no more than a few times the noise: data repeat a value now and then.
+        summed = np.cumsum(np.concatenate((np.zeros((1, self.chips)), np.minimum(powers, _LIMIT))), axis=0)
+        summed = summed[_LOOK:] - summed[:-_LOOK]
+        # Neighbours count together: a burst that starts between two samples shares its peak between two bins.
+        pairs = summed + np.roll(summed, 1, axis=1)
+        above = np.flatnonzero(pairs.max(axis=1) > _THRESHOLD)
+        if not len(above):
+            return Search((count - _LOOK) * self.chips)
+        first = int(above[0])
+        if first + _LOOK >= len(pairs):  # a strong burst is seen as it comes in; the best place is yet to come
+            return Search(first * self.chips)
+        best = first + int(np.argmax(pairs[first : first + _LOOK + 1].max(axis=1)))
+        late = int(np.argmax(summed[best]))
+        return Search(first * self.chips, best * self.chips + (self.chips - late) % self.chips)
+
+    def end(self, samples: Samples, start: int) -> int:
+        place = self._place(samples, start)
+        # What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
+        return start + self.span if place is None else int(place[0]) + self.symbols * self.chips - _SINC
+
+    def demodulate(self, samples: Samples, start: int) -> bytes | None:
+        place = self._place(samples, start)
+        if place is None:
+            return None
+        begin, carrier = place
+        turn = np.exp(-2j * np.pi * carrier * np.arange(self.chips) / self.chips) * self._down
+        values = np.empty(self.symbols, np.int64)
+        step = max(1, _CHUNK // self.chips)
+        pace = 0.0
+        for first in range(0, self.symbols, step):
+            count = min(step, self.symbols - first)
+            at = begin + first * self.chips
+            tones = _delayed(samples, at, count * self.chips).reshape(count, self.chips) * turn
+            peaks = np.argmax(np.abs(np.fft.fft(tones)), axis=1)
+            values[first : first + count] = peaks
+            late = self._late(tones, peaks)
+            pace -= _PACE_GAIN * late
+            begin += pace - _GAIN * late
+        return self.frame.unwrap(self._collect(values))
+
+    def _late(self, tones: NDArray[np.complex64], peaks: NDArray[np.int64]) -> float:
+        """Samples by which windows lie behind their chirps, -0.5..0.5.
+
+        Not simply how far a tone lies above its bin: where a chirp jumps back by the whole band, lateness turns the
+        phase. Lateness turns each sample by the chirp's frequency there.
+        """
+        n = np.arange(self.chips)
+        still = tones * self._roots[peaks[:, None] * -n % self.chips]
+        frequency = (n + peaks[:, None]) % self.chips / self.chips - 0.5
+        whole, part = still.sum(axis=1), (still * frequency).sum(axis=1)
+        power = float((np.abs(whole) ** 2).sum())
+        turned = float((part * whole.conj()).imag.sum())
+        return float(np.clip(turned * 6 / (np.pi * max(power, _TINY)), -0.5, 0.5))
+
+    def _place(self, samples: Samples, start: int) -> tuple[float, float] | None:
+        """Where the payload begins, and carrier offset in bins; None where this is no burst."""
+        windows = samples[start : start + (_HEAD + 1) * self.chips]
+        windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
+        falls = self._powers(windows, self._up)
+        pairs = falls[:-1] + falls[1:]
+        at = int(np.argmax(pairs.max(axis=1)))
+        if at < len(_SYNC) + 1:
+            return None
+        fall = self._bin(pairs[at])
+        rise = self._bin(self._powers(windows[: at - len(_SYNC)], self._down).sum(axis=0))
+        # Lateness moves rising and falling chirps apart, carrier offset moves them together.
+        begin = start + (at + _DOWN) * self.chips + round((fall - rise) / 2)
+        # Once more where the windows meet the chirps: between two chirps a fraction of a sample turns the phase.
+        first = begin - (_DOWN + len(_SYNC) + _LOOK) * self.chips
+        if first < 0:
+            return None
+        windows = samples[first:begin].reshape(-1, self.chips)
+        rise = self._bin(self._powers(windows[:_LOOK], self._down).sum(axis=0))
+        fall = self._bin(self._powers(windows[-_DOWN:], self._up).sum(axis=0))
+        return begin + (fall - rise) / 2, (fall + rise) / 2
+
+    def _powers(self, windows: Samples, chirp: Samples) -> NDArray[np.float64]:
+        """Spectra of windows against a chirp, ``_FINE`` places a bin."""
+        return np.asarray(np.abs(np.fft.fft(windows * chirp, _FINE * self.chips)) ** 2)
+
+    def _bin(self, powers: NDArray[np.float64]) -> float:
+        """The strongest place of such a spectrum, in bins either side of 0."""
+        top = int(np.argmax(powers))
+        place = (top + summit(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
+        return (place + self.chips / 2) % self.chips - self.chips / 2
+
+    def _spread(self, frame: Octets) -> NDArray[np.int64]:
+        """Bytes to chirp starts: Hamming code, diagonal interleaver, Gray code."""
+        sf = self.spreading_factor
+        nibbles = np.zeros(self.blocks * sf, np.uint8)
+        nibbles[: 2 * len(frame)] = np.stack((frame >> 4, frame & 15), axis=1).reshape(-1)
+        words = self._words[nibbles].reshape(self.blocks, sf)
+        bits = (words[:, :, None] >> np.arange(self.code_bits)) & 1
+        rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
+        mixed = bits[:, rows, np.arange(self.code_bits)[:, None]]
+        values = mixed.reshape(-1, sf) @ (1 << np.arange(sf))
+        out = values.copy()
+        for shift in (1, 2, 4, 8):
+            out ^= out >> shift
+        return out
+
+    def _collect(self, values: NDArray[np.int64]) -> Octets:
+        """Chirp starts to bytes."""
+        sf = self.spreading_factor
+        gray = values ^ values >> 1
+        mixed = ((gray[:, None] >> np.arange(sf)) & 1).reshape(self.blocks, self.code_bits, sf)
+        rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
+        bits = np.empty((self.blocks, sf, self.code_bits), np.int64)
+        bits[:, rows, np.arange(self.code_bits)[:, None]] = mixed
+        nibbles = self._nibbles[(bits @ (1 << np.arange(self.code_bits))).reshape(-1)]
+        pairs = nibbles[: 2 * self.frame.length].reshape(-1, 2)
+        octets: Octets = pairs[:, 0] << 4 | pairs[:, 1]
+        return octets
+
+
+@lru_cache
+def code_words(check_bits: int) -> NDArray[np.int64]:
+    """The 16 words of 4 data bits and so many check bits; with 3 any two differ in 3 bits, with 4 in 4."""
+    data = np.arange(16)
+    d = [(data >> i) & 1 for i in range(4)]
+    parity = d[0] ^ d[1] ^ d[2] ^ d[3]
+    checks = [d[0] ^ d[1] ^ d[2], d[1] ^ d[2] ^ d[3], d[0] ^ d[1] ^ d[3], d[0] ^ d[2] ^ d[3]]
+    chosen = [parity] if check_bits == 1 else checks[:check_bits]
+    return np.asarray(data + sum((bit << 4 + i) for i, bit in enumerate(chosen)))
+
+
+@lru_cache
+def nearest_nibbles(check_bits: int) -> Octets:
+    """For every received word the data bits of the nearest code word."""
+    words = code_words(check_bits)
+    apart = np.arange(1 << 4 + check_bits)[:, None] ^ words
+    distance = sum((apart >> i) & 1 for i in range(4 + check_bits))
+    # Of equally near ones the data bits as they came.
+    same = (apart & 15) == 0
+    return np.asarray(np.argmin(2 * distance - same, axis=1), np.uint8)
+
+
+def _delayed(samples: Samples, at: float, count: int) -> Samples:
+    """``count`` samples from a fractional place on, by a windowed sinc; zeros beyond the end."""
+    base = int(np.floor(at))
+    x = np.arange(-_SINC + 1, _SINC + 1) - (at - base)
+    taps = np.sinc(x) * np.cos(np.pi * x / (2 * _SINC + 2)) ** 2
+    part = samples[base - _SINC + 1 : base + _SINC + count]
+    missing = 2 * _SINC - 1 + count - len(part)
+    if missing:
+        part = np.concatenate((part, np.zeros(missing, np.complex64)))
+    return np.convolve(part, taps[::-1].astype(np.float32), "valid")
+
+
+class LoraPhy(BurstPhy):
+    """For links far below the noise, at a low rate: half of all packets of 64 B arrive at -8 dB with factor 7.
+
+    Carrier offset up to a tenth of the band, clocks within 10 ppm. One packet is one frame, however long, as long as it
+    has at most 2^22 samples: 4095 B with spreading factor 9 and below, 767 B with 12 (with 4 check bits).
+
+    :param options: see :class:`LoraOptions`
+    :raises ConfigError: for an option that is unknown or out of range, or a burst above 2^22 samples
+    """
+
+    name = "lora"
+
+    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate)
+        self.options = build(LoraOptions, options, "phy lora")
+        self.modem: LoraModem = LoraModem(packet_len, self.options)
+        self.gap = self.options.gap
+        if self.modem.burst_samples > MAX_BURST:
+            raise ConfigError(
+                f"phy lora: packet_len = {packet_len} with spreading_factor = {self.options.spreading_factor}: a burst "
+                f"of {self.modem.burst_samples} samples is above {MAX_BURST}; take a smaller one of either"
+            )
+
+    @property
+    def receiver_taps(self) -> Any:
+        return None
+
+    def burst_power(self) -> float:
+        return 1.0
+
+    def computed_pdr(self, snr_db: float) -> float:
+        """A block of code words is right if no symbol is wrong, or one where the code corrects an error.
+
+        An upper bound on loss: two wrong symbols need not meet in a code word.
+        """
+        modem = self.modem
+        wrong = orthogonal_symbol_error(modem.chips, 10 ** (snr_db / 10) * modem.chips)
+        lost = at_least(2 if self.options.coding_rate >= 3 else 1, modem.code_bits, wrong)
+        return packet_success(lost, modem.blocks)

@@ -1,0 +1,74 @@
+"""`--dashboard` and `gr-ros2 dashboard`: where, and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import pytest
+
+from gr_ros2.cli.dashboard import parse_place
+from gr_ros2.cli.main import run
+from gr_ros2.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("5006", ("127.0.0.1", 5006)),
+        ("0", ("127.0.0.1", 0)),
+        ("0.0.0.0:80", ("0.0.0.0", 80)),
+        ("[::1]:5006", ("::1", 5006)),
+        (" robot.local:65535 ", ("robot.local", 65535)),
+    ],
+)
+def test_a_place(text: str, place: tuple[str, int]) -> None:
+    assert parse_place(text) == place
+
+
+@pytest.mark.parametrize("text", ["", "demo", "65536", "-1", "1.5", "host:", "::1:80", "5006:host", "٣"])
+def test_no_place(text: str) -> None:
+    with pytest.raises(ConfigError, match="ADDRESS"):
+        parse_place(text)
+
+
+def test_nothing_there(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as held:  # bound and not listening: nobody answers, nobody else takes it
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+        assert run(["dashboard", str(port), "--no-browser"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"127.0.0.1:{port}: no dashboard there" in line
+
+
+def test_a_page_that_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from gr_ros2.dashboard.server import Dashboard
+
+    with Dashboard(port=0) as served:
+        assert run(["dashboard", str(served.port), "--no-browser"]) == 0
+        assert capsys.readouterr().out.strip() == served.url
+
+
+def test_without_bokeh_it_says_what_to_install(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    monkeypatch.delitem(sys.modules, "gr_ros2.dashboard.server", raising=False)
+    monkeypatch.setitem(sys.modules, "bokeh.application", None)
+    assert run(["run", "paper-direct", "--dashboard=0"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "bokeh" in line
+    assert "gr-ros2[dashboard]" in line
+
+
+def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        assert run(["run", "paper-direct", f"--dashboard={held.getsockname()[1]}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "choose another port" in line

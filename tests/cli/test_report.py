@@ -1,0 +1,70 @@
+"""`gr-ros2 report` and `gr-ros2 compare`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.cli import main as command
+from tests.experiment.runs import make_run
+
+
+def test_one_folder_gets_its_own_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_run(tmp_path)
+    assert command.run(["report", str(tmp_path)]) == 0
+    assert (tmp_path / "report.html").is_file()
+    assert f"Written: {tmp_path / 'report.html'}" in capsys.readouterr().out
+
+
+def test_several_folders_leave_theirs_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_run(tmp_path / "a", "one")
+    make_run(tmp_path / "b", "two")
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    assert command.run(["report", "a", "b"]) == 0
+    assert len(list(tmp_path.glob("results/report-*/report.html"))) == 1
+    assert command.run(["compare", "a", "b", "--out", "c"]) == 0
+    assert (tmp_path / "c" / "compare.html").is_file()
+    new = {path.relative_to(tmp_path).parts[0] for path in set(tmp_path.rglob("*")) - set(before)}
+    assert new == {"results", "c"}
+    out = capsys.readouterr().out
+    assert next(line for line in out.splitlines() if "PDR" in line).split() == [
+        "/robot_1/odom",
+        "PDR",
+        "0.625",
+        "0.625",
+    ]
+
+
+@pytest.mark.parametrize("name", ["report", "compare"])
+def test_a_damaged_folder_is_one_line_and_status_2(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_run(tmp_path / "a", "one")
+    make_run(tmp_path / "b", "two")
+    broken = tmp_path / "b" / "messages.parquet"
+    broken.write_bytes(broken.read_bytes()[:100])
+    assert command.run([name, str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"gr-ros2: {broken}: damaged or half-written")
+    assert error.count("\n") == 1
+
+
+def test_one_run_has_nothing_to_be_compared_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(["compare", str(tmp_path)]) == 2
+    assert "give two folders or more" in capsys.readouterr().err
+
+
+def test_reports_need_no_radio_and_no_ros(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    code = (
+        f"import sys; from gr_ros2.cli.main import run; assert run(['report', {str(tmp_path)!r}]) == 0;"
+        "heavy = {'gnuradio', 'cyclonedds', 'rclpy', 'matplotlib.pyplot', 'pandas'} & set(sys.modules);"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)

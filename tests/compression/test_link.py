@@ -1,0 +1,52 @@
+"""The receiver decodes what came whole, and books what it cannot read under the codec's row."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.compression import LinkCodec
+from gr_ros2.config import SinkConfig
+from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
+from gr_ros2.registry import Registry
+from gr_ros2.wire import Entry, Packet, encode
+from tests.compression.support import simulated
+
+REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+PACKET_LEN = 220
+
+
+def received(coded: bytes, *, codec: LinkCodec | None, compressed: bool = True) -> list[ReceiverEvent]:
+    receiver = Receiver(REGISTRY, SinkConfig(packet_len=PACKET_LEN), codec=codec)
+    pieces = [coded[at : at + 100] for at in range(0, len(coded), 100)]
+    events: list[ReceiverEvent] = []
+    for n, piece in enumerate(pieces):
+        packet = Packet(1, 255, n, 1, (Entry(0, 7, n, len(pieces), piece),), compressed=compressed)
+        events += receiver.receive(encode(packet, PACKET_LEN), 0.0)
+    lost = [key for key, count in receiver.stats.lost.items() if count == 1]
+    assert lost == [(event.src_id, event.topic_id, event.reason) for event in events if isinstance(event, Lost)]
+    return events
+
+
+def test_a_compressed_message_is_delivered_as_it_was() -> None:
+    payload = simulated("odom", 0.2)[0]
+    codec = LinkCodec(REGISTRY)
+    assert received(codec.encode(0, payload), codec=codec) == [Delivered(1, 0, payload, 0, 7)]
+    assert received(b"\0" + payload, codec=codec) == [Delivered(1, 0, payload, 0, 7)]
+    assert received(payload, codec=codec, compressed=False) == [Delivered(1, 0, payload, 0, 7)]
+
+
+@pytest.mark.parametrize(
+    ("coded", "row"),
+    [
+        (b"\xf2abc", "unknown_dictionary"),
+        (b"\x05abc", "unsupported"),
+        (b"\x01abc", "damaged"),
+        (b"\x12\xff" * 40, "damaged"),
+    ],
+)
+def test_what_cannot_be_read_has_a_row(coded: bytes, row: str) -> None:
+    assert received(coded, codec=LinkCodec(REGISTRY)) == [Lost(1, 0, row, 7)]
+
+
+def test_without_a_codec_it_is_unsupported() -> None:
+    assert received(b"\0abc", codec=None) == [Lost(1, 0, "unsupported", 7)]

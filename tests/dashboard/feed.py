@@ -1,0 +1,76 @@
+"""A link of the two engines for tests: messages go in, packets get lost on purpose, listeners hear all of it."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.experiment.positions import humble_types
+from gr_ros2.link import Receiver, Sender
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.registry import Registry
+
+REGISTRY = Registry.from_rows({"at": "geometry_msgs/PointStamped", "raw": "my_msgs/Thing"})
+SRC = 4
+NAMES = {(SRC, 0): "/robot_4/at", (SRC, 1): "/robot_4/raw"}
+
+
+class Hears(Protocol):
+    def sender_event(self, src_id: int, event: SenderEvent) -> None: ...
+    def packet_received(self, data: bytes, now: float) -> None: ...
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None: ...
+
+
+def at(x: float, y: float) -> bytes:
+    """A serialized position."""
+    types = humble_types().types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "map")
+    message = types["geometry_msgs/msg/PointStamped"](header, types["geometry_msgs/msg/Point"](x, y, 0.0))
+    return bytes(humble_types().serialize_cdr(message, "geometry_msgs/msg/PointStamped"))
+
+
+class Feed:
+    """Sender, air and receiver.
+
+    :param lost: whether the packet with this number is lost
+    """
+
+    def __init__(self, *ears: Hears, lost: Callable[[int], bool] = lambda _number: False, **settings: Any) -> None:
+        self.ears = ears
+        self.packets = 0
+        self._lost = lost
+        self.sender = Sender(
+            REGISTRY, SourceConfig(robot_id=SRC, **settings), rng=random.Random(1), observer=self._sender_event
+        )
+        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=self.sender.config.packet_len))
+
+    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
+        self.sender.submit(topic_id, payload, now)
+
+    def fly(self, now: float, latency: float = 0.05, most: int = 1_000_000) -> None:
+        """At most so many packets cross."""
+        for _ in range(most):
+            data = self.sender.next_packet(now)
+            if data is None:
+                return
+            self.packets += 1
+            if self._lost(self.packets):
+                continue
+            for ear in self.ears:
+                ear.packet_received(data, now + latency)
+            self._tell(self.receiver.receive(data, now + latency), now + latency)
+
+    def wait(self, now: float) -> None:
+        """Time passes at the receiver."""
+        self._tell(self.receiver.handle_timeout(now), now)
+
+    def _tell(self, events: list[ReceiverEvent], now: float) -> None:
+        for event in events:
+            for ear in self.ears:
+                ear.receiver_event(event, now)
+
+    def _sender_event(self, event: SenderEvent) -> None:
+        for ear in self.ears:
+            ear.sender_event(SRC, event)

@@ -1,0 +1,191 @@
+"""The dashboard as a person has it: the command in one process, Chromium in another."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("selenium", reason="needs selenium")
+
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.keys import Keys
+
+from gr_ros2.experiment.result import Result, read_result
+from tests.gr.probe import wait_for
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason="no chromium: apt-get install chromium chromium-driver"
+)
+
+PATIENCE_S = 90.0
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--window-size=1500,1600"),
+)
+FIND = """
+const found = [], selector = arguments[0];
+const look = root => {
+    found.push(...root.querySelectorAll(selector));
+    for (const node of root.querySelectorAll("*")) if (node.shadowRoot) look(node.shadowRoot);
+};
+look(document);
+"""
+"""Bokeh's models live in shadow roots."""
+
+
+class Viewer:
+    """One browser."""
+
+    def __init__(self, profile: Path) -> None:
+        options = webdriver.ChromeOptions()
+        options.binary_location = CHROMIUM
+        for flag in (*FLAGS, f"--user-data-dir={profile}"):
+            options.add_argument(flag)
+        self.driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+
+    def run(self, script: str, *arguments: Any) -> Any:
+        return self.driver.execute_script(script, *arguments)
+
+    def numbers(self, selector: str = ".tile b") -> dict[str, float]:
+        """``data-value`` by ``data-field``."""
+        script = f"{FIND} return found.map(node => [node.dataset.field, node.dataset.value])"
+        return {name: float(value) for name, value in self.run(script, selector) if value is not None}
+
+    def topic(self, name: str) -> dict[str, float]:
+        return self.numbers(f'tr[data-topic="{name}"] td[data-field]')
+
+    def ledger(self, topic: str) -> dict[str, int]:
+        script = f"{FIND} return found.map(node => [node.dataset.row, node.dataset.value])"
+        return {row: int(count) for row, count in self.run(script, f'tr[data-topic="{topic}"] i[data-row]')}
+
+    def text(self, selector: str) -> list[str]:
+        texts: list[str] = self.run(f"{FIND} return found.map(node => node.textContent)", selector)
+        return texts
+
+    def phase(self) -> str:
+        return "".join(self.text("b[data-field=phase]"))
+
+    def gone(self) -> bool:
+        return bool(self.run("return document.body.classList.contains('gone')"))
+
+    def slide(self, number: int, key: str) -> None:
+        """Press a key on the handle of a slider; they are counted from the top."""
+        self.run(f"{FIND} return found", ".noUi-handle")[number].send_keys(key)
+
+    def slider(self, number: int) -> float:
+        return float(self.run(f"{FIND} return found", ".noUi-handle")[number].get_attribute("aria-valuenow"))
+
+    def wait(self, condition: Callable[[], Any], what: str) -> None:
+        wait_for(condition, what, PATIENCE_S)
+
+
+SNR, OFFSET, LOSS = range(3)
+ODOM = "/robot_1/odom"
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Iterator[Viewer]:
+    viewer = Viewer(tmp_path / "profile")
+    yield viewer
+    viewer.driver.quit()
+
+
+@contextmanager
+def program(out: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A long run over OFDM with a dashboard, and where that is."""
+    settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
+    settings += ["phy.sample_rate=1e6", "channel.snr_db=30"]
+    command = [sys.executable, "-m", "gr_ros2.cli.main", "run", "paper-direct", "--duration", "3600"]
+    command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        url = re.search(r"http://\S+", line)
+        assert url is not None, line + process.stdout.read()
+        yield process, url[0]
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def stop(process: subprocess.Popen[str], out: Path) -> Result:
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, output
+    return read_result(out)
+
+
+def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path: Path) -> None:
+    with program(tmp_path / "out") as (process, url):
+        viewer.driver.get(url)
+        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "a delivery on the page")
+        first = viewer.topic(ODOM)
+        viewer.wait(lambda: viewer.topic(ODOM)["delivered"] > first["delivered"], "numbers that move")
+        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now", 0) > 0.9, "a good link")
+        assert viewer.phase() == "live"
+        assert any(re.match(r"odom #\d+ \d/4", text) for text in viewer.text(".bytes .entry"))
+        points = "return Bokeh.documents[0].get_model_by_name(arguments[0]).renderers[0].data_source.length"
+        for plot in ("map", "error", "latency", "pdr", "constellation", "spectrum"):
+            viewer.wait(lambda plot=plot: viewer.run(points, plot) > 0, f"something on {plot}")
+
+        # Another viewer sees what this one sets.
+        mine = viewer.driver.current_window_handle
+        viewer.driver.switch_to.new_window("window")
+        viewer.driver.get(url)
+        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the second viewer's numbers")
+        viewer.slide(LOSS, Keys.END)
+        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "a PDR of 0 at a loss of 100 %")
+        viewer.driver.close()
+        viewer.driver.switch_to.window(mine)
+        viewer.wait(lambda: viewer.slider(LOSS) == 100, "the first viewer's slider")
+        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "the first viewer's PDR")
+        viewer.slide(LOSS, Keys.HOME)
+        viewer.wait(lambda: viewer.topic(ODOM)["pdr_now"] > 0.5, "a link that is good again")
+        viewer.slide(SNR, Keys.HOME)
+        viewer.wait(lambda: viewer.topic(ODOM)["pdr_now"] == 0, "a PDR of 0 in noise")
+
+        errors = [entry["message"] for entry in viewer.driver.get_log("browser") if entry["level"] == "SEVERE"]
+        assert errors == []
+        result = stop(process, tmp_path / "out")
+        viewer.wait(viewer.gone, "the page to notice that the program has ended")
+    (topic,) = result.topics
+    shown = viewer.topic(ODOM)
+    assert viewer.phase() == "ended"
+    assert 0 < topic.delivered < topic.sent
+    assert (shown["sent"], shown["delivered"]) == (topic.sent, topic.delivered)
+    assert (shown["pdr"], shown["goodput_Bps"]) == (topic.pdr, topic.goodput_Bps)
+    assert (shown["latency_p50"], shown["latency_p99"]) == (topic.latency_s.p50, topic.latency_s.p99)
+    assert (shown["age_mean"], shown["age_peak"]) == (topic.age_s.mean, topic.age_s.peak)
+    assert viewer.ledger(ODOM) == {row: count for row, count in topic.ledger.items() if count}
+    tiles = viewer.numbers()
+    assert (tiles["sent"], tiles["delivered"], tiles["pdr"]) == (topic.sent, topic.delivered, topic.pdr)
+
+
+def test_the_page_returns_with_the_next_run(viewer: Viewer, tmp_path: Path) -> None:
+    with program(tmp_path / "one") as (process, url):
+        viewer.driver.get(url)
+        viewer.wait(lambda: viewer.numbers().get("delivered", 0) > 0, "the first run")
+        port = int(re.findall(r"\d+", url)[-1])
+        stop(process, tmp_path / "one")
+    viewer.wait(viewer.gone, "the page to notice")
+    before = viewer.numbers()
+    assert before["delivered"] > 0
+    assert json.loads((tmp_path / "one" / "result.json").read_text())["interrupted"] is True
+    with program(tmp_path / "two", port):
+        viewer.wait(lambda: not viewer.gone() and viewer.phase() == "live", "the next run on the same page")
+        viewer.wait(lambda: viewer.numbers().get("delivered", 0) > 0, "its numbers")

@@ -1,0 +1,111 @@
+"""The web server without a browser: where it serves, what it refuses, and that it goes."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from http.client import HTTPConnection
+from urllib.request import urlopen
+
+import pytest
+
+pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from bokeh.document import Document
+
+from gr_ros2.dashboard.page import Page
+from gr_ros2.dashboard.server import Dashboard
+from gr_ros2.dashboard.state import DashboardState
+from gr_ros2.errors import ConfigError
+from tests.dashboard.feed import NAMES, REGISTRY, Feed, at
+
+
+def get(url: str) -> str:
+    with urlopen(url, timeout=30) as answer:
+        text: str = answer.read().decode()
+    return text
+
+
+def test_it_serves_a_page_that_needs_nothing_from_elsewhere() -> None:
+    with Dashboard(port=0) as dashboard:
+        page = get(dashboard.url)
+        assert dashboard.url.startswith("http://127.0.0.1:")
+        assert "gr-ros2" in page
+        assert "cdn" not in page
+        assert json.loads(get(dashboard.url + "alive"))["instance"] in page
+
+
+@pytest.mark.parametrize(("own", "status"), [(True, 101), (False, 403)])
+def test_another_site_may_not_talk_to_it(own: bool, status: int) -> None:
+    with Dashboard(port=0) as dashboard:
+        token = re.search(r'"token":"([^"]+)"', get(dashboard.url))
+        assert token is not None
+        connection = HTTPConnection("127.0.0.1", dashboard.port, timeout=30)
+        headers = {
+            "Connection": "Upgrade",
+            "Upgrade": "websocket",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+            "Sec-WebSocket-Protocol": f"bokeh, {token[1]}",
+            "Origin": dashboard.url.rstrip("/") if own else "http://elsewhere.example:80",
+        }
+        connection.request("GET", "/ws", headers=headers)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_a_taken_port_is_named() -> None:
+    with Dashboard(port=0) as first, pytest.raises(ConfigError, match=f"127.0.0.1:{first.port}"):
+        Dashboard(port=first.port).start()
+
+
+def test_every_interface_only_where_asked() -> None:
+    with Dashboard("0.0.0.0", port=0) as dashboard:
+        assert dashboard.url == f"http://127.0.0.1:{dashboard.port}/"
+        assert get(dashboard.url)
+    assert Dashboard("::1", 80).url == "http://[::1]:80/"
+
+
+def test_it_goes_and_leaves_no_thread() -> None:
+    dashboard = Dashboard(port=0)
+    dashboard.start()
+    dashboard.close()
+    dashboard.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "gr-ros2-dashboard"]
+    with Dashboard(port=dashboard.port):
+        pass
+
+
+def test_a_page_grows_no_larger_with_time() -> None:
+    document = Document()
+    dashboard = Dashboard()
+    page = Page(document, dashboard, "test")
+    state = DashboardState(REGISTRY, NAMES, 64, name="test")
+    feed = Feed(state, lost=lambda number: number % 7 == 0, packet_len=64)
+    sizes: list[int] = []
+    for step in range(1200):
+        feed.submit(0, at(step, -step), step / 2)
+        feed.fly(step / 2)
+        page.draw(state.tick(step / 2), dashboard.radio)
+        if step % 400 == 399:
+            everything = document.to_json()
+            sizes.append(
+                len(json.dumps(everything.content, default=str)) + sum(len(b.data) for b in everything.buffers)
+            )
+    assert sizes[2] < 1.05 * sizes[1]
+    assert len(list(document.models)) < 400
+
+
+def test_a_viewer_that_cannot_keep_up_gets_fewer_pictures() -> None:
+    document = Document()
+    dashboard = Dashboard()
+    page = Page(document, dashboard, "test")
+    page.offer(dashboard.snapshot, dashboard.radio)
+    assert not document.session_callbacks  # nobody is there yet
+    page.ready()
+    for _ in range(10):
+        page.draw(dashboard.snapshot, dashboard.radio)  # and the browser never answers
+    page.offer(dashboard.snapshot, dashboard.radio)
+    assert not document.session_callbacks

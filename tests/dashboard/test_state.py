@@ -1,0 +1,227 @@
+"""What the dashboard says against what the result says, and that it stays small."""
+
+from __future__ import annotations
+
+import random
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gr_ros2.config import TopicOptions
+from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
+from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.experiment.recorder import Recorder
+from gr_ros2.experiment.result import Result
+from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
+
+
+def make(recorder: Recorder | None = None, packet_len: int = 64) -> DashboardState:
+    ledger = None if recorder is None else recorder.ledger.rows
+    return DashboardState(REGISTRY, NAMES, packet_len, name="test", duration_s=10.0, ledger=ledger)
+
+
+def lossy_run(seed: int, *ears: Hears, share: float = 0.05) -> Feed:
+    """10 s of positions at 10 Hz and of other messages at 5 Hz, through packet loss."""
+    lost = random.Random(seed)
+    feed = Feed(*ears, lost=lambda _number: lost.random() < share, packet_len=64)
+    for step in range(100):
+        now = 50 + step / 10
+        feed.submit(0, at(step, 2 * step), now)
+        if step % 2:
+            feed.submit(1, random.Random(step).randbytes(300), now)
+        if step % 40 == 0:
+            feed.submit(1, bytes(60_000), now)  # too large
+        feed.fly(now)
+        feed.wait(now)
+    return feed
+
+
+def result_of(recorder: Recorder) -> Result:
+    topics = recorder.finish(duration_s=10.0, t_end=60.0, drained=True)
+    return Result("test", 0, 10.0, {}, topics, recorder.ledger.packets(), {})
+
+
+@pytest.mark.parametrize("with_ledger", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_live_numbers_are_the_results(seed: int, with_ledger: bool) -> None:
+    recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
+    state = make(recorder if with_ledger else None)
+    feed = lossy_run(seed, recorder, state)
+    feed.wait(61.0)
+    snapshot = state.tick(60.0)
+    result = result_of(recorder)
+    assert snapshot.phase == "running"
+    assert snapshot.packets == {"sent": feed.packets, "received": result.packets["received"]}
+    for view, topic in zip(snapshot.topics, result.topics, strict=True):
+        assert (view.name, view.type_name) == (topic.topic, topic.type)
+        assert (view.sent, view.delivered, view.pdr) == (topic.sent, topic.delivered, topic.pdr)
+        assert view.goodput_Bps == pytest.approx(topic.goodput_Bps)
+        assert sum(view.ledger.values()) == view.sent
+        assert view.latency_cdf_s == pytest.approx(topic.latency_cdf_s)
+        assert view.latency_s is not None
+        assert view.latency_s.p95 == pytest.approx(topic.latency_s.p95)
+        assert (view.age_mean_s, view.age_peak_s) == pytest.approx((topic.age_s.mean, topic.age_s.peak), rel=1e-6)
+        lost = {row: count for row, count in topic.ledger.items() if row == "too_large"}
+        assert {row: view.ledger[row] for row in lost} == lost
+
+
+def test_once_it_is_over_every_number_is_the_results() -> None:
+    recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
+    state = make(recorder)
+    lossy_run(7, recorder, state)
+    before = state.tick(60.0)
+    result = result_of(recorder)
+    state.finish(result)
+    after = state.tick(75.0)
+    assert (after.phase, after.elapsed_s) == ("ended", 10.0)
+    for view, topic in zip(after.topics, result.topics, strict=True):
+        assert dict(view.ledger) == topic.ledger
+        assert (view.sent, view.delivered, view.pdr, view.goodput_Bps) == (
+            topic.sent,
+            topic.delivered,
+            topic.pdr,
+            topic.goodput_Bps,
+        )
+        assert view.path_error_m == topic.path_error_m
+        assert view.latency_cdf_s == topic.latency_cdf_s
+    # History stops with the run.
+    assert len(after.series[0].t) == len(before.series[0].t) == 1
+
+
+def test_a_run_that_failed_keeps_what_was_seen() -> None:
+    state = make()
+    lossy_run(1, state)
+    before = state.tick(60.0)
+    state.finish(None)
+    after = state.tick(60.0)
+    assert after.phase == "failed"
+    assert after.topics == before.topics
+
+
+def test_before_anything_happens() -> None:
+    snapshot = make().tick(5.0)
+    assert (snapshot.phase, snapshot.sent, snapshot.pdr, snapshot.elapsed_s) == ("waiting", 0, None, 0.0)
+    assert [topic.name for topic in snapshot.topics] == list(NAMES.values())
+    assert all(topic.pdr is topic.latency_s is topic.age_now_s is topic.pdr_now is None for topic in snapshot.topics)
+
+
+def test_the_error_is_what_the_other_robot_believes_wrongly() -> None:
+    outage = {"on": False}
+    state = make()
+    feed = Feed(state, lost=lambda _number: outage["on"], packet_len=64)
+    for step in range(50):
+        outage["on"] = step >= 30
+        feed.submit(0, at(step, 0.0), step / 5)
+        feed.fly(step / 5, latency=0.0)
+    snapshot = state.tick(10.0)
+    (path,) = snapshot.paths
+    assert (path.truth, path.belief, path.error_m) == ((49.0, 0.0), (29.0, 0.0), 20.0)
+    assert path.sent_x[-1] == 49
+    assert path.received_x[-1] == 29
+    assert path.errors_m[-1] == pytest.approx(20)
+    assert path.errors_m[10] == pytest.approx(1)  # before the packet of that very position arrives
+    assert snapshot.topics[0].age_now_s == pytest.approx(10.0 - 29 / 5)
+
+
+def test_now_means_the_last_seconds() -> None:
+    outage = {"on": False}
+    state = make()
+    feed = Feed(state, lost=lambda _number: outage["on"], packet_len=64)
+    for step in range(200):
+        outage["on"] = step >= 100
+        feed.submit(0, at(step, 0.0), step / 10)
+        feed.fly(step / 10, latency=0.0)
+        if step in (99, 199):
+            topic = state.tick(step / 10).topics[0]
+            assert topic.pdr_now == (1.0 if step == 99 else 0.0)
+    assert topic.pdr == 0.5
+    assert topic.goodput_now_Bps == 0
+
+
+@pytest.mark.parametrize("with_ledger", [True, False])
+def test_repeats_count_nowhere(with_ledger: bool) -> None:
+    recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
+    state = make(recorder if with_ledger else None)
+    latched = {"raw": TopicOptions(durability="transient_local")}
+    feed = Feed(recorder, state, lost=lambda number: number == 1, packet_len=64, topic_options=latched, repeat_s=2.0)
+    feed.submit(1, b"the map", 10.0)
+    feed.fly(10.0)
+    feed.fly(12.5)
+    assert feed.packets == 2
+    topic = state.tick(13.0).topics[1]
+    assert (topic.sent, topic.delivered, sum(topic.ledger.values())) == (1, 0, 1)
+
+
+def test_packets_field_by_field() -> None:
+    state = make()
+    feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, hop=5)
+    feed.submit(1, bytes(300), 10.0)
+    feed.fly(10.0)
+    state.packet_received(b"no packet", 11.0)
+    *packets, refused = state.tick(12.0).last_packets
+    assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
+    first = packets[0]
+    assert (first.version, first.src_id, first.dst_id, first.hop, first.qos) == (0, SRC, 255, 5, "default")
+    (entry,) = first.entries
+    assert (entry.topic, entry.colour, entry.index, entry.total, entry.size) == ("raw", 1, 0, 6, 51)
+    assert first.pad == 0
+    assert packets[-1].pad == 64 - 13 - packets[-1].entries[0].size
+    assert refused.refused.startswith("length:")
+    assert refused.t == pytest.approx(1.0)
+
+
+def test_queues_and_colours_go_with_their_topic() -> None:
+    state = make()
+    lossy_run(1, state)
+    snapshot = state.tick(60.0, {(SRC, 1): 17})
+    assert [topic.queued for topic in snapshot.topics] == [None, 17]
+    assert [topic.colour for topic in snapshot.topics] == [0, 1]
+    assert snapshot.series[1].queued[-1] == 17
+    assert np.isnan(snapshot.series[0].queued[-1])
+
+
+def sizes(snapshot: Snapshot) -> dict[str, int]:
+    """Items in everything that could grow."""
+    return {
+        "series": sum(len(line.t) for line in snapshot.series),
+        "paths": sum(len(path.sent_x) + len(path.received_x) + len(path.errors_m) for path in snapshot.paths),
+        "latency": sum(len(topic.latency_cdf_s) for topic in snapshot.topics),
+        "packets": len(snapshot.last_packets),
+    }
+
+
+def resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory from")
+def test_an_hour_at_35_hz_takes_no_more_memory_than_ten_minutes() -> None:
+    state = make(packet_len=220)
+    lost = random.Random(1)
+    feed = Feed(state, lost=lambda _number: lost.random() < 0.2, packet_len=220)
+    payloads = [at(step, -step) for step in range(500)]
+    early: tuple[dict[str, int], float] | None = None
+    tick_at = 0.0
+    for step in range(3600 * 35):
+        now = step / 35
+        feed.submit(0, payloads[step % len(payloads)], now)
+        feed.fly(now)
+        if now >= tick_at:
+            tick_at += 2.0  # four times a real one's, for speed
+            snapshot = state.tick(now)
+        if step == 600 * 35:
+            early = sizes(snapshot), resident_mb()
+    snapshot = state.tick(3600.0)
+    assert early is not None
+    assert sizes(snapshot)["paths"] <= early[0]["paths"] + 3
+    assert sizes(snapshot)["packets"] == PACKETS_SHOWN
+    assert sizes(snapshot)["series"] <= 2 * 360
+    assert snapshot.sent == 3600 * 35
+    assert snapshot.delivered > 0.7 * snapshot.sent
+    source = state._sources[SRC]
+    assert max(len(source.open), len(source.away)) <= UNDER_WAY
+    assert len(state._topics[SRC, 0].latencies) == LATENCIES
+    assert resident_mb() - early[1] < 8

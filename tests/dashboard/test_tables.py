@@ -1,0 +1,71 @@
+"""Numbers and packets as HTML: nothing from outside is markup."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+from gr_ros2.dashboard.state import DashboardState
+from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_html, topics_html
+from gr_ros2.dashboard.views import Snapshot
+from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, at
+
+
+class Balanced(HTMLParser):
+    """Fails on a tag that is not closed in its turn; collects ``data-value`` by ``data-field``."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.values: dict[str, str | None] = {}
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open.append(tag)
+        found = dict(attrs)
+        if "data-field" in found:
+            self.values[str(found["data-field"])] = found.get("data-value")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def snapshot(name: str = "/robot_4/at") -> Snapshot:
+    state = DashboardState(REGISTRY, {**NAMES, (SRC, 0): name}, 64, name=name)
+    feed = Feed(state, packet_len=64, lost=lambda number: number == 4)
+    for step in range(20):
+        feed.submit(0, at(step, 0), step / 10)
+        feed.submit(1, bytes(200), step / 10)
+        feed.fly(step / 10)
+    state.packet_received(b"<b>", 2.0)
+    return state.tick(2.0, {(SRC, 0): 3})
+
+
+def test_what_is_written_is_well_formed_with_data_and_without() -> None:
+    for shown in (Snapshot(), snapshot(), snapshot("<script>alert(1)</script>&")):
+        for text in (tiles_html(shown, 3), tiles_html(shown, None), topics_html(shown), paths_html(shown)):
+            assert "<script" not in text
+            Balanced(text)
+        Balanced(packets_html(shown))
+
+
+def test_the_exact_value_stands_beside_the_rounded_one() -> None:
+    shown = snapshot()
+    tiles = Balanced(tiles_html(shown, 3)).values
+    assert tiles["sent"] == "40"
+    assert tiles["pdr"] == repr(shown.pdr)
+    assert tiles["backlog"] == "3"
+    assert Balanced(tiles_html(shown, None)).values["backlog"] is None
+    assert Balanced(topics_html(shown)).values["sent"] == "20"
+
+
+def test_a_packet_shows_its_fields_and_what_is_missing() -> None:
+    text = packets_html(snapshot())
+    assert "raw #" in text
+    assert "4 → all" in text
+    assert "length" in text
+
+
+def test_colours_repeat_and_strangers_are_grey() -> None:
+    assert colour(0) == colour(16)
+    assert colour(-1) not in {colour(place) for place in range(16)}

@@ -1,0 +1,87 @@
+"""What the whole-path tests share: DDS domains nobody uses, scenarios that use them, and the bag of a run."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.experiment.result import Result
+from gr_ros2.experiment.runner import DELIVERED_BAG
+from gr_ros2.experiment.scenario import Scenario, load_scenario
+from gr_ros2.middleware.bag_files import read_bag
+from tests.middleware.support import same
+
+DDS_PADDING = 3
+"""Zeros DDS may put behind a message."""
+COMMAND = (sys.executable, "-m", "gr_ros2.cli.main")
+HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
+needs_husky = pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording: {HUSKY} is missing")
+
+_DOMAINS = (*range(1, 100), *range(215, 231))
+"""Their ports lie below and above those the system hands out (32768 to 60999)."""
+
+
+def free_domains(count: int = 2) -> list[int]:
+    """DDS domains no process uses, other ones in each test process."""
+    start = os.getpid() * 37 % len(_DOMAINS)
+    found = (domain for domain in (*_DOMAINS[start:], *_DOMAINS[:start]) if _unused(domain))
+    return [next(found) for _ in range(count)]
+
+
+def _unused(domain: int) -> bool:
+    """Whether the unicast port of a domain's first participant is free."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", 7400 + 250 * domain + 10))
+        except OSError:
+            return False
+    return True
+
+
+def on_free_domains() -> list[str]:
+    """Overrides that put the ends of a link on two unused domains."""
+    sending, receiving = free_domains()
+    return [f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}"]
+
+
+def scenario(name: str | Path, *overrides: str, duration_s: float | None = None, seed: int | None = None) -> Scenario:
+    return load_scenario(name, [*on_free_domains(), *overrides], duration_s=duration_s, seed=seed)
+
+
+def set_options(overrides: Sequence[str]) -> list[str]:
+    """The same as arguments of the command."""
+    return [word for override in overrides for word in ("--set", override)]
+
+
+def check_books(result: Result) -> None:
+    """Every message is in exactly one row, and none is corrupt."""
+    for topic in result.topics:
+        assert sum(topic.ledger.values()) == topic.sent, topic
+        assert topic.ledger.get("delivered", 0) == topic.delivered
+        assert topic.corrupt == 0
+    assert result.packets["crc_failed"] == result.packets["malformed"] == 0
+
+
+def check_complete(result: Result) -> None:
+    """Everything sent was delivered, unaltered."""
+    check_books(result)
+    for topic in result.topics:
+        assert topic.sent > 0, topic.topic
+        assert topic.ledger == {"delivered": topic.sent}
+        assert topic.pdr == 1.0
+
+
+def delivered_bag(out: Path, topic: str) -> list[bytes]:
+    return [message.payload for message in read_bag(out / DELIVERED_BAG, [topic])]
+
+
+def check_identical(received: Sequence[bytes], sent: Sequence[bytes]) -> None:
+    """The same messages in the same order, up to the zeros DDS may add."""
+    assert len(received) == len(sent)
+    altered = [number for number, pair in enumerate(zip(received, sent, strict=True)) if not same(*pair, DDS_PADDING)]
+    assert altered == []

@@ -1,0 +1,90 @@
+"""`gr-ros2 demo` as a user has it, and subscribers in other processes as the only witnesses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from gnuradio import gr
+
+from gr_ros2.experiment.result import read_result
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.registry import Registry
+from tests.e2e.support import COMMAND, check_books, delivered_bag, free_domains, set_options
+from tests.middleware.support import LATCHED, Peer, message, same, wait_for
+
+PEER = Path(__file__).parents[1] / "middleware" / "dds_peer.py"
+ODOM, GRID = "nav_msgs/msg/Odometry", "nav_msgs/msg/OccupancyGrid"
+
+
+@contextmanager
+def subscriber(domain: int, topic: str, type_name: str) -> Iterator[Peer]:
+    """Another process on a graph; it adapts to what it finds there."""
+    command = [sys.executable, str(PEER), str(domain), topic, type_name, "sub", "adapt", "adapt", "1000"]
+    peer = Peer(command, {"ROS_LOCALHOST_ONLY": "1"})
+    try:
+        wait_for(lambda: peer.ready, "the subscriber's start")
+        yield peer
+    finally:
+        peer.close()
+
+
+def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path) -> None:
+    sending, receiving = free_domains()
+    out = tmp_path / "out"
+    options = set_options([f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}"])
+    with ExitStack() as stack:
+        arrived = stack.enter_context(subscriber(receiving, "/rx_robot_1/odom", ODOM))
+        not_sent_there = stack.enter_context(subscriber(sending, "/rx_robot_1/odom", ODOM))
+        not_leaked = stack.enter_context(subscriber(receiving, "/robot_1/odom", ODOM))
+        sent = stack.enter_context(subscriber(sending, "/robot_1/odom", ODOM))
+        done = subprocess.run(
+            [*COMMAND, "demo", "--duration", "4", "--out", str(out), *options], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        result = read_result(out)
+        odom = next(topic for topic in result.topics if topic.topic == "/robot_1/odom")
+        assert arrived.received
+        # The subscribers ran all along: what came out is what went in, and nowhere else.
+        assert all(any(same(got, one, 3) for one in sent.received) for got in arrived.received[5:])
+        assert not_sent_there.received == not_leaked.received == []
+    check_books(result)
+    assert {topic.topic for topic in result.topics} == {
+        f"/robot_1/{name}" for name in ("scan", "odom", "imu", "cmd_vel", "map", "clock")
+    }
+    assert all(topic.pdr == 1.0 for topic in result.topics), [(topic.topic, topic.ledger) for topic in result.topics]
+    assert len(delivered_bag(out, "/rx_robot_1/odom")) == odom.delivered
+    assert odom.path_error_m is not None
+    assert all((out / name).stat().st_size > 1000 for name in ("path.png", "latency.png"))
+    assert "/robot_1/odom" in done.stdout
+    assert "samples/s, chosen to carry 120%" in done.stdout
+    assert "PDR" in done.stdout
+
+
+def test_a_late_joiner_on_the_receiving_graph_gets_the_map() -> None:
+    sending, receiving = free_domains()
+    registry = Registry.from_rows({"map": GRID})
+    map_ = message(7, 5000)
+    with ExitStack() as stack:
+        robot = stack.enter_context(DdsMiddleware(domain_id=sending, node_name="robot", localhost_only=True))
+        there = stack.enter_context(DdsMiddleware(domain_id=sending, node_name="source", localhost_only=True))
+        here = stack.enter_context(DdsMiddleware(domain_id=receiving, node_name="sink", localhost_only=True))
+        robot.advertise("/robot_1/map", GRID, LATCHED).publish(map_)
+        # The source comes after the map was published, and the subscriber after it crossed the link.
+        source = RosSource(registry, middleware=there, namespace="/robot_1")
+        stack.callback(source.close)
+        sink = RosSink(registry, middleware=here)
+        stack.callback(sink.close)
+        graph = gr.top_block()
+        graph.msg_connect(source, "pdus", sink, "pdus")
+        graph.start()
+        stack.callback(graph.wait)
+        stack.callback(graph.stop)
+        wait_for(lambda: sink.stats()["topics"], "the map at the sink")
+        with subscriber(receiving, "/rx_robot_1/map", GRID) as late:
+            wait_for(lambda: late.received, "the map at the late joiner")
+            assert same(late.received[0], map_, 3)

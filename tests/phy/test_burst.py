@@ -1,0 +1,113 @@
+"""Burst modems without GNU Radio's scheduler: any cut of the samples, offsets of carrier, timing and clock, damage."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import numpy as np
+
+from gr_ros2.phy import PHY
+from gr_ros2.phy.burst import BurstReceiver, Frame, whitening
+from gr_ros2.phy.lora import code_words, nearest_nibbles
+
+NAMES = ("gfsk", "psk", "lora")
+
+
+def bursts(phy: Any, count: int, seed: int = 0) -> tuple[list[bytes], np.ndarray]:
+    source = random.Random(seed)
+    packets = [source.randbytes(phy.packet_len) for _ in range(count)]
+    parts = [np.zeros(400)]
+    for packet in packets:
+        parts += [phy.modem.modulate(packet), np.zeros(phy.gap)]
+    return packets, np.concatenate([*parts, np.zeros(400)])
+
+
+def received(phy: Any, samples: np.ndarray, cut: int = 4096) -> list[bytes]:
+    if phy.receiver_taps is not None:
+        samples = np.convolve(samples, phy.receiver_taps)
+    samples = samples.astype(np.complex64)
+    engine = BurstReceiver(phy.modem)
+    return [packet for at in range(0, len(samples), cut) for packet in engine.feed(samples[at : at + cut])]
+
+
+def noise(count: int, snr_db: float, seed: int = 0) -> np.ndarray:
+    draw = np.random.default_rng(seed)
+    scale = np.sqrt(10 ** (-snr_db / 10) / 2)
+    return np.asarray(scale * (draw.standard_normal(count) + 1j * draw.standard_normal(count)))
+
+
+def delayed(samples: np.ndarray, delay: float) -> np.ndarray:
+    size = 1 << (len(samples) + 64).bit_length()
+    spectrum = np.fft.fft(samples, size) * np.exp(-2j * np.pi * np.fft.fftfreq(size) * delay)
+    return np.asarray(np.fft.ifft(spectrum)[: len(samples)])
+
+
+def test_a_frame_is_whitened_and_checked() -> None:
+    frame = Frame(20)
+    wrapped = frame.wrap(bytes(20))
+    assert wrapped.tobytes() == (np.frombuffer(bytes(20) + zlib.crc32(bytes(20)).to_bytes(4, "little"), np.uint8)
+                                 ^ whitening(24)).tobytes()  # fmt: skip
+    assert frame.unwrap(wrapped) == bytes(20)
+    for bit in range(8 * 24):
+        damaged = wrapped.copy()
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert frame.unwrap(damaged) is None
+
+
+def test_whitening_is_pn9() -> None:
+    # The first bytes as in data sheets of the CC1101 and of SX127x, whose bit order in a byte is the other way round.
+    assert [int(f"{byte:08b}"[::-1], 2) for byte in whitening(5)] == [0xFF, 0xE1, 0x1D, 0x9A, 0xED]
+
+
+@pytest.mark.parametrize("cut", [1000, 4096, 65536, 1_000_000])
+@pytest.mark.parametrize("name", NAMES)
+def test_it_does_not_matter_where_the_stream_is_cut(name: str, cut: int) -> None:
+    phy = PHY.load(name)(64, 1e6)
+    packets, samples = bursts(phy, 12)
+    assert received(phy, samples, cut) == packets
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("delay", [0.0, 0.25, 0.5, 0.75])
+def test_bursts_between_samples_with_a_carrier_offset(name: str, delay: float) -> None:
+    phy = PHY.load(name)(64, 1e6)
+    packets, samples = bursts(phy, 10)
+    turned = delayed(samples, delay) * np.exp(2j * np.pi * 0.0125 * np.arange(len(samples)))
+    assert received(phy, turned + noise(len(samples), 10)) == packets
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_damaged_burst_is_counted_and_hides_nothing(name: str) -> None:
+    phy = PHY.load(name)(64, 1e6)
+    packets, samples = bursts(phy, 4)
+    start = 400 + phy.airtime_samples()
+    samples[start + phy.airtime_samples() * 2 // 3 : start + phy.airtime_samples() * 5 // 6] *= -1j
+    filtered = samples if phy.receiver_taps is None else np.convolve(samples, phy.receiver_taps)
+    engine = BurstReceiver(phy.modem)
+    if name == "lora":  # its chirps do not mind a turn
+        filtered[start + 15 * 128 : start + 60 * 128] = 0
+    assert engine.feed(filtered.astype(np.complex64)) == [packets[0], *packets[2:]]
+    assert engine.damaged >= 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_noise_alone_makes_no_packet(name: str) -> None:
+    phy = PHY.load(name)(64, 1e6)
+    assert received(phy, noise(200_000, 0.0)) == []
+
+
+def test_the_hamming_codes_are_as_far_apart_as_they_say() -> None:
+    for check_bits, distance in ((1, 2), (2, 2), (3, 3), (4, 4)):
+        words = code_words(check_bits).tolist()
+        assert min((a ^ b).bit_count() for a in words for b in words if a != b) == distance
+        table = nearest_nibbles(check_bits)
+        assert table[words].tolist() == list(range(16))
+        if distance >= 3:
+            for nibble, word in enumerate(words):
+                assert {int(table[word ^ 1 << bit]) for bit in range(4 + check_bits)} == {nibble}

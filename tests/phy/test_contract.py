@@ -1,0 +1,150 @@
+"""What every PHY with samples promises, run over every row of the table and the settings that change its samples."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import numpy as np
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.errors import ConfigError
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.measure import deliver, pdr, record
+from gr_ros2.phy.theory import half_point
+from tests.gr.probe import Probe, wait_for
+
+WITH_SAMPLES = [name for name in PHY if PHY.load(name).has_samples]
+SETTINGS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in WITH_SAMPLES),
+    *(("ofdm", {"payload_modulation": name}) for name in ("qpsk", "8psk", "16qam", "64qam")),
+    ("ofdm", {"fft_len": 256, "scramble": True}),
+    ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "64qam"}),
+    ("ofdm", {"detection_threshold": "stock", "gap": 112}),
+    ("gfsk", {"sps": 2, "bt": 0.3, "gap": 16}),
+    ("gfsk", {"sps": 8, "bt": 1.0}),
+    ("psk", {"modulation": "bpsk", "sps": 2, "gap": 16}),
+    ("psk", {"modulation": "8psk", "rolloff": 0.2}),
+    ("psk", {"modulation": "qpsk", "sps": 8, "rolloff": 1.0}),
+    ("lora", {"coding_rate": 1, "gap": 16}),
+    ("lora", {"spreading_factor": 9, "coding_rate": 3}),
+]
+LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
+IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
+IN_NOISE = [("ofdm", {}), ("gfsk", {}), ("psk", {}), ("psk", {"modulation": "bpsk"}), ("psk", {"modulation": "8psk"})]
+IN_NOISE += [("lora", {"coding_rate": 4})]
+
+
+def make(name: str, options: dict[str, Any], packet_len: int = 64) -> Phy:
+    phy: Phy = PHY.load(name)(packet_len, 1e6, **options)
+    return phy
+
+
+@pytest.mark.parametrize("packet_len", LENGTHS)
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_nothing_is_lost_back_to_back_and_the_air_is_as_long_and_strong_as_claimed(
+    name: str, options: dict[str, Any], packet_len: int
+) -> None:
+    phy = make(name, options, packet_len)
+    count = 2 if phy.airtime_samples() > 300_000 else 5 if packet_len > 1000 else 20
+    recording = record(phy, count)
+    samples = recording.samples
+    assert len(samples) == count * phy.airtime_samples()
+    power = np.mean(np.abs(samples) ** 2) * phy.airtime_samples() / (phy.airtime_samples() - phy.gap)  # type: ignore[attr-defined]
+    assert power == pytest.approx(phy.burst_power(), rel=0.09 if packet_len < 1000 else 0.04)
+    assert np.all(samples.reshape(count, -1)[:, -phy.gap :] == 0)  # type: ignore[attr-defined]
+    assert deliver(phy, recording, ChannelConfig()) == recording.packets
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_a_single_packet_comes_out_by_itself(name: str, options: dict[str, Any]) -> None:
+    source, sink = Probe(), Probe()
+    draw = random.Random(1)
+    with LoopbackLink(make(name, options), source, sink, pace="flow") as link:
+        for number in range(1, 6):
+            source.post(draw.randbytes(64))
+            wait_for(lambda number=number: sink.handled == number, "the packet just sent")
+        assert link.counts().transmitted == 5
+
+
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_all_zeros_and_all_ones_pass(name: str) -> None:
+    source, sink = Probe(), Probe()
+    sent = [bytes(64), b"\xff" * 64] * 5
+    with LoopbackLink(make(name, {}), source, sink, pace="flow"):
+        for packet in sent:
+            source.post(packet)
+        wait_for(lambda: sink.handled == len(sent), "every packet")
+    assert sink.packets == sent
+
+
+@pytest.mark.parametrize("frequency_offset", [0.0, 0.0025, -0.005])
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_at_20_db_nothing_is_lost_at_default_settings(name: str, frequency_offset: float) -> None:
+    phy = make(name, {})
+    recording = record(phy, 200 if name != "lora" else 60)
+    channel = ChannelConfig(snr_db=20, frequency_offset=frequency_offset, epsilon=1.00001, seed=1)
+    assert deliver(phy, recording, channel) == recording.packets
+
+
+@pytest.mark.parametrize(("name", "options"), IN_NOISE, ids=str)
+def test_half_of_the_packets_arrive_within_2_db_of_the_computed_point(name: str, options: dict[str, Any]) -> None:
+    phy = make(name, options)
+    recording = record(phy, 200 if name != "lora" else 80)
+    middle = half_point(phy.computed_pdr)
+    assert pdr(phy, recording, ChannelConfig(snr_db=middle + 2, seed=2)) > 0.5
+    assert pdr(phy, recording, ChannelConfig(snr_db=middle - 2, seed=2)) < 0.5
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_the_computed_share_rises_with_snr(name: str, options: dict[str, Any]) -> None:
+    phy = make(name, options)
+    shares = [phy.computed_pdr(snr_db) for snr_db in range(-40, 41, 2)]
+    assert shares == sorted(shares)
+    assert shares[0] == pytest.approx(0, abs=1e-3)
+    assert shares[-1] == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "named"),
+    [
+        ("gfsk", {"sps": 1}, "sps = 1"),
+        ("gfsk", {"bt": 0.1}, "bt = 0.1"),
+        ("gfsk", {"gap": 0}, "gap = 0"),
+        ("psk", {"modulation": "qam"}, "modulation = 'qam'"),
+        ("psk", {"rolloff": 0}, "rolloff = 0"),
+        ("psk", {"colour": 1}, "unknown key colour"),
+        ("lora", {"spreading_factor": 13}, "spreading_factor = 13"),
+        ("lora", {"coding_rate": 0}, "coding_rate = 0"),
+        ("ofdm", {"fft_len": 63}, "fft_len = 63"),
+        ("ofdm", {"cp_len": 33}, "cp_len = 33"),
+        ("ofdm", {"gap": 111}, "gap = 111"),
+        ("ofdm", {"detection_threshold": 0.4}, "detection_threshold"),
+        ("ofdm", {"detection_threshold": "best"}, "detection_threshold"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(name: str, options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        make(name, options)
+
+
+def test_a_lora_burst_that_takes_too_much_memory_is_refused_with_a_remedy() -> None:
+    with pytest.raises(ConfigError, match="packet_len = 4095 with spreading_factor = 12"):
+        make("lora", {"spreading_factor": 12}, 4095)
+
+
+@pytest.mark.parametrize("name", ["gfsk", "psk", "lora"])
+def test_a_pdu_that_is_no_packet_is_counted_and_not_sent(name: str) -> None:
+    source, sink = Probe(), Probe()
+    link = LoopbackLink(make(name, {}), source, sink, pace="flow")
+    with link:
+        source.post(bytes(63))
+        source.post(bytes(64))
+        wait_for(lambda: sink.handled == 1, "the right one")
+        assert link.counts().transmitted == 1
+        assert link._transmitter.refused == 1

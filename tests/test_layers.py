@@ -1,0 +1,186 @@
+"""The architecture, read from the sources: who may import whom, and what library code never does."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import gr_ros2
+
+ROOT = Path(gr_ros2.__file__).resolve().parent
+MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
+
+LAYERS = (
+    {"errors"},
+    {"config", "backends"},
+    {"registry"},
+    {"wire"},
+    {"link"},
+    {"middleware", "compression"},
+    {"phy", "sim", "grc_path"},
+    {"gr"},
+    {"experiment"},
+    {"dashboard"},
+    {"cli"},
+    {"ros"},
+)
+"""From the bottom up. A part imports itself and what lies below it, not its neighbours."""
+
+MAY_PRINT = {"cli", "ros"}
+
+PURE = {"wire", "link"}
+PURE_CODECS = {"backports"}
+"""Small pure codecs these may import beside the standard library."""
+
+CONFINED = {
+    "gnuradio": ("gr/", "phy/"),
+    "pmt": ("gr/", "phy/"),
+    "rclpy": ("middleware/rclpy.py", "ros/"),
+    "cyclonedds": ("middleware/cdr_dds.py", "middleware/dds"),
+}
+BLOCKED = tuple(CONFINED)
+WITHOUT_BACKENDS = (
+    "gr_ros2",
+    "gr_ros2.wire",
+    "gr_ros2.link",
+    "gr_ros2.registry",
+    "gr_ros2.config",
+    "gr_ros2.compression",
+    "gr_ros2.middleware",
+    "gr_ros2.middleware.memory",
+    "gr_ros2.middleware.bag",
+    "gr_ros2.phy",
+    "gr_ros2.sim",
+    "gr_ros2.experiment.ledger",
+    "gr_ros2.experiment.metrics",
+    "gr_ros2.experiment.result",
+    "gr_ros2.experiment.scenario",
+    "gr_ros2.cli.main",
+)
+MAX_LINES = 500
+
+_GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}
+"""What makes a generator of one's own; anything else of ``random`` and ``numpy.random`` is the global one."""
+_STATE = {"get_state", "set_state"}
+"""Put back what GNU Radio's stock blocks do to the global generator; draw nothing."""
+
+
+def part(module: str) -> str:
+    """``link`` of ``link/sender.py``, ``config`` of ``config.py``."""
+    return module.split("/", maxsplit=1)[0].removesuffix(".py")
+
+
+def imports(tree: ast.Module) -> Iterator[str]:
+    """Dotted names of everything imported anywhere in a module, in functions too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "imports are absolute"
+            assert node.module is not None
+            # `from gr_ros2 import errors` names a part too.
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def level(name: str) -> int:
+    found = [number for number, layer in enumerate(LAYERS) if name in layer]
+    assert found, f"gr_ros2.{name} stands in no layer; add it to LAYERS"
+    return found[0]
+
+
+def dotted(node: ast.expr) -> str:
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else "?"
+
+
+def calls_and_uses(tree: ast.Module) -> Iterator[str]:
+    """Dotted names as they stand in the source: ``sys.exit``, ``print``, ``np.random.rand``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            yield dotted(node)
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            yield node.func.id
+
+
+def ours(module: str) -> list[str]:
+    """The parts of gr_ros2 that a module imports."""
+    names = [name.split(".") for name in imports(MODULES[module])]
+    return [name[1] for name in names if name[0] == "gr_ros2" and len(name) > 1 and name[1] != "__version__"]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_arrows_point_down_only(module: str) -> None:
+    own = part(module)
+    if own == "__init__":
+        assert ours(module) == []
+        return
+    up = [name for name in ours(module) if name != own and level(name) >= level(own)]
+    assert up == []
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if part(module) in PURE])
+def test_wire_and_link_are_pure(module: str) -> None:
+    outside = {name.split(".")[0] for name in imports(MODULES[module])} - {"gr_ros2"}
+    assert outside - set(sys.stdlib_module_names) <= PURE_CODECS
+    assert not outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
+
+
+@pytest.mark.parametrize("package", CONFINED)
+def test_back_end_packages_are_imported_in_their_adapters_only(package: str) -> None:
+    users = [module for module, tree in MODULES.items() if package in {name.split(".")[0] for name in imports(tree)}]
+    assert users, f"nothing imports {package}"
+    assert [module for module in users if not module.startswith(CONFINED[package])] == []
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if part(module) not in MAY_PRINT])
+def test_library_code_never_prints_asks_exits_or_reads_argv(module: str) -> None:
+    forbidden = {"print", "input", "exit", "quit", "breakpoint", "sys.exit", "sys.argv", "os._exit"}
+    assert forbidden & set(calls_and_uses(MODULES[module])) == set()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_draws_from_a_global_generator(module: str) -> None:
+    uses = [use.split(".") for use in calls_and_uses(MODULES[module])]
+    drawn = [use for use in uses if use[0] == "random" or use[:2] in (["np", "random"], ["numpy", "random"])]
+    names = {use[-1] for use in drawn} - {"random"}
+    assert names <= _GENERATORS | _STATE
+    from_random = {name for name in imports(MODULES[module]) if name.startswith(("random.", "numpy.random."))}
+    assert {name.rsplit(".", 1)[1] for name in from_random} <= _GENERATORS
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_modules_are_short(module: str) -> None:
+    assert len((ROOT / module).read_text("utf-8").splitlines()) < MAX_LINES
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_module_says_what_it_is(module: str) -> None:
+    tree = MODULES[module]
+    assert not tree.body or ast.get_docstring(tree)
+
+
+def test_everything_but_the_adapters_imports_without_any_back_end() -> None:
+    wanted = [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/")).with_suffix(".py").exists()]
+    wanted += [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/") / "__init__.py").exists()]
+    wanted += [f"gr_ros2.{m.removesuffix('.py').replace('/', '.')}" for m in MODULES if part(m) in PURE]
+    code = f"""
+import sys
+from importlib import import_module
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {BLOCKED!r}:
+            raise ImportError(f"{{name}} is blocked")
+
+sys.meta_path.insert(0, Blocked())
+for name in {wanted!r}:
+    import_module(name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
