@@ -184,10 +184,8 @@ class TopicReassembler:
     def _overtaken(self, context: Context) -> Iterator[Partial]:
         newest = self._newest
         assert newest is not None
-        if context.steady:
-            patience = max(self._pace.duration(_PATIENT), _STALL_S)
-        else:
-            patience = self._pace.duration(OVERTAKEN)
+        waited = self._pace.duration(_PATIENT if context.steady else OVERTAKEN)
+        patience = max(waited, _STALL_S) if context.steady else waited
         for entry_id, partial in list(self.partials.items()):
             if newest - partial.number >= OVERTAKEN or context.now - partial.last > patience:
                 yield self.partials.pop(entry_id)

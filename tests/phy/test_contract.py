@@ -36,7 +36,13 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
 ]
 LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
 IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
-IN_NOISE = [("ofdm", {}), ("gfsk", {}), ("psk", {}), ("psk", {"modulation": "bpsk"}), ("psk", {"modulation": "8psk"})]
+IN_NOISE = [
+    ("ofdm", {"detection_threshold": 0.6}),
+    ("gfsk", {}),
+    ("psk", {}),
+    ("psk", {"modulation": "bpsk"}),
+    ("psk", {"modulation": "8psk"}),
+]
 IN_NOISE += [("lora", {"coding_rate": 4})]
 
 
