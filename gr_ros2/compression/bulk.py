@@ -1,8 +1,6 @@
 """Long arrays made easy for zstd: bytes of like significance side by side, differences, decimals.
 
-Each array says how it was turned: _Whole = npt.NDArray[Any]
-
-PLAIN, PLANES (byte 0 of all elements, then byte 1, ...), DELTAS (differences of
+Each array says how it was turned: PLAIN, PLANES (byte 0 of all elements, then byte 1, ...), DELTAS (differences of
 neighbouring elements, modulo their width, folded and as planes), DECIMALS (float32 that are n / 10**k: 5 + the folded
 differences of the n, as planes; 0..4 stand for infinities and the like).
 
@@ -59,7 +57,9 @@ def turn_back(way: int, parameter: int, data: bytes, size: int) -> bytes:
     """
     if way == PLAIN:
         return data
-    if size == 1 or len(data) % size or way > DECIMALS or (way < DECIMALS and parameter != size):
+    # DECIMALS are of float32 and have their own parameter; the others repeat the size.
+    fits = size == 4 if way == DECIMALS else parameter == size and way < DECIMALS
+    if size == 1 or len(data) % size or not fits:
         raise ValueError(f"way {way} with {parameter} for {len(data)} bytes of elements of {size}")
     data = _from_planes(data, size)
     if way == PLANES:
