@@ -76,12 +76,13 @@ def _run(
 
         outcome = runner.run_scenario(scenario, out, advance, onlookers)
     _print(console, scenario, outcome)
+    kept = f"result.json, bag {runner.DELIVERED_BAG}/, the tables messages and packets"
+    if outcome.result.interrupted:
+        # Who pressed Ctrl-C wants the prompt back, not a second of drawing.
+        console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
+        return
     written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]
-    console.print(
-        f"\nWritten to {out}: {written[0]}, result.json, bag {runner.DELIVERED_BAG}/, the tables messages and packets, "
-        f"{', '.join(written[1:])}",
-        soft_wrap=True,
-    )
+    console.print(f"\nWritten to {out}: {written[0]}, {kept}, {', '.join(written[1:])}", soft_wrap=True)
 
 
 def _bar(console: Console) -> Progress:
