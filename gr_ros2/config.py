@@ -259,6 +259,15 @@ def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
         raise ConfigError("; ".join(_explain(cls, item, where) for item in error.errors())) from error
 
 
+def replaced(config: _T, **changes: Any) -> _T:
+    """A configuration with some settings changed, validated again.
+
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
+    return build(type(config), {**current, **changes})
+
+
 def _explain(cls: type[Any], item: Any, where: str) -> str:
     prefix = f"{where}: " if where else ""
     key = ".".join(str(part) for part in item["loc"])

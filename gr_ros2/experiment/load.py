@@ -5,8 +5,6 @@ Law: the offered load counts every message as if it travelled alone, so it is ne
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.scenario import Scenario
 from gr_ros2.link.fragment import largest_message
@@ -63,7 +61,7 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     packets = 0.0
     for topic, size in sizes.items():
         rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
-        packets += _fragments([size], scenario.packet_len) * (rate or 1 / scenario.duration_s)
+        packets += _packets_alone(size, scenario.packet_len) * (rate or 1 / scenario.duration_s)
     return packets, 1.0
 
 
@@ -71,7 +69,7 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
     packets, first, last = 0, 0, 0
     for message in read_bag(scenario.bag_path, source_names(scenario, registry)):
-        packets += _fragments([len(message.payload)], scenario.packet_len)
+        packets += _packets_alone(len(message.payload), scenario.packet_len)
         first = first or message.stamp_ns
         last = message.stamp_ns
         if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
@@ -80,7 +78,6 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     return packets, seconds or 1.0
 
 
-def _fragments(sizes: Iterable[int], packet_len: int) -> int:
-    """Packets that messages of these sizes need alone; those too large for the link need none."""
-    payload = single_entry_payload(packet_len)
-    return sum(max(-(-size // payload), 1) for size in sizes if size <= largest_message(packet_len))
+def _packets_alone(size: int, packet_len: int) -> int:
+    """Packets that a message of this size needs alone; one too large for the link needs none."""
+    return max(-(-size // single_entry_payload(packet_len)), 1) if size <= largest_message(packet_len) else 0

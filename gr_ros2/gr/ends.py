@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
 from typing import Any, TypeVar
 
 from gr_ros2.config import SinkConfig, SourceConfig, build
@@ -36,15 +35,6 @@ def settings(
     if middleware is not None:
         named["middleware"] = middleware if isinstance(middleware, str) else middleware.name
     return build(cls, named)
-
-
-def replaced(config: _T, **changes: Any) -> _T:
-    """A configuration with some settings changed, validated again.
-
-    :raises ConfigError: naming key, value and what is allowed
-    """
-    current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
-    return build(type(config), {**current, **changes})
 
 
 def read_registry(registry: str | Registry) -> Registry:

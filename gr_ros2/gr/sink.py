@@ -16,9 +16,9 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig
+from gr_ros2.config import SinkConfig, replaced
 from gr_ros2.errors import GrRos2Error, MiddlewareError
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.latency import CLOCK_TYPE, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import PDUS, packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes

@@ -19,9 +19,9 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
-from gr_ros2.config import SourceConfig
+from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, replaced, settings
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Refused, Sender, SenderEvent

@@ -11,11 +11,11 @@ from __future__ import annotations
 import random
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
-from gr_ros2.config import SourceConfig, build
+from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
@@ -194,8 +194,7 @@ class Sender:
         for name in settings:
             if name not in LIVE_SETTINGS:
                 raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
-        current = {item.name: getattr(self.config, item.name) for item in fields(SourceConfig)}
-        self.config = build(SourceConfig, {**current, **settings})
+        self.config = replaced(self.config, **settings)
         self._scheduler.config = self.config
         self._plan_until = -inf
         if "packet_rate" in settings:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.gr.ends import Graph, check_loop, read_registry, replaced, settings
+from gr_ros2.gr.ends import Graph, check_loop, read_registry, settings
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 
