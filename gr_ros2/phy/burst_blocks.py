@@ -18,7 +18,7 @@ from gnuradio import filter, gr, pdu
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.ofdm_wiring import only_warnings
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import BlockThread, keep_messages
 
 _PDUS = pmt.intern("pdus")
 _TX_KEY = "gr_ros2_tx_len"
@@ -62,6 +62,7 @@ class BurstTransmitter(gr.hier_block2):  # type: ignore[misc]
 
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(f"gr_ros2_{phy.name}_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, _SAMPLE_LEN))
+        keep_messages()
         self.message_port_register_hier_in("pdus")
         self._airtime_samples = phy.airtime_samples()
         self._modulator = _Modulator(phy)

@@ -26,6 +26,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.ofdm_wiring import BITS, Layout, OfdmDemodulator, OfdmModulator, only_warnings, point_power
 from gr_ros2.phy.tap import Tap
+from gr_ros2.phy.threads import keep_messages
 from gr_ros2.phy.theory import packet_success, psk_symbol_error, qam_symbol_error
 
 HEAD_SYMBOLS = 3
@@ -189,6 +190,7 @@ class OfdmTransmitter(gr.hier_block2):  # type: ignore[misc]
 
     def __init__(self, phy: OfdmPhy) -> None:
         super().__init__("gr_ros2_ofdm_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, gr.sizeof_gr_complex))
+        keep_messages()
         self.message_port_register_hier_in("pdus")
         self._airtime_samples = phy.airtime_samples()
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)

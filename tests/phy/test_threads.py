@@ -1,0 +1,69 @@
+"""GNU Radio's message ports keep every message, once a transmitter of ours has been made."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pmt
+import pytest
+from gnuradio import gr, pdu
+
+from gr_ros2.phy.ofdm import OfdmPhy
+from gr_ros2.phy.psk import PskPhy
+from gr_ros2.phy.threads import keep_messages
+
+OVER_GNU_RADIOS_LIMIT = 8192 + 2500  # of which 1024 find room behind the port
+LIMIT_S = 60.0
+
+
+class HeldSink(gr.sync_block):  # type: ignore[misc]
+    """Takes nothing until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__("held_sink", [np.uint8], None)
+        self.go = threading.Event()
+        self.taken = 0
+
+    def work(self, input_items: list[Any], output_items: list[Any]) -> int:  # noqa: ARG002
+        self.go.wait(LIMIT_S)
+        self.taken += len(input_items[0])
+        return len(input_items[0])
+
+
+def test_a_port_without_a_handler_keeps_all_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GR_CONF_DEFAULT_MAX_MESSAGES", raising=False)
+    keep_messages()
+    length = 64
+    flowgraph = gr.top_block()
+    to_stream, sink = pdu.pdu_to_tagged_stream(gr.types.byte_t, "length"), HeldSink()
+    flowgraph.connect(to_stream, sink)
+    flowgraph.start()
+    try:
+        message = pmt.cons(pmt.PMT_NIL, pmt.init_u8vector(length, [0] * length))
+        for _ in range(OVER_GNU_RADIOS_LIMIT):
+            to_stream.to_basic_block()._post(pmt.intern("pdus"), message)
+        sink.go.set()
+        deadline = time.monotonic() + LIMIT_S
+        while sink.taken < OVER_GNU_RADIOS_LIMIT * length and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert sink.taken == OVER_GNU_RADIOS_LIMIT * length
+    finally:
+        sink.go.set()
+        flowgraph.stop()
+        flowgraph.wait()
+
+
+@pytest.mark.parametrize("phy", [OfdmPhy(packet_len=64, sample_rate=1e5), PskPhy(packet_len=64, sample_rate=1e5)])
+def test_every_transmitter_asks_for_it(phy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GR_CONF_DEFAULT_MAX_MESSAGES", raising=False)
+    phy.transmitter().disconnect_all()
+    assert gr.prefs().get_long("DEFAULT", "max_messages", 100) == -1
+
+
+def test_a_setting_of_the_users_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GR_CONF_DEFAULT_MAX_MESSAGES", "77")
+    keep_messages()
+    assert gr.prefs().get_long("DEFAULT", "max_messages", 100) == 77
