@@ -26,8 +26,8 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.ofdm_wiring import BITS, Layout, OfdmDemodulator, OfdmModulator, only_warnings, point_power
 from gr_ros2.phy.tap import Tap
-from gr_ros2.phy.threads import keep_messages
 from gr_ros2.phy.theory import packet_success, psk_symbol_error, qam_symbol_error
+from gr_ros2.phy.threads import keep_messages
 
 HEAD_SYMBOLS = 3
 """Two sync words and one header symbol."""
