@@ -1,12 +1,19 @@
 """Package metadata; it stands here and not in pyproject.toml because colcon reads it from here."""
 
+from pathlib import Path
+
 from setuptools import find_packages, setup
+
+
+def files(pattern: str) -> list[str]:
+    return [str(path) for path in sorted(Path().glob(pattern))]
+
 
 setup(
     name="gr-ros2",
     version="0.1.0",
     description="Native ROS 2 topics over any GNU Radio physical layer, without IP",
-    long_description=open("README.md", encoding="utf-8").read(),
+    long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="GPL-3.0-or-later",
     python_requires=">=3.10",
@@ -15,13 +22,25 @@ setup(
         "gr_ros2": [
             "py.typed",
             "grc/*.yml",
+            "wireshark/*",
             "examples/*",
             "scenarios/*",
+            "sweeps/*",
+            "losses/*",
             "experiment/templates/*",
             "dashboard/templates/*",
             "compression/dictionaries/*",
         ]
     },
+    # What a ROS 2 workspace looks for; GRC finds the blocks in share by the hook of colcon.pkg.
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/gr_ros2"]),
+        ("share/gr_ros2", ["package.xml"]),
+        ("share/gr_ros2/launch", files("launch/*.py")),
+        ("share/gr_ros2/grc", files("gr_ros2/grc/*.yml")),
+        ("share/gr_ros2/hook", files("resource/hook/*")),
+        ("lib/gr_ros2", ["resource/link"]),
+    ],
     install_requires=[
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
@@ -36,7 +55,11 @@ setup(
         "rich>=14",
         "rosbags>=0.11,<0.12",
     ],
-    extras_require={"dashboard": ["bokeh>=3.8,<4"]},
+    extras_require={
+        "dashboard": ["bokeh>=3.8,<4"],
+        "sweep": ["distributed>=2024.8"],
+        "zenoh": ["eclipse-zenoh>=1.10,<2"],
+    },
     entry_points={"console_scripts": ["gr-ros2 = gr_ros2.cli.main:main"]},
     classifiers=[
         "License :: OSI Approved :: GNU General Public License v3 or later (GPLv3+)",

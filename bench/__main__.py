@@ -17,8 +17,12 @@ BENCHMARKS = {
     "fast": "bench.runs",
     "ofdm": "bench.runs",
     "husky": "bench.runs",
+    "links": "bench.links",
+    "drive": "bench.phys",
+    "beside": "bench.phys",
     "stop": "bench.stop",
     "compression": "bench.compression",
+    "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
@@ -30,6 +30,7 @@ PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
 RobotId = Annotated[int, Field(ge=-1, le=254)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
+Probability = Annotated[float, Field(ge=0, le=1)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
 
@@ -45,8 +46,10 @@ class TopicOptions:
     :param queue_depth: messages waiting at the source, 0 unbounded, None takes the source's ``queue_depth``
     :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
-        ``queue_depth``), deadline (fifo, and stale after ``deadline_ms``); None: latest where ``depth`` is 1, else fifo
-    :param deadline_ms: ms after submission until which a message must be across, or it is dropped; 0 none
+        ``queue_depth``), deadline (fifo, and stale after ``deadline_ms``); None follows ``depth`` and the
+        publishers' QoS (docs/scheduling.md)
+    :param deadline_ms: ms after submission until which a message must be across, or it is dropped; 0 none, or without
+        ``queue`` the publishers' lifespan
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/compression.md)
@@ -71,11 +74,6 @@ class TopicOptions:
         if self.queue == "deadline" and not self.deadline_ms:
             raise ValueError("queue = 'deadline': deadline_ms is missing; set it above 0")
         return self
-
-    @property
-    def queue_policy(self) -> QueuePolicy:
-        """``queue``, or what the depth asks for: a KeepLast depth of 1 says that only the newest message matters."""
-        return self.queue or ("latest" if self.depth == 1 else "fifo")
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -175,6 +173,9 @@ class SinkConfig:
     :param dictionaries: files of dictionaries of your own, the same at both ends
     :param topic_options: per topic name, over the registry's columns
     :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
+    :param frame_prefix: before every frame name of a message, ``{src_id}`` is the sender; '' leaves messages as sent
+    :param merge_tf: topic on which the transforms of all senders come out too, and their static ones, latched, on this
+        + ``_static``; needs ``frame_prefix``; '' off
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
     :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
     :param debug: readable log of headers, topic ids and entries
@@ -193,39 +194,111 @@ class SinkConfig:
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     use_sim_time: bool = False
+    frame_prefix: str = ""
+    merge_tf: str = ""
     middleware: str = "dds"
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 
     @model_validator(mode="after")
     def _formats(self) -> SinkConfig:
-        try:
-            self.namespace_format.format(src_id=0)
-        except (KeyError, IndexError, ValueError) as error:
+        for key in ("namespace_format", "frame_prefix"):
+            try:
+                getattr(self, key).format(src_id=0)
+            except (KeyError, IndexError, ValueError) as error:
+                raise ValueError(f"{key} = {getattr(self, key)!r}: only {{src_id}} may stand in braces") from error
+        if self.merge_tf and not self.frame_prefix:
             raise ValueError(
-                f"namespace_format = {self.namespace_format!r}: only {{src_id}} may stand in braces"
-            ) from error
+                f"merge_tf = {self.merge_tf!r}: frames of several robots would be mixed up; set frame_prefix, "
+                "for instance to 'robot_{src_id}/'"
+            )
         return self
+
+    @property
+    def merged_topics(self) -> tuple[str, ...]:
+        """The topics of ``merge_tf``: moving and static transforms; () where it is off."""
+        return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
+
+
+@dataclass(frozen=True, config=_STRICT)
+class BurstLoss:
+    """Losses that come in bursts: the two-state model of Gilbert and Elliott, one step per packet.
+
+    The mean share of lost packets and the mean length of a stay in the bad state are :attr:`mean_loss` and
+    ``1 / p_bad_to_good`` packets.
+
+    :param p_good_to_bad: probability that the packet after one in the good state finds the bad one, 0..1
+    :param p_bad_to_good: the other way round, above 0..1
+    :param loss_good: probability that a packet is lost in the good state, 0..1
+    :param loss_bad: the same in the bad state, 0..1
+    """
+
+    p_good_to_bad: Probability
+    p_bad_to_good: Annotated[float, Field(gt=0, le=1)]
+    loss_good: Probability = 0.0
+    loss_bad: Probability = 1.0
+
+    @property
+    def share_bad(self) -> float:
+        """Long-run share of packets that find the bad state, 0..1."""
+        return self.p_good_to_bad / (self.p_good_to_bad + self.p_bad_to_good)
+
+    @property
+    def mean_loss(self) -> float:
+        """Long-run share of packets that are lost, 0..1."""
+        return self.share_bad * self.loss_bad + (1 - self.share_bad) * self.loss_good
 
 
 @dataclass(frozen=True, config=_STRICT)
 class ChannelConfig:
-    """The simulated channel between transmitter and receiver (GNU Radio's channel model, plus packet loss).
+    """The simulated channel between transmitter and receiver (docs/channels.md).
 
-    :param snr_db: mean burst power over noise power in the sampled band, dB; None = no noise
+    ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
+    act on packets, whatever the PHY.
+
+    :param snr_db: mean burst power over noise power in the sampled band, dB, -50..100; None = no noise
     :param frequency_offset: carrier frequency offset, fraction of the sample rate, -0.5..0.5
     :param epsilon: sample clock ratio, 1.0 = none, 0.99..1.01
     :param taps: complex impulse response at the sample rate
+    :param doppler_hz: Rayleigh fading with this maximum Doppler shift, Hz; every tap fades by itself; 0 = none
     :param packet_loss: probability that a packet is dropped between PHY and sink, 0..1
-    :param seed: of noise and packet loss
+    :param burst_loss: losses in bursts; None = none
+    :param outages: [from_s, to_s) during which nothing passes, s since the run began, in order of time
+    :param seed: of noise, fading and losses
     """
 
     snr_db: Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None = None
     frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
-    taps: tuple[complex, ...] = (1.0 + 0.0j,)
-    packet_loss: Annotated[float, Field(ge=0, le=1)] = 0.0
+    taps: Annotated[tuple[complex, ...], Field(min_length=1)] = (1.0 + 0.0j,)
+    doppler_hz: Seconds = 0.0
+    packet_loss: Probability = 0.0
+    burst_loss: BurstLoss | None = None
+    outages: tuple[tuple[Seconds, Seconds], ...] = ()
     seed: Count = 0
+
+    @model_validator(mode="after")
+    def _outages_in_order(self) -> ChannelConfig:
+        before = 0.0
+        for begin, end in self.outages:
+            if not before <= begin < end:
+                raise ValueError(
+                    f"outages: [{begin:g}, {end:g}] ends before it begins, or begins before the one before it has "
+                    "ended; write [from_s, to_s] in order of time"
+                )
+            before = end
+        return self
+
+    def on_samples(self) -> dict[str, Any]:
+        """The settings that act on samples and are not at their defaults, by name."""
+        default = ChannelConfig()
+        names = ("snr_db", "frequency_offset", "epsilon", "taps", "doppler_hz")
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(default, name)}
+
+    @property
+    def loses_packets(self) -> bool:
+        """Whether anything here drops whole packets."""
+        return bool(self.packet_loss or self.burst_loss or self.outages)
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -242,6 +315,40 @@ class PhyConfig:
     sample_rate: Seconds = 0.0
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
     options: dict[str, Any] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class DiagnosticsConfig:
+    """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
+
+    :param period_s: s between two messages, 0 = none at all
+    :param window_s: s over which rates and losses are taken, 1 or more
+    :param packet_loss_warn: share of packets lost, 0..1; 0 = never, as for all limits
+    :param packet_loss_error: the same for an error
+    :param message_loss_warn: share of messages lost, 0..1
+    :param message_loss_error: the same for an error
+    :param latency_warn_s: s from a message's stamp to its publication here, median of the newest
+    :param latency_error_s: the same for an error
+    :param age_warn_s: s since the stamp of a topic's newest message (where it has none, since its publication)
+    :param age_error_s: the same for an error
+    :param silence_warn_s: s without any packet, once there was one
+    :param silence_error_s: the same for an error
+    :param queue_warn: share of ``queue_depth`` that waits to be sent, 0..1
+    """
+
+    period_s: Seconds = 1.0
+    window_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+    packet_loss_warn: Probability = 0.1
+    packet_loss_error: Probability = 0.5
+    message_loss_warn: Probability = 0.1
+    message_loss_error: Probability = 0.5
+    latency_warn_s: Seconds = 1.0
+    latency_error_s: Seconds = 5.0
+    age_warn_s: Seconds = 0.0
+    age_error_s: Seconds = 0.0
+    silence_warn_s: Seconds = 3.0
+    silence_error_s: Seconds = 10.0
+    queue_warn: Probability = 0.8
 
 
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
@@ -268,6 +375,12 @@ def replaced(config: _T, **changes: Any) -> _T:
     return build(type(config), {**current, **changes})
 
 
+def meanings(cls: type[Any]) -> dict[str, str]:
+    """What its docstring says of each setting of a configuration class, one line each."""
+    text = re.sub(r"\s*\n\s+(?!:param)", " ", cls.__doc__ or "")
+    return {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
+
+
 def _explain(cls: type[Any], item: Any, where: str) -> str:
     prefix = f"{where}: " if where else ""
     key = ".".join(str(part) for part in item["loc"])
@@ -290,6 +403,7 @@ def _keys_at(cls: Any, loc: tuple[Any, ...]) -> list[str]:
         annotation = known.get(part)
         cls = getattr(cls, "__pydantic_fields__", {}).get(part)
         cls = getattr(cls, "annotation", None) or annotation
+        cls = next((kind for kind in get_args(cls) if kind is not type(None)), cls)  # X of X | None
     return [field.name for field in fields(cls)] if hasattr(cls, "__dataclass_fields__") else []
 
 

@@ -12,6 +12,7 @@
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   └── BagError                    a bag cannot be read or written
     ├── PhyError (RuntimeError)         the flowgraph or radio failed
+    │   └── RadioError                  a device or recording cannot be opened, set up or used
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
     └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
 
@@ -135,6 +136,10 @@ class BagError(MiddlewareError):
 
 class PhyError(GrRos2Error, RuntimeError):
     """The flowgraph, channel or radio failed."""
+
+
+class RadioError(PhyError):
+    """A front end's device, socket or recording cannot be opened, set up or used; the message names it."""
 
 
 class BackendMissingError(GrRos2Error, ImportError):

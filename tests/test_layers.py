@@ -18,14 +18,15 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 LAYERS = (
     {"errors"},
     {"config", "backends"},
-    {"registry"},
+    {"registry", "settings_file"},
     {"wire"},
     {"link"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path"},
     {"gr"},
+    {"radio"},
     {"experiment"},
-    {"dashboard"},
+    {"dashboard", "race"},
     {"cli"},
     {"ros"},
 )
@@ -38,10 +39,13 @@ PURE_CODECS = {"backports"}
 """Small pure codecs these may import beside the standard library."""
 
 CONFINED = {
-    "gnuradio": ("gr/", "phy/"),
-    "pmt": ("gr/", "phy/"),
+    "gnuradio": ("gr/", "phy/", "radio/", "race/air.py"),
+    "pmt": ("gr/", "phy/", "radio/", "race/air.py"),
     "rclpy": ("middleware/rclpy.py", "ros/"),
+    "rcl_interfaces": ("ros/",),
     "cyclonedds": ("middleware/cdr_dds.py", "middleware/dds"),
+    "distributed": ("experiment/sweep/cluster.py",),
+    "zenoh": ("middleware/zenoh.py", "race/"),
 }
 BLOCKED = tuple(CONFINED)
 WITHOUT_BACKENDS = (
@@ -55,6 +59,8 @@ WITHOUT_BACKENDS = (
     "gr_ros2.middleware.memory",
     "gr_ros2.middleware.bag",
     "gr_ros2.phy",
+    "gr_ros2.radio",
+    "gr_ros2.radio.config",
     "gr_ros2.sim",
     "gr_ros2.experiment.ledger",
     "gr_ros2.experiment.metrics",

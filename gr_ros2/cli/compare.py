@@ -19,9 +19,9 @@ from gr_ros2.experiment.table import as_table
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default results/compare-TIME.")
 def compare(directories: tuple[Path, ...], out: Path | None) -> None:
     """Print the runs in these folders side by side; write compare.html, figures and tables."""
-    if len(directories) < 2:
-        raise ConfigError(f"{directories[0]}: nothing to compare it with; give two folders or more")
     runs = read_runs(directories)
+    if len(runs) < 2:
+        raise ConfigError(f"{directories[0]}: nothing to compare it with; give two folders or more")
     written = write_comparison(runs, out or Path("results") / f"compare-{time.strftime('%Y%m%d-%H%M%S')}")
     console().print(as_table(compare_grid(runs)))
     print(f"Written: {written[0]} and {len(written) - 1} files beside it")

@@ -1,4 +1,4 @@
-"""The live dashboard on the command line: `--dashboard` of a run, and `gr-ros2 dashboard` that opens its page."""
+"""The live dashboard on the command line: `--dashboard` of a run, and `gr-ros2 dashboard` beside one that goes on."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import logging
 import time
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from http.client import HTTPConnection, HTTPException
 from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 
+from gr_ros2.cli.doorbell import Doorbell, neighbours, ring
 from gr_ros2.errors import BackendMissingError, ConfigError, RunError
+from gr_ros2.experiment.watch import Audience
 
 if TYPE_CHECKING:
-    from gr_ros2.experiment.watch import Watcher
+    from gr_ros2.dashboard.server import Dashboard
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
@@ -31,47 +33,80 @@ dashboard_option = click.option(
 
 
 @contextmanager
-def watchers(where: str | None, console: Console) -> Iterator[list[Watcher]]:
-    """The onlookers of a run: a dashboard, where one is wanted.
+def audience(where: str | None, console: Console, name: str, *, instruments: bool = True) -> Iterator[Audience]:
+    """Whoever looks on at a run or a link: a dashboard from the start where one is wanted, and those asked for by
+    `gr-ros2 dashboard` in the meantime.
 
-    :param where: value of ``--dashboard``; None for no dashboard
+    :param where: value of ``--dashboard``; None for no dashboard at the start
+    :param name: what the program is doing, for those who look for it
+    :param instruments: see :class:`gr_ros2.experiment.watch.Watcher`
     :raises ConfigError: for a place where nothing can be served
     :raises BackendMissingError: when the package that draws it is not installed
     """
-    if where is None:
-        yield []
-        return
-    address, port = parse_place(where)
+    seen = Audience(instruments or where is not None)
+    urls: list[str] = []
+    with ExitStack() as dashboards:
+
+        def serve(address: str, port: int) -> str:
+            if not urls:
+                dashboard = dashboards.enter_context(_make(address, port))
+                seen.add(dashboard)
+                urls.append(dashboard.url)
+            return urls[0]
+
+        if where is not None:
+            console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
+        # Closed before the dashboards are, so that nobody can ask for one more by then.
+        with Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))}):
+            yield seen
+
+
+def _make(address: str, port: int) -> Dashboard:
     try:
         from gr_ros2.dashboard.server import Dashboard
     except ModuleNotFoundError as error:
         package = (error.name or "bokeh").split(".")[0]
-        raise BackendMissingError(f"--dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error
+        raise BackendMissingError(f"the dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error
     for name in ("bokeh", "tornado"):  # they warn of every viewer that leaves
         logging.getLogger(name).setLevel(logging.ERROR)
-    with Dashboard(address, port) as dashboard:
-        console.print(f"live at {dashboard.url}", soft_wrap=True)
-        yield [dashboard]
+    return Dashboard(address, port)
 
 
 @click.command()
 @click.argument("place", default=str(PORT), metavar="[[ADDRESS:]PORT]")
+@click.option("--pid", type=int, help="Process to look at, where several run.")
 @click.option("--wait", type=click.FloatRange(0), default=0.0, help="Seconds to wait for a run to begin.")
 @click.option("--browser/--no-browser", default=True, help="Open it, or only say where it is.")
-def dashboard(place: str, wait: float, browser: bool) -> None:
-    """Open the page of a run that was started with --dashboard."""
+def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
+    """Open the live page of a run or a link that goes on in another terminal.
+
+    One that was not started with --dashboard is asked to serve its page at PLACE now.
+    """
     address, port = parse_place(place)
     deadline = time.monotonic() + wait
-    while not _answers(address, port):
+    while (url := _find(address, port, pid)) is None:
         if time.monotonic() >= deadline:
             raise RunError(
-                f"{address}:{port}: no dashboard there; start a run with --dashboard={place}, or --wait for it"
+                f"{address}:{port}: no dashboard there, and no run or link of yours goes on; start one, or --wait"
             )
         time.sleep(_ASK_S)
-    url = f"http://{address}:{port}/"
     click.echo(url)
     if browser:
         webbrowser.open(url)
+
+
+def _find(address: str, port: int, pid: int | None) -> str | None:
+    """Where a page is served, by who serves one already or by who is asked to; None where nothing runs."""
+    if pid is None and _answers(address, port):
+        return f"http://{address}:{port}/"
+    running = neighbours()
+    if pid is None and not running:
+        return None
+    if pid is None and len(running) > 1:
+        several = ", ".join(f"{pid} ({name})" for pid, name in running.items())
+        raise ConfigError(f"several run: {several}; say which with --pid")
+    chosen = next(iter(running)) if pid is None else pid
+    return str(ring(chosen, {"address": address, "port": port})["url"])
 
 
 def parse_place(text: str) -> tuple[str, int]:

@@ -34,14 +34,22 @@ REGISTRY_COMMANDS: Commands = {
 COMMANDS: Commands = {
     "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
     "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "link": ("gr_ros2.cli.link:link", "One robot's end of a link, live: its ROS topics to the air and back."),
     "plan": ("gr_ros2.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
+    "replay": ("gr_ros2.cli.replay:replay", "A bag through a link into a bag: what arrives, and when."),
+    "losses": ("gr_ros2.cli.losses:losses", "How many packets a radio loses at which SNR, measured."),
+    "sweep": ("gr_ros2.cli.sweep:sweep", "One scenario at many settings, on all cores or a Dask cluster."),
     "report": ("gr_ros2.cli.report:report", "The HTML report of one or several runs, from their folders."),
     "compare": ("gr_ros2.cli.compare:compare", "Runs side by side: a table, and their curves in one figure."),
+    "race": ("gr_ros2.cli.race:race", "gr-ros2, DDS and Zenoh over the same radio, side by side (root)."),
+    "ablate": ("gr_ros2.cli.ablate:ablate", "What each part is worth: a scenario with one part off at a time."),
     "dashboard": ("gr_ros2.cli.dashboard:dashboard", "Open the live page of a run started with --dashboard."),
     "scenarios": ("gr_ros2.cli.scenarios:scenarios", "List the built-in scenarios."),
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
     "dict": ("gr_ros2.cli.dict:group", "Dictionaries for message compression."),
+    "wireshark": ("gr_ros2.cli.wireshark:wireshark", "The Wireshark dissector for captures made with --pcap."),
+    "completion": ("gr_ros2.cli.completion:completion", "Completion of commands for bash, zsh and fish."),
     "grc-path": ("gr_ros2.cli.grc:grc_path", "The folder of block descriptions for GRC."),
 }
 

@@ -16,9 +16,10 @@ from gr_ros2.experiment.report import read_runs, write_report
 def report(directories: tuple[Path, ...], out: Path | None) -> None:
     """Write report.html, figures (PNG, SVG) and tables (CSV, Parquet) of the runs in these folders.
 
-    One folder gets its own report; several share one, with their latencies in one figure.
+    One folder gets its own report, over all its runs where it holds repetitions; several share one, with their
+    latencies in one figure.
     """
     runs = read_runs(directories)
-    default = directories[0] if len(runs) == 1 else Path("results") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+    default = directories[0] if len(directories) == 1 else Path("results") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
     written = write_report(runs, out or default)
     print(f"Written: {written[0]} and {len(written) - 1} files beside it")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +15,30 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.dashboard import dashboard_option, watchers
+from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.params import SCENARIO
+from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
 from gr_ros2.experiment import runner
 from gr_ros2.experiment.explain import explanation
-from gr_ros2.experiment.report import Run, write_report
+from gr_ros2.experiment.outcome import Outcome
+from gr_ros2.experiment.repeat import REPETITIONS_FILE, repetition_folder, repetition_grid
+from gr_ros2.experiment.report import Run, read_runs, write_report
+from gr_ros2.experiment.result import Result
 from gr_ros2.experiment.scenario import Scenario, load_scenario
 from gr_ros2.experiment.table import as_table, ledger_table, notes, paper_grid, summary_table
+from gr_ros2.experiment.watch import Watcher
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
+    click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
     click.option(
         "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys."
     ),
     dashboard_option,
+    pcap_option,
 ]
 
 
@@ -39,7 +49,7 @@ def _with_options(function: Any) -> Any:
 
 
 @click.command()
-@click.argument("scenario")
+@click.argument("scenario", type=SCENARIO)
 @_with_options
 def run(scenario: str, **options: Any) -> None:
     """Run SCENARIO, a built-in name or a YAML file, and write its result."""
@@ -58,23 +68,44 @@ def _run(
     *,
     out: Path | None,
     seed: int | None,
+    repetitions: int | None,
     duration: float | None,
     overrides: tuple[str, ...],
     dashboard: str | None,
+    pcap: Path | None,
 ) -> None:
-    scenario = load_scenario(name, overrides, seed=seed, duration_s=duration)
+    scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
     # A service manager's SIGTERM ends a run as Ctrl-C does, with its result written.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with watchers(dashboard, console) as onlookers, _bar(console) as bar:
-        task = bar.add_task(scenario.name, total=scenario.duration_s or None, sent=0, delivered=0)
+    # With pace `flow` the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
+    looked_at = audience(dashboard, console, scenario.name, instruments=scenario.pace == "airtime")
+    with looked_at as onlookers, capture(pcap) as captures, _bar(console) as bar:
+        seen: list[Watcher] = [onlookers, *captures]
+        if scenario.repetitions == 1:
+            outcome = runner.run_scenario(scenario, out, _advance(bar, scenario, scenario.name), seen)
+        else:
+            turns = (f"{scenario.name} {k} of {scenario.repetitions}" for k in count(1))
+            results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
+    if scenario.repetitions == 1:
+        _report_run(console, scenario, outcome, out)
+    else:
+        _report_repetitions(console, scenario, results, out)
 
-        def advance(progress: runner.Progress) -> None:
-            done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
-            bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
 
-        outcome = runner.run_scenario(scenario, out, advance, onlookers)
+def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
+    """Something that shows how far a run is."""
+    task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
+
+    def advance(progress: runner.Progress) -> None:
+        done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
+        bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
+
+    return advance
+
+
+def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path) -> None:
     _print(console, scenario, outcome)
     kept = f"result.json, bag {runner.DELIVERED_BAG}/, the tables messages and packets"
     if outcome.result.interrupted:
@@ -83,6 +114,20 @@ def _run(
         return
     written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]
     console.print(f"\nWritten to {out}: {written[0]}, {kept}, {', '.join(written[1:])}", soft_wrap=True)
+
+
+def _report_repetitions(console: Console, scenario: Scenario, results: Sequence[Result], out: Path) -> None:
+    if len(results) < scenario.repetitions:
+        console.print(f"stopped after {len(results)} of {scenario.repetitions} runs")
+    if not results:
+        return
+    console.print(as_table(repetition_grid(results)))
+    kept = f"{REPETITIONS_FILE}, the runs in rep-0 to {repetition_folder(out, len(results) - 1).name}"
+    if len(results) < scenario.repetitions:
+        console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
+        return
+    report, *_ = write_report(read_runs([out]), out)
+    console.print(f"\nWritten to {out}: {report.name}, {kept}", soft_wrap=True)
 
 
 def _bar(console: Console) -> Progress:
@@ -96,7 +141,7 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _print(console: Console, scenario: Scenario, outcome: runner.Outcome) -> None:
+def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
     result = outcome.result
     phy = result.phy
     if phy["sample_rate"]:

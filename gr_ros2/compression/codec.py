@@ -59,6 +59,15 @@ class LinkCodec:
         sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
         self._topics = [TopicCodec(topic, sets, max_size) for topic in registry]
 
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:
+        """What the far end gets of a message: its alignment gaps zero, its chosen fields rounded, all else as it is.
+
+        It follows from the type alone, not from what was coded: so it tells a codec that errs from one that does not.
+
+        :raises IndexError: a topic id that is not in the registry
+        """
+        return self._topics[topic_id].canonical(payload)
+
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, at most one byte longer than the payload; never fails.
 
@@ -105,10 +114,8 @@ class TopicCodec:
 
     def encode(self, payload: bytes) -> bytes:
         """See LinkCodec."""
-        if len(payload) > self._max_size:
-            return b"\0" + payload
-        payload = self._quantised(payload)
-        if self._mode == "none":
+        payload = self.canonical(payload)
+        if self._mode == "none" or len(payload) > self._max_size:
             return b"\0" + payload
         coders = self._coders
         coded = None
@@ -150,19 +157,18 @@ class TopicCodec:
             raise UnknownDictionaryError(f"the definition of {coders.type_name} is not known here")
         return coders.fields.decode(body, codec == FIELDS_AND_MORE)
 
-    def _quantised(self, payload: bytes) -> bytes:
-        if self._quantizer is not None and self._coders.fields is not None:
-            found = self._coders.fields.layout(payload)
-            if found is not None:
-                return self._quantizer(*found)
-        return payload
+    def canonical(self, payload: bytes) -> bytes:
+        """See LinkCodec. A message that is stored by configuration keeps its gaps."""
+        fields = self._coders.fields
+        if fields is None or len(payload) > self._max_size or (self._mode == "none" and self._quantizer is None):
+            return payload
+        found = fields.layout(payload)
+        if found is None:
+            return payload
+        return found[0].pack(*found[1]) if self._quantizer is None else self._quantizer(*found)
 
     def _zstd(self, payload: bytes) -> bytes:
         coders = self._coders
-        if coders.fields is not None:
-            found = coders.fields.layout(payload)
-            if found is not None:
-                payload = found[0].pack(*found[1])
         if coders.zstd is None:
             return b"\x01" + self._plain.compress(payload)
         return coders.heads[ZSTD] + coders.zstd.compress(payload)

@@ -104,8 +104,8 @@ def _rounded(bits: int, decimals: int, real: str, whole: str) -> int:
 
 def _rounded_array(data: bytes, decimals: int, dtype: str) -> bytes:
     values = np.frombuffer(data, dtype)
-    wide = values.astype("f8")
     with np.errstate(all="ignore"):
+        wide = values.astype("f8")
         scaled = wide * 10**decimals
         chosen = np.abs(scaled) < LARGEST
         rounded = (np.rint(np.where(chosen, scaled, 0.0)) / 10**decimals + 0.0).astype(dtype)

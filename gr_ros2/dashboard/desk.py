@@ -50,6 +50,8 @@ class Radio:
 class Desk:
     """A :class:`gr_ros2.experiment.watch.Watcher` that keeps a snapshot for others to draw."""
 
+    instruments = True
+
     def __init__(self) -> None:
         self.snapshot = Snapshot()
         self.radio = Radio()
@@ -63,8 +65,8 @@ class Desk:
     # -- the run's side -----------------------------------------------------------------------------------------
 
     def run_started(self, run: LiveRun) -> None:
-        phy = run.links[0].phy
-        self._spectrum = Spectrum(phy.sample_rate) if phy.has_samples else None
+        sampled = [link.phy for link in run.links if link.phy.has_samples]  # on simulated time there is no link
+        self._spectrum = Spectrum(sampled[0].sample_rate) if sampled else None
         self._state = DashboardState(
             run.registry,
             run.topics,
@@ -119,6 +121,8 @@ class Desk:
             for topic in source.stats()["topics"].values()
         }
         self.snapshot = state.tick(run.clock(), queued)
+        if not run.links:
+            return
         spectrum = self._spectrum
         counts = [link.counts() for link in run.links]
         self.radio = Radio(
@@ -134,7 +138,7 @@ class Desk:
     def channel(self) -> ChannelConfig | None:
         """The channel as it is set at this very moment; after the run as it was last, None before the first."""
         run = self._run
-        return self.radio.channel if run is None else run.links[0].channel
+        return self.radio.channel if run is None or not run.links else run.links[0].channel
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Noise on every link; dB, None = none."""
@@ -154,5 +158,7 @@ class Desk:
             run = self._run
             for link in () if run is None else run.links:
                 change(link)
+            if run is not None and not run.links:
+                self.refused = "a run on simulated time has no channel to change"
         except GrRos2Error as error:
             self.refused = str(error)

@@ -74,9 +74,10 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
     return Grid("Side by side", ("Topic", "Number", *(run.label for run in runs)), tuple(filter(None, kept)), texts=2)
 
 
-def write_comparison(runs: Sequence[Run], out: Path) -> list[Path]:
+def write_comparison(runs: Sequence[Run], out: Path, first: Sequence[Grid] = ()) -> list[Path]:
     """Write ``compare.html``, its figures and the table of all numbers.
 
+    :param first: tables to stand before the one of all numbers
     :return: the files written, the page first
     :raises ConfigError: when they cannot be written
     """
@@ -107,7 +108,7 @@ def write_comparison(runs: Sequence[Run], out: Path) -> list[Path]:
     ]
     title = " · ".join(run.label for run in runs)
     sections = [
-        Section(sentences=[f"{run.label}: {lead_of(run)}" for run in runs], grids=[compare_grid(runs)]),
+        Section(sentences=[f"{run.label}: {lead_of(run)}" for run in runs], grids=[*first, compare_grid(runs)]),
         Section(pictures=pictures),
     ]
     return write_page(out / COMPARISON_FILE, title, f"{len(runs)} runs side by side", sections, runs)

@@ -65,9 +65,12 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
         return
     needed = sum((m.row != "too_large").sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
-    share = needed * airtime / result.duration_s
+    channels = result.phy.get("channels", 1)
+    share = needed * airtime / result.duration_s / channels
+    each = "" if channels == 1 else f" on its {channels} channels"
     yield (
-        f"A packet takes {milliseconds(airtime)} ms of air, so the link carries at most {1 / airtime:,.1f} packets/s. "
+        f"A packet takes {milliseconds(airtime)} ms of air, so the link carries at most {channels / airtime:,.1f} "
+        f"packets/s{each}. "
         f"All messages sent, cut and packed as they were, come to {needed / result.duration_s:,.1f} packets/s: "
         + (f"{share:.1f} times what the link has." if share > 1 else f"{_percent(share)} of what the link has.")
     )
@@ -87,7 +90,8 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     )
     if result.phy.get("airtime_s") and result.config.get("pace") != "flow" and arrived:
         span = max(result.duration_s, float(np.nanmax(t_received)))
-        text += f"; those that arrived took {_percent(arrived * result.phy['airtime_s'] / span)} of the air"
+        used = arrived * result.phy["airtime_s"] / span / result.phy.get("channels", 1)
+        text += f"; those that arrived took {_percent(used)} of the air"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
     if whole and arrived < passed:

@@ -1,8 +1,9 @@
 """The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
 
 Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
-a delivery with its very bytes was seen; repeats count neither as sent nor as delivered; memory holds payload
-digests only of messages whose fate is open, and about 33 bytes of each message besides.
+a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); repeats
+count neither as sent nor as delivered; memory holds payload digests only of messages whose fate is open, and about
+33 bytes of each message besides.
 
 Events must come in causal order: what a packet carries is told before its reception is, and a packet's reception
 (:meth:`Ledger.packet_received`) before what the receiver makes of it. The ledger may be fed from several threads.
@@ -165,20 +166,22 @@ class Ledger:
                     return source.src_id, _arrived(source, digest)
         return None
 
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+    def receiver_event(self, event: ReceiverEvent, now: float) -> float | None:
         """What the receiver reports.
 
         :param now: s, on the clock of the sender's events; of a delivery: when the message was republished
+        :return: s, when the message delivered was submitted; None where there is none, or none that is known yet
         """
         with self._lock:
             if self._finished:
-                return
+                return None
             if isinstance(event, Delivered):
-                self._delivered(event, now)
-            elif isinstance(event, Lost):
+                return self._delivered(event, now)
+            if isinstance(event, Lost):
                 self._lost(event)
             elif isinstance(event, Rejected):
                 self._rejected[event.error.kind] += 1
+        return None
 
     def finish(self, drained: bool = False) -> list[TopicLedger]:
         """Close the books. What the run's threads report later is no part of it and is ignored.
@@ -254,7 +257,8 @@ class Ledger:
 
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
-        message = _Open(topic, event.serial, topic.sent - 1, _digest(event.payload))
+        expected = event.payload if event.expected is None else event.expected
+        message = _Open(topic, event.serial, topic.sent - 1, _digest(expected))
         source.open[event.serial] = message
         source.by_digest.setdefault((event.topic_id, message.digest), {})[event.serial] = message
 
@@ -297,7 +301,7 @@ class Ledger:
 
     # -- receiver -----------------------------------------------------------------------------------------------
 
-    def _delivered(self, event: Delivered, now: float) -> None:
+    def _delivered(self, event: Delivered, now: float) -> float | None:
         digest = _digest(event.payload)
         source = self._sources.get(event.src_id)
         if source is not None:
@@ -307,17 +311,18 @@ class Ledger:
             message = next(exact, None)
             if message is None and key in source.repeats:
                 self._topic(event.src_id, event.topic_id).repeats_delivered += 1
-                return
+                return None
             if message is None:
                 message = next((m for m in same.values() if m.sent), None)
             if message is not None:
-                self._deliver(source, message, now)
-                return
+                return self._deliver(source, message, now)
         self._unmatched.append((event.src_id, event.topic_id, digest, now))
+        return None
 
-    def _deliver(self, source: _Source, message: _Open, now: float) -> None:
+    def _deliver(self, source: _Source, message: _Open, now: float) -> float:
         message.topic.t_delivered[message.position] = now
         self._close(source, message, DELIVERED)
+        return message.topic.t_sent[message.position]
 
     def _lost(self, event: Lost) -> None:
         """Note the reason. It stands unless a delivery proves it wrong."""

@@ -5,6 +5,10 @@ Law: the offered load counts every message as if it travelled alone, so it is ne
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.scenario import Scenario
 from gr_ros2.link.fragment import largest_message
@@ -21,7 +25,7 @@ _SAMPLE_S = 2.0
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
     """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
 
-    :raises ConfigError: for wrong PHY options, or when nothing is offered
+    :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
     """
     cls = PHY.load(scenario.phy.name)
     rate = scenario.phy.sample_rate
@@ -29,7 +33,19 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
         at_1_hz: Phy = cls(scenario.packet_len, 1.0, **scenario.phy.options)
         rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
     phy: Phy = cls(scenario.packet_len, rate, **scenario.phy.options)
+    phy.check_channel(scenario.channel)
     return phy
+
+
+def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
+    """The PHY of every direction of a scenario, all at one sample rate: the highest that any of them asks for.
+
+    :raises ConfigError: see :func:`make_phy`
+    """
+    phys = [make_phy(way, registry) for way in directions]
+    rate = max(phy.sample_rate for phy in phys)
+    at_rate = (replace(way, phy=replaced(way.phy, sample_rate=rate)) for way in directions)
+    return [phy if phy.sample_rate == rate else make_phy(way, registry) for phy, way in zip(phys, at_rate, strict=True)]
 
 
 def offered_packets(scenario: Scenario, registry: Registry) -> float:

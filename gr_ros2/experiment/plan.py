@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gr_ros2.config import MAX_PACKET_LEN, SINGLE_ENTRY_OVERHEAD
+from gr_ros2.config import MAX_PACKET_LEN, SINGLE_ENTRY_OVERHEAD, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.load import make_phy, source_names
 from gr_ros2.experiment.result import TopicResult
@@ -22,6 +22,7 @@ from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.fragment import largest_message
+from gr_ros2.link.freshness import TURN
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.wire import ENTRY_HEADER_LEN, decode, pad_len
 
@@ -29,6 +30,10 @@ TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
 OVERHEAD_S = 0.0025
 """s that middleware, Python and the OFDM receiver add to the airtime of a message, as measured on two idle cores."""
+_WALL_S = 1.7e9
+"""s since 1970, of some day: a plan is the same on every day."""
+_MARGIN = 1.5
+"""A proposed ``reassembly_timeout`` beside the longest pause: what a lost packet and a busy computer add."""
 _PARTS = (1, 2, 3)
 """Packets per message that packet lengths are tried for."""
 _BETTER = 0.97
@@ -68,6 +73,7 @@ class Forecast:
     :param used: part of the airtime that is used, 0..1
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
     :param pad: part of the packets' bytes that is PAD
+    :param pause_s: s that may lie between two fragments of a message while others go first; 0 where each has only one
     """
 
     packet_len: int
@@ -76,6 +82,7 @@ class Forecast:
     used: float
     air_bytes_per_message: float | None
     pad: float
+    pause_s: float
     topics: tuple[TopicForecast, ...]
 
     @property
@@ -101,6 +108,9 @@ class Planner:
     def __init__(self, scenario: Scenario) -> None:
         if not PHY.load(scenario.phy.name).has_samples:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
+        if scenario.time == "real":
+            # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
+            scenario = replace(scenario, sim=replaced(scenario.sim, start_time=_WALL_S))
         self.scenario = scenario
         self.registry = scenario.load_registry()
         self.phy = make_phy(scenario, self.registry)
@@ -112,6 +122,13 @@ class Planner:
     def forecast(self) -> Forecast:
         """The scenario as it is."""
         return self._forecast(self.scenario)
+
+    def reassembly_timeout(self, forecast: Forecast) -> float | None:
+        """The sink's ``reassembly_timeout`` that this traffic needs, s, where the configured one is too short for
+        messages of several fragments to wait for their turns; None where it is not."""
+        if self.scenario.ros_sink.reassembly_timeout > forecast.pause_s:
+            return None
+        return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
 
     def advice(self) -> list[Advice]:
         """Single changes that make the topics younger, or the link freer at the same age; the best first.
@@ -191,10 +208,12 @@ class Planner:
         messages = [message for message in self._messages if message.t <= duration]
         shares: Counter[int] = Counter()
         padded = 0
+        cut = False
 
         def share(packet: SentPacket) -> None:
-            nonlocal padded
+            nonlocal padded, cut
             entries = decode(packet.data, scenario.packet_len).entries
+            cut = cut or any(entry.total > 1 for entry in entries)
             lengths = [len(entry.payload) for entry in entries]
             padded += pad_len(scenario.packet_len, lengths)
             whole = sum(lengths) + ENTRY_HEADER_LEN * len(entries)
@@ -230,6 +249,7 @@ class Planner:
             used=min(packets * airtime / duration, 1.0),
             air_bytes_per_message=packets * scenario.packet_len / delivered if delivered else None,
             pad=padded / (packets * scenario.packet_len) if packets else 0.0,
+            pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
         )
 
@@ -242,6 +262,9 @@ class _Remembering:
         self._coded: dict[tuple[int, bytes], bytes] = {}
         self._decoded: dict[tuple[int, bytes], bytes] = {}
 
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:
+        return self._codec.canonical(topic_id, payload)
+
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         coded = self._coded.get((topic_id, payload))
         if coded is None:
@@ -253,6 +276,11 @@ class _Remembering:
         if payload is None:
             payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)
         return payload
+
+
+def _turn(scenario: Scenario) -> int:
+    """Packets per topic until a topic that waits has its turn again."""
+    return TURN if scenario.ros_source.scheduler == "freshness" else 1
 
 
 def _age(forecast: Forecast) -> float:

@@ -7,9 +7,8 @@ lock and the reading of one position; what it keeps of a message or packet are n
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
-from itertools import product
 from math import nan
 from typing import Any
 
@@ -28,16 +27,19 @@ class Recorder:
 
     :param registry: names and types of the topic ids
     :param namespaces: namespace of each source id on the ROS graph, for the names of its topics
-    :param topic_ids: topics to report even if nothing was sent on them, None = the whole registry
+    :param topic_ids: topics of each source id to report even if nothing was sent on them, None = the whole registry
     :param latency_clock: time base of the submission times: submit, stamp_wall or stamp_sim
+    :param on_delivery: called with every delivery, when it came, and when the message was submitted, s on the run's
+        clock; None for a repeat, and where no such message is known
     """
 
     def __init__(
         self,
         registry: Registry,
         namespaces: Mapping[int, str],
-        topic_ids: Iterable[int] | None = None,
+        topic_ids: Mapping[int, Iterable[int]] | None = None,
         latency_clock: str = "submit",
+        on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
     ) -> None:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
@@ -47,9 +49,11 @@ class Recorder:
         self._books: list[TopicLedger] = []
         self._registry = registry
         self._namespaces = dict(namespaces)
-        self._topic_ids = range(len(registry)) if topic_ids is None else sorted(topic_ids)
+        reported = dict.fromkeys(namespaces, range(len(registry))) if topic_ids is None else topic_ids
+        self._keys = [(src_id, topic_id) for src_id, ids in reported.items() for topic_id in ids]
         self._delivered, self._delivered_bytes = 0, 0
         self._latency_clock = latency_clock
+        self._on_delivery = on_delivery
         readers = {topic.topic_id: position_reader(topic.type_name) for topic in registry}
         self._readers: dict[int, PositionReader] = {key: read for key, read in readers.items() if read is not None}
 
@@ -70,8 +74,10 @@ class Recorder:
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports; of a delivery once it is republished, at ``now`` on the sender's clock."""
-        self.ledger.receiver_event(event, now)
+        submitted = self.ledger.receiver_event(event, now)
         if isinstance(event, Delivered):
+            if self._on_delivery is not None:
+                self._on_delivery(event, now, submitted)
             self._follow(self.received, event.src_id, event.topic_id, event.payload, now)
 
     def progress(self) -> tuple[int, int]:
@@ -88,7 +94,7 @@ class Recorder:
         :raises RunError: when the ledger does not add up
         """
         books = {(book.src_id, book.topic_id): book for book in self.ledger.finish(drained)}
-        for key in product(self._namespaces, self._topic_ids):
+        for key in self._keys:
             books.setdefault(key, TopicLedger(*key))
         self._books = [books[key] for key in sorted(books)]
         numbers = {key: topic_metrics(books[key], duration_s, t_end) for key in sorted(books)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ from gr_ros2 import __version__
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.explain import explanation
 from gr_ros2.experiment.figures import latency_figure, ledger_figure, path_figure, save_figure
-from gr_ros2.experiment.result import Result, read_result
+from gr_ros2.experiment.repeat import run_folders
+from gr_ros2.experiment.result import Result, read_result, topic_numbers
 from gr_ros2.experiment.table import PAPER, Grid, ledger_grid, notes, paper_grid, summary_grid
 from gr_ros2.experiment.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
-from gr_ros2.experiment.trace import Messages, Trace, read_trace, write_csv, write_whole
+from gr_ros2.experiment.trace import Messages, Trace, read_trace, write_csv, write_text, write_whole
 
 REPORT_FILE = "report.html"
 SUMMARY = "summary"
@@ -82,11 +83,12 @@ class Section:
 
 
 def read_runs(directories: Iterable[str | Path]) -> list[Run]:
-    """Read run folders. A run is called after its scenario, or after its folder where that is ambiguous.
+    """Read run folders; one that holds repetitions counts as those. A run is called after its scenario, or after its
+    folder where that is ambiguous.
 
     :raises ConfigError: when a folder is missing, or a file of it is missing, damaged or half-written; names it
     """
-    paths = [Path(directory) for directory in directories]
+    paths = [folder for directory in directories for folder in run_folders(Path(directory))]
     found = []
     for path in paths:
         if not path.is_dir():
@@ -124,7 +126,15 @@ def write_page(path: Path, title: str, lead: str, sections: Sequence[Section], r
 
     :raises ConfigError: when it cannot be written
     """
-    tables = _write_summary(runs, path.parent)
+    return render_page(path, title, lead, sections, _write_summary(runs, path.parent))
+
+
+def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], tables: Sequence[Path]) -> list[Path]:
+    """Write an HTML page with its pictures inside; all files, the page first.
+
+    :param tables: files with the numbers, already written beside it
+    :raises ConfigError: when it cannot be written
+    """
     environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
     text = environment.get_template("report.html.j2").render(
@@ -135,7 +145,7 @@ def write_page(path: Path, title: str, lead: str, sections: Sequence[Section], r
         version=__version__,
         files=f"Beside it: {', '.join(table.name for table in tables)} with every number.",
     )
-    write_whole(path, text, _write_text)
+    write_whole(path, text, write_text)
     pictures = [file for section in sections for picture in section.pictures for file in (picture.png, picture.svg)]
     return [path, *tables, *pictures]
 
@@ -232,7 +242,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     if airtime and result.config.get("pace") != "flow":
         pictures.append(
             save(
-                airtime_figure(packets, airtime, result.duration_s),
+                airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),
                 out,
                 f"{prefix}airtime",
                 "Airtime of the packets that left the source and of those that arrived",
@@ -266,11 +276,6 @@ def _write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
     for run in runs:
         result = run.result
         for topic in result.topics:
-            values = asdict(topic)
-            for name in ("latency_s", "age_s"):
-                values.update({f"{name[:-2]}_{key}_s": value for key, value in values.pop(name).items()})
-            ledger = values.pop("ledger")
-            del values["latency_cdf_s"]
             lines.append(
                 {
                     **{"run": run.label, "scenario": result.scenario, "seed": result.seed},
@@ -279,8 +284,7 @@ def _write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
                         "interrupted": result.interrupted,
                         "phy": result.phy.get("name"),
                     },
-                    **values,
-                    **{f"ledger_{row}": ledger.get(row, 0) for row in rows},
+                    **topic_numbers(topic, rows),
                 }
             )
     table = pa.Table.from_pylist(lines)
@@ -301,10 +305,6 @@ def _check(run: Run) -> None:
                 f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "
                 f"result.json says {topic.sent} and {topic.delivered}: not of the same run"
             )
-
-
-def _write_text(text: str, path: Path) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def _labels(runs: Sequence[tuple[Path, str]]) -> list[str]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import field
+from collections.abc import Iterable
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,8 +90,8 @@ class Result:
     :param duration_s: s during which messages were submitted
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
-    :param phy: name, sample_rate, airtime_s (of one packet), airtime_per_message_s and airtime_per_byte_s
-        (of all packets sent, per delivered message and byte), …
+    :param phy: name, channels (one per direction), sample_rate, airtime_s (of one packet), airtime_per_message_s and
+        airtime_per_byte_s (of all packets sent, per delivered message and byte), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
@@ -106,6 +107,19 @@ class Result:
     wall_s: _Number | None = None
     interrupted: bool = False
     counters: dict[str, Any] = field(default_factory=dict)
+
+
+def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:
+    """Every number of a topic as a column of a table.
+
+    :param rows: ledger rows that get a column each
+    """
+    values = asdict(topic)
+    for name in ("latency_s", "age_s"):
+        values.update({f"{name[:-2]}_{key}_s": value for key, value in values.pop(name).items()})
+    ledger = values.pop("ledger")
+    del values["latency_cdf_s"]
+    return {**values, **{f"ledger_{row}": ledger.get(row, 0) for row in rows}}
 
 
 def write_result(result: Result, path: str | Path) -> Path:

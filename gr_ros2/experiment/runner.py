@@ -1,72 +1,56 @@
-"""Runs one scenario: input -> ROS Source -> PHY and channel -> ROS Sink -> output, watched by a Recorder.
+"""Runs one scenario: one direction or two, watched by a Recorder.
 
 Laws: everything started is stopped in reverse order whatever happens; a run that is interrupted still closes its books
-and writes its result; the only path from input graph to output graph is the link.
+and writes its result.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
-from gr_ros2.experiment.load import make_phy, source_names
+from gr_ros2.experiment.direction import Direction, open_graph
+from gr_ros2.experiment.load import make_phys, source_names
+from gr_ros2.experiment.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.experiment.recorder import Recorder
+from gr_ros2.experiment.repeat import repetition_folder, repetitions, write_repetitions
 from gr_ros2.experiment.result import RESULT_FILE, Result, write_result
 from gr_ros2.experiment.scenario import Scenario, dump
-from gr_ros2.experiment.trace import Trace, write_trace
+from gr_ros2.experiment.simulated import run_simulated
+from gr_ros2.experiment.trace import write_trace
 from gr_ros2.experiment.watch import Fanout, LiveRun, Watcher
-from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos
+from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics
-from gr_ros2.phy import Phy
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
-DELIVERED_BAG = "delivered"
-"""Folder of the bag with what came out on the receiving graph."""
+__all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
 
 _MATCH_S = 20.0
 _POLL_S = 0.05
-_QUIET_S = 0.3
-"""A PHY that has given no packet for so long, with nothing waiting, is empty."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a run is: s since it began, s it takes (0 = until the bag ends), messages sent and delivered."""
-
-    elapsed_s: float
-    duration_s: float
-    sent: int
-    delivered: int
-
-
-@dataclass
-class Outcome:
-    """What a run gives back: the result, and what happened message by message."""
-
-    result: Result
-    trace: Trace
 
 
 class Listener:
-    """An independent subscriber on the receiving graph, which records what comes out there as a bag."""
+    """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
 
-    def __init__(self, graph: Middleware, bag: Path, topics: dict[str, str]) -> None:
+    :param graphs: name and type of the topics to hear, by graph
+    """
+
+    def __init__(self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path) -> None:
         self.received: Counter[str] = Counter()
         self._bag = BagMiddleware(path=bag, mode="write")
-        self._publishers = {name: self._bag.advertise(name, kind, Qos()) for name, kind in topics.items()}
+        self._publishers = {
+            name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
+        }
         self._subscriptions = [
             graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
+            for graph, topics in graphs.items()
             for name, kind in topics.items()
         ]
 
@@ -96,7 +80,8 @@ def run_scenario(
     :param out: folder for ``result.json``, the tables of the trace and the bag of delivered messages, made if missing;
         None writes nothing
     :param on_progress: called about 20 times a second
-    :param watchers: onlookers; with one, the link is built so that its channel can be changed and its signal seen
+    :param watchers: onlookers; where one has ``instruments``, the link is built so that its channel can be changed and
+        its signal seen
     :raises ConfigError: when the scenario cannot be set up
     :raises RunError: when it fails under way
     """
@@ -104,8 +89,11 @@ def run_scenario(
         raise ConfigError(f"{out}: holds a run already; choose another folder")
     outcome: Outcome | None = None
     try:
-        with ExitStack() as stack:
-            outcome = _Run(scenario, out, stack, watchers).execute(on_progress)
+        if scenario.time == "real":
+            with ExitStack() as stack:
+                outcome = _Run(scenario, out, stack, watchers).execute(on_progress)
+        else:
+            outcome = run_simulated(scenario, out, on_progress, watchers)
     finally:
         for watcher in watchers:
             watcher.run_ended(None if outcome is None else outcome.result)
@@ -115,75 +103,66 @@ def run_scenario(
     return outcome
 
 
+def run_repetitions(
+    scenario: Scenario,
+    out: Path,
+    on_start: Callable[[], Callable[[Progress], None] | None] = lambda: None,
+    watchers: Sequence[Watcher] = (),
+) -> list[Result]:
+    """Run every repetition of a scenario, until KeyboardInterrupt at the latest, each into a folder of its own.
+
+    :param out: folder for ``rep-0``, ``rep-1``, ... and ``repetitions.json``, made if missing
+    :param on_start: called before each run for its ``on_progress``
+    :param watchers: see :func:`run_scenario`
+    :return: the results of the runs that came to their end
+    :raises ConfigError: when the scenario cannot be set up, or a run is there already
+    :raises RunError: when a run fails under way
+    """
+    results: list[Result] = []
+    for k, one in enumerate(repetitions(scenario)):
+        try:
+            result = run_scenario(one, repetition_folder(out, k), on_start(), watchers).result
+        except KeyboardInterrupt:  # between two runs: the same as during one
+            break
+        if result.interrupted:
+            break
+        results.append(result)
+        write_repetitions(results, out)  # each time, so that runs are kept together whatever happens to the next
+    return results
+
+
 class _Run:
     def __init__(
         self, scenario: Scenario, out: Path | None, stack: ExitStack, watchers: Sequence[Watcher] = ()
     ) -> None:
         self.scenario = scenario
-        self.watchers = watchers
         self.registry = scenario.load_registry()
-        self.phy: Phy = make_phy(scenario, self.registry)
-        self.src_id = scenario.ros_source.src_id()
-        self.topics = source_names(scenario, self.registry)
-        namespaces = {self.src_id: scenario.ros_source.namespace}
-        self.recorder = Recorder(self.registry, namespaces, self.topics.values())
-        self.ears = Fanout([self.recorder, *watchers])
+        ways = scenario.directions()
+        phys = make_phys(ways, self.registry)
+        self.phy = phys[0]
+        namespaces = {way.ros_source.src_id(): way.ros_source.namespace for way in ways}
+        topics = {way.ros_source.src_id(): source_names(way, self.registry).values() for way in ways}
+        self.recorder = Recorder(self.registry, namespaces, topics)
         self.interrupted = False
         self.listener: Listener | None = None
         self.sim: SimPublisher | None = None
         try:
-            self._open(out, stack)
+            ears = Fanout([self.recorder, *watchers])
+            instrumented = any(watcher.instruments for watcher in watchers)
+            self.directions = [
+                Direction(way, self.registry, phy, ears=ears, stack=stack, instrumented=instrumented)
+                for way, phy in zip(ways, phys, strict=True)
+            ]
+            if out is not None:
+                out.mkdir(parents=True, exist_ok=True)
+                self.listener = self._listen(out, stack)
+            for watcher in watchers:
+                watcher.run_started(self._live())
+            if scenario.bag_path is None:
+                self.sim = SimPublisher(Fleet(scenario.sim), self._robots(stack), scenario.duration_s)
+                stack.callback(self.sim.close)
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
-
-    def _open(self, out: Path | None, stack: ExitStack) -> None:
-        scenario = self.scenario
-        self.input = stack.enter_context(self._input_graph())
-        output = stack.enter_context(self._graph(scenario.ros_sink.middleware, scenario.ros_sink.domain_id, "sink"))
-        # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
-        backpressure = scenario.ros_source.backpressure or (
-            isinstance(self.input, BagMiddleware) and self.input.speed == 0
-        )
-        self.source = RosSource(
-            self.registry,
-            middleware=self.input,
-            observer=partial(self.ears.sender_event, self.src_id),
-            seed=scenario.seed,
-            **_values(replace(scenario.ros_source, backpressure=backpressure)),
-        )
-        stack.callback(self.source.close)
-        self.sink = RosSink(
-            self.registry,
-            middleware=output,
-            observer=lambda event: self.ears.receiver_event(event, time.monotonic()),
-            packet_observer=lambda data: self.ears.packet_received(data, time.monotonic()),
-            **_values(scenario.ros_sink),
-        )
-        stack.callback(self.sink.close)
-        self.sink.announce(self.src_id, self.topics.values())
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            self.listener = self._listen(out, stack)
-        self.link = LoopbackLink(
-            self.phy,
-            self.source,
-            self.sink,
-            channel=scenario.channel,
-            pace=scenario.pace,
-            paced=scenario.paced,
-            instrumented=bool(self.watchers),
-        )
-        stack.callback(self.link.stop)
-        for watcher in self.watchers:
-            watcher.run_started(self._live())
-        if scenario.bag_path is None:
-            robots = {robot_id: output for robot_id in self._robot_ids() if robot_id != self.src_id}
-            if self.src_id in self._robot_ids():
-                robots[self.src_id] = stack.enter_context(
-                    self._graph(scenario.ros_source.middleware, scenario.ros_source.domain_id, "robot")
-                )
-            self.sim = SimPublisher(Fleet(scenario.sim), robots, scenario.duration_s)
-            stack.callback(self.sim.close)
 
     def _live(self) -> LiveRun:
         return LiveRun(
@@ -191,53 +170,42 @@ class _Run:
             duration_s=self.scenario.duration_s,
             packet_len=self.scenario.packet_len,
             registry=self.registry,
-            topics={(self.src_id, topic_id): name for name, topic_id in self.topics.items()},
-            sources={self.src_id: self.source},
-            links=(self.link,),
+            topics={(way.src_id, topic_id): name for way in self.directions for name, topic_id in way.topics.items()},
+            sources={way.src_id: way.source for way in self.directions},
+            links=[way.link for way in self.directions],
             ledger=self.recorder.ledger,
         )
 
-    def _robot_ids(self) -> range:
-        return range(1, self.scenario.sim.robots + 1)
-
-    def _graph(self, name: str, domain_id: int, node: str) -> Middleware:
-        settings: dict[str, Any] = {"domain_id": domain_id, "node_name": f"gr_ros2_{node}"}
-        if name == "dds":
-            settings["localhost_only"] = self.scenario.localhost_only
-        graph: Middleware = MIDDLEWARE.load(name)(**settings)
-        return graph
-
-    def _input_graph(self) -> Middleware:
-        path = self.scenario.bag_path
-        if path is None:
-            source = self.scenario.ros_source
-            return self._graph(source.middleware, source.domain_id, "source")
-        found = [info.topic for info in bag_topics(path)]
-        if not set(found) & set(self.topics):
-            raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
-        return BagMiddleware(path=path, speed=self.scenario.bag_speed)
+    def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
+        """The graph of every simulated robot: its source's, or else the one at the other end of the link."""
+        ids = range(1, self.scenario.sim.robots + 1)
+        robots = dict.fromkeys(ids, self.directions[0].output)
+        for way in self.directions:
+            if way.src_id in robots:
+                end = way.scenario.ros_source
+                robots[way.src_id] = stack.enter_context(open_graph(self.scenario, end, f"robot_{way.src_id}"))
+        return robots
 
     def _listen(self, out: Path, stack: ExitStack) -> Listener:
-        sink = self.scenario.ros_sink
-        graph = stack.enter_context(self._graph(sink.middleware, sink.domain_id, "listener"))
-        listener = Listener(graph, out / DELIVERED_BAG, self._output_topics())
+        graphs = {
+            stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
+            for way in self.directions
+        }
+        listener = Listener(graphs, out / DELIVERED_BAG)
         stack.callback(listener.close)
         return listener
-
-    def _output_topics(self) -> dict[str, str]:
-        """Name and type of every topic at the sink."""
-        format_ = self.scenario.ros_sink.namespace_format
-        rows = [self.registry[topic_id] for topic_id in self.topics.values()]
-        return {topic.republished(format_, self.src_id): topic.type_name for topic in rows}
 
     def execute(self, on_progress: Callable[[Progress], None] | None) -> Outcome:
         scenario = self.scenario
         wall = begin = end = time.monotonic()
         try:
-            self.link.start()
+            for way in self.directions:
+                way.link.start()
             self._wait_matched()
             begin = end = time.monotonic()
-            (self.sim or self.input).start()
+            for way in self.directions:
+                way.link.run_began(begin)
+            (self.sim or self.directions[0].input).start()
             while not self._submitted(begin):
                 time.sleep(_POLL_S)
                 self._report(on_progress, begin)
@@ -251,7 +219,8 @@ class _Run:
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
         drained = not self.interrupted and self._empty()
-        self.link.stop()
+        for way in self.directions:
+            way.link.stop()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
@@ -263,12 +232,14 @@ class _Run:
             config=dump(scenario),
             topics=topics,
             packets=self.recorder.ledger.packets(),
-            phy=self._phy_numbers(),
+            phy=phy_numbers(self.phy, len(self.directions), self.recorder),
             wall_s=time.monotonic() - wall,
             interrupted=self.interrupted,
             counters=self._counters(),
         )
-        names = dict(zip(self.topics, self._output_topics(), strict=True))
+        names = {
+            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
+        }
         return Outcome(result, self.recorder.trace(begin, end, names))
 
     def _wait_matched(self) -> None:
@@ -276,7 +247,7 @@ class _Run:
         limit = time.monotonic() + _MATCH_S
         while time.monotonic() < limit:
             heard = self.listener is None or self.listener.matched()
-            if heard and (self.sim is None or (self._sim_matched() and self.source.matched)):
+            if heard and (self.sim is None or self._sim_matched(self.sim)):
                 return
             time.sleep(_POLL_S)
         raise RunError(
@@ -284,18 +255,21 @@ class _Run:
             "is the loopback interface up, and the domain free?"
         )
 
-    def _sim_matched(self) -> bool:
-        assert self.sim is not None
-        return all(self.sim.publishers[name].matched() for name in self.topics if name in self.sim.publishers)
+    def _sim_matched(self, sim: SimPublisher) -> bool:
+        wanted = [name for way in self.directions for name in way.topics if name in sim.publishers]
+        return all(sim.publishers[name].matched() for name in wanted) and all(
+            way.source.matched for way in self.directions
+        )
 
     def _submitted(self, begin: float) -> bool:
         if self.sim is not None:
             return self.sim.finished
-        assert isinstance(self.input, BagMiddleware)
-        if self.input.error is not None:
-            raise self.input.error
+        bag = self.directions[0].input
+        assert isinstance(bag, BagMiddleware)
+        if bag.error is not None:
+            raise bag.error
         over = bool(self.scenario.duration_s) and time.monotonic() - begin >= self.scenario.duration_s
-        return self.input.finished or over
+        return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
         """Let the link deliver what it holds, for at most ``drain_s`` without news in pace `flow`."""
@@ -308,35 +282,15 @@ class _Run:
                 before, limit = now, time.monotonic() + self.scenario.drain_s
 
     def _empty(self) -> bool:
-        """Whether nothing is left at the source, at the gate or in the PHY."""
-        counts = self.link.counts()
-        if not self.source.idle or counts.backlog or counts.transmitted < counts.passed:
-            return False
-        time.sleep(_QUIET_S if self.recorder.ledger.unresolved() else 0)
-        return self.link.counts() == counts
+        """Whether nothing is left in any direction."""
+        return all(way.empty(bool(self.recorder.ledger.unresolved())) for way in self.directions)
 
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
         if on_progress is not None:
             sent, delivered = self.recorder.progress()
             on_progress(Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered))
 
-    def _phy_numbers(self) -> dict[str, Any]:
-        phy = self.phy
-        airtime = phy.airtime() if phy.has_samples else None
-        return {
-            "name": phy.name,
-            "sample_rate": phy.sample_rate if phy.has_samples else None,
-            "airtime_samples": phy.airtime_samples() if phy.has_samples else None,
-            **self.recorder.airtime(airtime),
-        }
-
     def _counters(self) -> dict[str, Any]:
+        there, *back = (way.counters() for way in self.directions)
         heard = {} if self.listener is None else dict(self.listener.received)
-        return {"source": self.source.stats(), "sink": self.sink.stats(), "listener": heard}
-
-
-def _values(config: Any) -> dict[str, Any]:
-    """The settings of a block, without what is handed over as an object."""
-    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
-    del values["registry"], values["middleware"]
-    return values
+        return {**there, **({"back": back[0]} if back else {}), "listener": heard}

@@ -1,18 +1,18 @@
 """Scenarios: one experiment as one YAML file, with single settings replaced on the command line.
 
-Laws: what both ends of the link must agree on (`registry`, `packet_len`) stands once, at the top level, and both
-ends follow it; `source` names where messages come from, `ros_source` and `ros_sink` configure the two blocks;
-`dump` gives a mapping from which `scenario_from` makes the same scenario again.
+Laws: what both ends of the link must agree on (`registry`, `packet_len`) stands once, at the top level, and all ends
+follow it; `source` names where messages come from, `ros_source` and `ros_sink` configure the two blocks; a two-way
+scenario is two one-way ones between the same two graphs; `dump` gives a mapping from which `scenario_from` makes the
+same scenario again.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
@@ -25,22 +25,22 @@ from gr_ros2.config import (
     SinkConfig,
     SourceConfig,
     build,
-    read_yaml,
 )
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.registry import Registry
+from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.sim.settings import SimSettings
 
-BUILTIN_DIR = Path(__file__).resolve().parent.parent / "scenarios"
-"""Where the built-in scenarios and registries lie."""
-
-SHARED_KEYS = ("registry", "packet_len")
-"""Settings both ends of the link must agree on."""
+_GRAPH_KEYS = ("middleware", "domain_id")
+"""Settings of a block that say on which ROS graph it is."""
+_OWN_KEYS = ("namespace", "robot_id", "dst_id", *_GRAPH_KEYS)
+"""Settings of a block that belong to its robot: the way back does not take them over."""
+_BACK_SEED = 100_003
+"""From the seed of one direction's channel to the other's; no two repetitions of an experiment are so far apart."""
 
 _BAG = "bag:"
-_NUMBER = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,22 @@ class _Common:
 
     packet_len: PacketLen = 220
     seed: Count = 0
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Back:
+    """The way back of a two-way scenario, at the same time on a second channel (full duplex).
+
+    What is not set is as on the way there, with the two graphs swapped; of ``channel`` the seed differs.
+
+    :param ros_source: the second robot's sending block; needs a ``namespace`` or ``robot_id`` of its own
+    :param ros_sink: the first robot's receiving block
+    :param channel: what lies between them
+    """
+
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
@@ -67,11 +83,15 @@ class Scenario:
     :param ros_sink: the receiving block
     :param phy: which physical layer, and how fast
     :param channel: what lies between transmitter and receiver; its seed is the scenario's unless given
+    :param back: the way back, where both robots talk; None = one way only
     :param duration_s: s during which messages are submitted; 0 = until the bag ends
     :param drain_s: s the link may go on delivering after that
     :param seed: of the simulator, the channel and the sender
+    :param repetitions: runs, with seeds seed, seed + 1, ...
     :param pace: `airtime` lets samples pass at their sample rate, as on the air; `flow` as fast as the flowgraph runs
     :param paced: the PHY grants the source one packet at a time; false offers every packet at once, as the paper does
+    :param time: what the run's clock follows: `real` the wall clock; `samples` the samples of the flowgraph, which runs
+        as fast as it can; `packets` the packets alone, which are lost as measured on the flowgraph
     :param localhost_only: DDS stays on the loopback interface
     """
 
@@ -86,11 +106,14 @@ class Scenario:
     ros_sink: SinkConfig = Field(default_factory=SinkConfig)
     phy: PhyConfig = Field(default_factory=PhyConfig)
     channel: ChannelConfig = Field(default_factory=ChannelConfig)
+    back: Back | None = None
     duration_s: Seconds = 15.0
     drain_s: Seconds = 2.0
     seed: Count = 0
+    repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
     pace: Literal["airtime", "flow"] = "airtime"
     paced: bool = True
+    time: Literal["real", "samples", "packets"] = "real"
     localhost_only: bool = True
 
     @model_validator(mode="after")
@@ -108,7 +131,29 @@ class Scenario:
         ):
             if name not in table:
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
+        if self.back is not None:
+            self._check_back(self.back)
         return self
+
+    def _check_back(self, back: Back) -> None:
+        if self.source != "sim":
+            raise ValueError(f"back: source = {self.source!r} speaks for one robot; two-way runs need source: sim")
+        try:
+            src_id = back.ros_source.src_id()
+        except ConfigError as error:
+            raise ValueError(f"back.ros_source: {error}") from error
+        if src_id == self.ros_source.src_id():
+            raise ValueError(
+                f"back.ros_source: source id {src_id} is that of ros_source; set another namespace or robot_id"
+            )
+
+    def directions(self) -> tuple[Scenario, ...]:
+        """The one-way scenarios this one is made of: itself, or the way there and the way back."""
+        if self.back is None:
+            return (self,)
+        there = replace(self, back=None)
+        back = {item.name: getattr(self.back, item.name) for item in fields(self.back)}
+        return there, replace(there, **back)
 
     @property
     def bag_path(self) -> Path | None:
@@ -139,18 +184,30 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
     build(_Common, {key: values[key] for key in ("packet_len", "seed") if key in values}, where)
     prefix = f"{where}: " if where else ""
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
-    for end in ("ros_source", "ros_sink"):
-        block = values.get(end, {})
-        if not isinstance(block, Mapping):
-            continue  # build() says what is wrong with it
-        for key in SHARED_KEYS:
-            if key in block and block[key] != shared.get(key):
-                raise ConfigError(f"{prefix}{end}.{key} = {block[key]!r}: both ends share it; set {key} instead")
-        values[end] = {**block, **shared}
+    values.update(with_shared(values, shared, prefix))
     for part in ("sim", "channel"):
         if isinstance(block := values.get(part, {}), Mapping) and "seed" in values:
             values[part] = {"seed": values["seed"], **block}
+    if isinstance(values.get("back"), Mapping):
+        back = _way_back(values)
+        values["back"] = {**back, **with_shared(back, shared, f"{prefix}back.")}
     return build(Scenario, values, where)
+
+
+def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of ``back``, with what it does not set taken over from the way there."""
+    back = dict(values["back"])
+    parts = {part: values.get(part, {}) for part in (*ENDS, "channel")}
+    if not all(isinstance(part, Mapping) for part in (*parts.values(), *(back.get(name, {}) for name in parts))):
+        return back  # build() says what is wrong with it
+    for end, other in zip(ENDS, reversed(ENDS), strict=True):
+        kept = {key: value for key, value in parts[end].items() if key not in _OWN_KEYS}
+        graph = {key: parts[other][key] for key in _GRAPH_KEYS if key in parts[other]}
+        back[end] = {**kept, **graph, **back.get(end, {})}
+    seed = parts["channel"].get("seed", 0)
+    another = {"seed": seed + _BACK_SEED} if isinstance(seed, int) else {}
+    back["channel"] = {**parts["channel"], **another, **back.get("channel", {})}
+    return back
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **settings: Any) -> Scenario:
@@ -169,14 +226,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
                 f"scenario {str(name_or_path)!r} is neither a file nor built in; "
                 f"built in are {', '.join(sorted(_builtin_names()))}"
             )
-    values = {"name": path.stem, **read_yaml(path)}
-    if isinstance(values.get("registry"), str):
-        values["registry"] = find_registry(values["registry"], path.parent)
-    for override in overrides:
-        keys, value = parse_override(override)
-        if keys == ("registry",):
-            value = find_registry(str(value), Path())
-        _replace(values, keys, value, override)
+    values = read_settings(path, overrides)
     values.update((key, value) for key, value in settings.items() if value is not None)
     return scenario_from(values, str(name_or_path))
 
@@ -185,49 +235,6 @@ def builtin_scenarios() -> Iterator[Scenario]:
     """The scenarios that come with gr-ros2, by name."""
     for name in sorted(_builtin_names()):
         yield load_scenario(name)
-
-
-def find_registry(name: str, directory: Path) -> str:
-    """The absolute path of a registry: a file seen from a directory, or else a built-in one, with or without `.csv`.
-
-    :raises ConfigError: when there is neither
-    """
-    path = Path(name).expanduser()
-    for candidate in (directory / path, BUILTIN_DIR / path, BUILTIN_DIR / f"{name}.csv"):
-        if candidate.is_file():
-            return str(candidate.resolve())
-    known = ", ".join(sorted(path.stem for path in BUILTIN_DIR.glob("*.csv")))
-    raise ConfigError(f"registry = {name!r}: no such file; built in are {known}")
-
-
-def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
-    """`phy.sample_rate=2e5` as (("phy", "sample_rate"), 200000.0).
-
-    :raises ConfigError: when it has no `=`, an empty key, or a value that is no YAML
-    """
-    key, equals, value = text.partition("=")
-    keys = tuple(part.strip() for part in key.split("."))
-    if not equals or not all(keys):
-        raise ConfigError(f"--set {text}: write key=value, with dots between nested keys")
-    value = value.strip()
-    if _NUMBER.fullmatch(value):  # YAML 1.1 takes 2e5 for a string
-        return keys, float(value)
-    try:
-        parsed = yaml.safe_load(value) if value else ""
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {text}: the value is no YAML ({' '.join(str(error).split())})") from error
-    # Without braces a mapping was not meant: the colon belongs to a text such as bag:PATH.
-    return keys, value if isinstance(parsed, dict) and not value.startswith("{") else parsed
-
-
-def _replace(values: dict[str, Any], keys: tuple[str, ...], value: Any, override: str) -> None:
-    for depth, key in enumerate(keys[:-1], start=1):
-        inner = values.get(key, {})
-        if not isinstance(inner, Mapping):
-            raise ConfigError(f"--set {override}: {'.'.join(keys[:depth])} has no settings below it")
-        values[key] = dict(inner)
-        values = values[key]
-    values[keys[-1]] = value
 
 
 def _builtin_names() -> list[str]:

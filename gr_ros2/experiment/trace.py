@@ -311,8 +311,13 @@ def write_csv(table: Any, path: Path) -> None:
     pa_csv.write_csv(table.cast(plain), path, pa_csv.WriteOptions(quoting_style="needed"))
 
 
+def write_text(text: str, path: Path) -> None:
+    """One text file."""
+    path.write_text(text, encoding="utf-8")
+
+
 def write_whole(path: Path, table: Any, write: Callable[[Any, Path], None]) -> Path:
-    """Write a table so that the file appears whole or not at all.
+    """Write a table or text so that the file appears whole or not at all.
 
     :raises ConfigError: when it cannot be written
     """

@@ -5,6 +5,7 @@ Law: the run never depends on an onlooker; without one nothing of this costs any
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -56,13 +57,65 @@ class EventSink(Protocol):
 
 
 class Watcher(EventSink, Protocol):
-    """An onlooker."""
+    """An onlooker.
+
+    :param instruments: whether the link is to be built so that its channel can be changed and its signal seen
+    """
+
+    @property
+    def instruments(self) -> bool: ...
 
     def run_started(self, run: LiveRun) -> None:
         """Before the first event of a run."""
 
     def run_ended(self, result: Result | None) -> None:
         """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
+
+
+class Audience:
+    """A watcher that passes everything on to whoever looks on at the moment: they may come while the run goes on.
+
+    Who comes late is told of the run, and from then on of every event.
+
+    :param instruments: see :class:`Watcher`; for everybody who may come
+    """
+
+    def __init__(self, instruments: bool = True) -> None:
+        self.instruments = instruments
+        self._lock = threading.Lock()
+        self._watchers: tuple[Watcher, ...] = ()
+        self._run: LiveRun | None = None
+
+    def add(self, watcher: Watcher) -> None:
+        """Let one more look on, from now."""
+        with self._lock:
+            if self._run is not None:
+                watcher.run_started(self._run)
+            self._watchers += (watcher,)
+
+    def run_started(self, run: LiveRun) -> None:
+        with self._lock:
+            self._run = run
+            for watcher in self._watchers:
+                watcher.run_started(run)
+
+    def run_ended(self, result: Result | None) -> None:
+        with self._lock:
+            self._run = None
+            for watcher in self._watchers:
+                watcher.run_ended(result)
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        for watcher in self._watchers:
+            watcher.sender_event(src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        for watcher in self._watchers:
+            watcher.packet_received(data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        for watcher in self._watchers:
+            watcher.receiver_event(event, now)
 
 
 class Fanout:

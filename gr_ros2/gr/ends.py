@@ -86,9 +86,10 @@ class Graph:
             return True
         if "bag" in (self.middleware.name, other.middleware.name):
             return False
-        # DDS and rclpy meet on the wire; memory meets memory only.
-        in_memory = {self.middleware.name == "memory", other.middleware.name == "memory"}
-        return self._domain_id == other._domain_id and len(in_memory) == 1
+        # rclpy meets DDS or Zenoh on the wire, as its RMW has it; these two never meet, and memory meets memory only.
+        names = {self.middleware.name, other.middleware.name}
+        apart = names == {"dds", "zenoh"} or ("memory" in names and len(names) > 1)
+        return self._domain_id == other._domain_id and not apart
 
     def close(self) -> None:
         """Leave the graph, if we joined it."""
@@ -104,6 +105,12 @@ def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry
     :raises ConfigError: naming the topic
     """
     names = set(subscribed)
+    for merged in config.merged_topics:
+        if merged in names:
+            raise ConfigError(
+                f"loop: the sink publishes {merged} (merge_tf), which a source on the same graph subscribes; "
+                "change merge_tf or domain_id"
+            )
     for topic in registry:
         for src_id in range(_MAX_SRC_ID + 1):
             name = topic.republished(config.namespace_format, src_id)

@@ -9,12 +9,15 @@ from __future__ import annotations
 import struct
 from collections import deque
 from functools import lru_cache
+from itertools import islice
 from typing import Any, NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 
 WINDOW = 10_000
 """Newest values the percentiles are taken over."""
+RECENT = 100
+"""Newest values that say how it is now."""
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 _TIME = (struct.Struct(">iI"), struct.Struct("<iI"))
@@ -60,9 +63,14 @@ class LatencyWindow:
         self._count += 1
         self._negative += seconds < 0
 
-    def summary(self) -> Latency:
-        """Percentiles by nearest rank."""
-        values = sorted(self._values)
+    @property
+    def newest(self) -> float | None:
+        """The latency measured last, s."""
+        return self._values[-1] if self._values else None
+
+    def summary(self, newest: int = WINDOW) -> Latency:
+        """Percentiles by nearest rank, over that many of the newest values."""
+        values = sorted(islice(reversed(self._values), newest))
         if not values:
             return Latency(None, None, None, None, 0, 0)
         p50, p95, p99 = (values[-(-len(values) * percent // 100) - 1] for percent in (50, 95, 99))

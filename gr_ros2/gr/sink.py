@@ -19,7 +19,8 @@ from gnuradio import gr
 from gr_ros2.config import SinkConfig, replaced
 from gr_ros2.errors import GrRos2Error, MiddlewareError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
-from gr_ros2.gr.latency import CLOCK_TYPE, LatencyWindow, has_header, leading_time
+from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
+from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import PDUS, packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
@@ -30,6 +31,10 @@ from gr_ros2.registry import Registry
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
+_COUNTED = (
+    *("not_a_pair", "not_u8", "publish_failed", "handler_failed"),
+    *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
+)
 
 
 class RosSink(gr.basic_block):  # type: ignore[misc]
@@ -74,8 +79,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._thread: threading.Thread | None = None
         self._block_thread = BlockThread()
         self._counters: Counter[str] = Counter()
+        self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
+        self._transforms: MergedTransforms | None = None
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
+        self._delivered_at: dict[tuple[int, int], float] = {}
         self._stamped = [has_header(topic.type_name) for topic in self.registry]
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
@@ -87,6 +95,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
             LOOP_GUARD.add_sink(self, self._graph, self.config, self.registry)
+            if self.config.merge_tf:
+                self._transforms = MergedTransforms(self.config.merged_topics, self.middleware, self._counters)
             if self.config.use_sim_time:
                 qos = Qos("best_effort", "volatile", _CLOCK_DEPTH)
                 self._clock_subscription = self.middleware.subscribe("/clock", CLOCK_TYPE, qos, self._set_sim_time)
@@ -132,6 +142,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if self._clock_subscription is not None:
             self._clock_subscription.close()
             self._clock_subscription = None
+        if self._transforms is not None:
+            self._transforms.close()
         for publisher in list(self._publishers.values()):
             publisher.close()
         LOOP_GUARD.remove(self)
@@ -147,7 +159,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "handled": self.handled,
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
-                **{name: self._counters[name] for name in ("not_a_pair", "not_u8", "publish_failed", "handler_failed")},
+                **{name: self._counters[name] for name in _COUNTED},
                 "repeats": stats.repeats,
                 "packet_loss_est": stats.packet_loss_est,
                 "message_loss_est": stats.message_loss_est,
@@ -175,12 +187,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
         stats = self._receiver.stats
         window = self._latency.get(key)
+        delivered_at = self._delivered_at.get(key)
+        latency = 0.0 if window is None else window.newest or 0.0
         return {
             "src_id": key[0],
             "topic_id": key[1],
             "delivered": stats.delivered[key],
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
             "latency_s": None if window is None else window.summary()._asdict(),
+            "recent_latency_s": None if window is None else window.summary(RECENT)._asdict(),
+            "age_s": None if delivered_at is None else self._clock() - delivered_at + latency,
         }
 
     def _handle(self, pdu: Any) -> None:
@@ -223,9 +239,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
+        topic = self.registry[event.topic_id]
+        payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
         try:
             publisher = self._publishers.get(key) or self._advertise(key)
-            publisher.publish(event.payload)
+            publisher.publish(payload)
         except MiddlewareError as error:
             with self._lock:
                 self._counters["publish_failed"] += 1
@@ -233,9 +251,23 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if first:
                 self._log.warning("ros2_sink: a message was not published: %s", error)
             return Lost(event.src_id, event.topic_id, "publish_failed", event.entry_id)
+        with self._lock:
+            self._delivered_at[key] = self._clock()
         if self._stamped[event.topic_id]:
             self._measure(key, event.payload)
+        if self._transforms is not None and topic.type_name == TF_TYPE:
+            self._merge(self._transforms, payload, static=topic.latched)
         return event
+
+    def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
+        try:
+            transforms.add(payload, static=static)
+        except MiddlewareError as error:
+            with self._lock:
+                self._counters["tf_failed"] += 1
+                first = self._counters["tf_failed"] == 1
+            if first:
+                self._log.warning("ros2_sink: transforms were not merged: %s", error)
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
         topic = self.registry[key[1]]

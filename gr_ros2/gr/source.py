@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,13 +22,16 @@ from gnuradio import gr
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
+from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Refused, Sender, SenderEvent
 from gr_ros2.middleware import Middleware, Qos, Subscription
+from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.threads import BlockThread, quicken_threads
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
 
+_COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 16
 """Packets composed before the lock is given up, so that callbacks do not wait."""
 _JOIN_S = 1.0
@@ -83,6 +86,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._unread = False
         self._counters: Counter[str] = Counter()
         self._said: set[tuple[int, str]] = set()
+        static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
+        self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
         self._subscriptions: list[Subscription] = []
         self.message_port_register_out(PDUS)
         self._publish = self.message_port_pub  # found through two proxies otherwise, for every packet
@@ -171,6 +176,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                     "submitted": stats.submitted[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
+                    "queue": self._sender.queue(topic.topic_id)[0],
                     "refused": {
                         reason: count for (number, reason), count in stats.refused.items() if number == topic.topic_id
                     },
@@ -183,7 +189,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "entries": stats.entries,
                 "payload_bytes": stats.payload_bytes,
                 "repeats": stats.repeats,
-                **{name: self._counters[name] for name in ("unread", "held_back_at_close", "pump_failed")},
+                **{name: self._counters[name] for name in _COUNTED},
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
@@ -235,9 +241,23 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             depth = self.config.subscriber_depth if options.depth is None else options.depth
             qos = Qos(options.reliability, options.durability, depth)
             callback = partial(self._take, topic.topic_id)
-            self._subscriptions.append(self.middleware.subscribe(name, topic.type_name, qos, callback))
+            subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
+            self._subscriptions.append(subscription)
+            subscription.follow(partial(self._follow, topic))
         if self._graph.owned:
             self.middleware.start()
+
+    def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
+        """What the publishers of a topic offer: its queue follows, where it is not configured."""
+        qos = agreed(offers)
+        with self._lock:
+            changed = self._sender.follow(
+                topic.topic_id, depth=qos.depth, lifespan_s=qos.lifespan_s, period_s=qos.deadline_s
+            )
+            policy, deadline_s = self._sender.queue(topic.topic_id)
+        if changed:
+            limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
+            self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
 
     def _take(self, topic_id: int, payload: bytes) -> None:
         """A message of the ROS graph, in a thread of the middleware."""
@@ -247,7 +267,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
-            self._sender.submit(topic_id, payload, self._clock())
+            # A robot that comes late gets the newest message of a topic, which then has to hold all static transforms.
+            static = self._static.get(topic_id)
+            whole = None if static is None else static.union(payload)
+            self._sender.submit(topic_id, whole or payload, self._clock())
             self._work.notify()
 
     def _credit(self, _message: Any) -> None:

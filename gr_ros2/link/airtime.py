@@ -1,9 +1,9 @@
 """When packets have the air: one after the other, each for its airtime, and when the next may be asked for.
 
-Laws: a packet starts at the later of its arrival and the end of the one before, and leaves when its airtime is
-over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air is free
-of all that is here or promised (credits not yet used), and while fewer than ``OUTSTANDING`` packets are. No IO, no
-clock: ``now`` is seconds, monotonic.
+Laws: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
+airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air
+is free of all that is here or promised (credits not yet used), and while fewer than ``OUTSTANDING`` packets are. No
+IO, no clock: ``now`` is seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -26,16 +26,21 @@ class AirtimeClock(Generic[T]):
 
     :param airtime: s each packet occupies, gap included, above 0
     :param lead: s ahead of the air being free at which the next packet is asked for
-    :raises ConfigError: for an airtime that is not above 0 or a negative lead
+    :param early: s before its airtime is over at which a packet leaves: 0 where what follows takes no time, all of its
+        airtime and a little more where a device takes it
+    :raises ConfigError: for an airtime that is not above 0, or a negative lead or early
     """
 
-    def __init__(self, airtime: float, lead: float = LEAD_S) -> None:
+    def __init__(self, airtime: float, lead: float = LEAD_S, early: float = 0.0) -> None:
         if not airtime > 0:
             raise ConfigError(f"airtime = {airtime} s: must be above 0")
         if not lead >= 0:
             raise ConfigError(f"lead = {lead} s: must be 0 or more")
+        if not early >= 0:
+            raise ConfigError(f"early = {early} s: must be 0 or more")
         self._airtime = airtime
         self._lead = lead
+        self._early = early
         self._free = float("-inf")
         self._queue: deque[tuple[float, T]] = deque()
         self._unused = 0
@@ -43,11 +48,11 @@ class AirtimeClock(Generic[T]):
     def offer(self, packet: T, now: float) -> None:
         """A packet arrives; it uses up a credit where one is open."""
         self._free = max(now, self._free) + self._airtime
-        self._queue.append((self._free, packet))
+        self._queue.append((self._free - self._early, packet))
         self._unused = max(0, self._unused - 1)
 
     def due(self, now: float) -> list[T]:
-        """The packets whose airtime is over, in order of arrival."""
+        """The packets that may leave: their airtime is over, or will be within ``early``; in order of arrival."""
         over: list[T] = []
         while self._queue and self._queue[0][0] <= now:
             over.append(self._queue.popleft()[1])
@@ -70,7 +75,7 @@ class AirtimeClock(Generic[T]):
 
     @property
     def backlog(self) -> int:
-        """Packets here, the one on the air included."""
+        """Packets that have not left."""
         return len(self._queue)
 
     @property

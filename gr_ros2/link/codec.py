@@ -12,6 +12,10 @@ class MessageCodec(Protocol):
     """Codes the messages of one link; on such a link every packet carries C = 1 and every message begins with one
     byte that names codec and dictionary, 0 = stored as it is."""
 
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:
+        """What ``decode`` makes of the coded message: the payload itself, but for bytes that carry nothing and for
+        loss that was asked for."""
+
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, its naming byte first; at most one byte longer than the message."""
 

@@ -45,12 +45,17 @@ ReceiverEvent = Delivered | Lost | Rejected
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """A message was submitted. ``serial`` counts the submitted messages of this sender from 0."""
+    """A message was submitted. ``serial`` counts the submitted messages of this sender from 0.
+
+    ``expected`` is what is to come out at the far end, where the link's codec changes the message on purpose (alignment
+    gaps, quantised fields); None: the payload itself.
+    """
 
     serial: int
     topic_id: int
     payload: bytes
     now: float
+    expected: bytes | None = None
 
 
 @dataclass(frozen=True, slots=True)

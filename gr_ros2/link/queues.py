@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from gr_ros2.config import QueuePolicy
+from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
 
 
@@ -40,6 +40,16 @@ class TopicQueue(deque[Outgoing]):
         self.deadline_s = deadline_s
         self._interval = 1 / max_rate if max_rate else 0.0
         self._opens = float("-inf")
+        self.since = inf
+        """When the wait for company began: with the first message, or when one started; not anew when one is dropped,
+        or a topic faster than the wait would never leave."""
+
+    def change(self, policy: QueuePolicy, deadline_s: float) -> None:
+        """Another policy or deadline, from now on; the deadline for what waits too."""
+        self.policy = policy
+        self.deadline_s = deadline_s
+        for message in self:
+            message.expires = self._expiry(message)
 
     def room(self, depth: int) -> bool:
         """Whether one more would push none out. ``depth``: messages that may wait, 0 unbounded."""
@@ -49,6 +59,8 @@ class TopicQueue(deque[Outgoing]):
 
     def admit(self, message: Outgoing, depth: int) -> list[Dropped]:
         """Put a message in; returns those that make room for it."""
+        if not self:
+            self.since = message.submitted
         dropped: list[Dropped] = []
         if self.policy == "latest":
             while self and not self[-1].started:
@@ -57,8 +69,7 @@ class TopicQueue(deque[Outgoing]):
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
                 dropped.append(Dropped(victim, "queue_bound", f"{depth} messages were waiting"))
-        if self.deadline_s:
-            message.expires = message.submitted + self.deadline_s
+        message.expires = self._expiry(message)
         self.append(message)
         return dropped
 
@@ -81,6 +92,7 @@ class TopicQueue(deque[Outgoing]):
 
     def started(self, now: float) -> None:
         """A message began: when may the next one?"""
+        self.since = now
         if self._interval:
             # What a start was late by is not added to the next, unless it was late by a whole interval.
             self._opens = (self._opens if now - self._opens < self._interval else now) + self._interval
@@ -95,10 +107,34 @@ class TopicQueue(deque[Outgoing]):
         """When the next message may start, if one waits for that; otherwise infinite."""
         return self._opens if self and now < self._opens and not self[0].started else inf
 
+    def _expiry(self, message: Outgoing) -> float:
+        return message.submitted + self.deadline_s if self.deadline_s else inf
+
     def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[str, str]:
-        limit = f"deadline_ms {self.deadline_s * 1e3:g}"
+        limit = f"{self.deadline_s * 1e3:g} ms"
         if message.started:
             return "abandoned", f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:
             return "stale", f"it waited longer than {limit}"
         return "cannot_complete", f"{needs * 1e3:.0f} ms on the air end after {limit}"
+
+
+def queue_for(
+    options: TopicOptions, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+) -> tuple[QueuePolicy, float]:
+    """The policy of a topic's queue and its deadline in s (0 none), as configured; where left open, as its publishers'
+    QoS has it.
+
+    A configured ``queue`` stands as it is. A history of one message, which the registry may set too, or a promise of
+    one per period says that only the newest matters: ``latest``. A lifespan says when a message is of no more use.
+
+    :param depth: of the publishers' history, 0 unbounded or not known
+    :param lifespan_s: s, 0 for ever
+    :param period_s: their deadline: s within which they promise a message, 0 no promise
+    """
+    if options.queue is not None:
+        return options.queue, options.deadline_ms / 1e3
+    deadline_s = options.deadline_ms / 1e3 or lifespan_s
+    if options.depth == 1 or (options.depth is None and (depth == 1 or period_s)):
+        return "latest", deadline_s
+    return ("deadline" if deadline_s else "fifo"), deadline_s

@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
-from gr_ros2.config import SourceConfig, replaced
+from gr_ros2.config import QueuePolicy, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing, largest_message, smallest_packet_len
-from gr_ros2.link.queues import Dropped, TopicQueue
+from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Packet, encode, single_entry_payload
@@ -77,7 +77,7 @@ class Sender:
         self._largest = largest_message(config.packet_len)
         self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry)
         self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
-        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        self._with_deadline = self._deadlines()
         self._capped = any(topic.options.max_rate for topic in self.registry)
         self._plan: Plan | None = None
         self._plan_until = -inf
@@ -107,7 +107,9 @@ class Sender:
         serial = self._serial
         self._serial += 1
         self.stats.submitted[topic_id] += 1
-        self._observe(Accepted(serial, topic_id, payload, now))
+        if self._observer is not None:
+            expected = None if self._codec is None else self._codec.canonical(topic_id, payload)
+            self._observer(Accepted(serial, topic_id, payload, now, expected))
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
@@ -154,6 +156,27 @@ class Sender:
             times.append(self._plan_until)
         return max(min(times), self._slot) if times else None
 
+    def follow(self, topic_id: int, *, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0) -> bool:
+        """Let a topic's queue follow the QoS of its publishers, as far as the configuration leaves it open.
+
+        :param depth: of their history, 0 unbounded or not known
+        :param lifespan_s: s after which a message is of no use, 0 for ever
+        :param period_s: s within which they promise a message, 0 no promise
+        :return: whether that changed it; ``queue`` has what it is
+        """
+        queue = self._queues[topic_id]
+        wanted = queue_for(self.registry[topic_id].options, depth, lifespan_s, period_s)
+        if wanted == self.queue(topic_id):
+            return False
+        queue.change(*wanted)
+        self._with_deadline = self._deadlines()
+        return True
+
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+        """Policy and deadline (s, 0 none) of a topic's queue."""
+        queue = self._queues[topic_id]
+        return queue.policy, queue.deadline_s
+
     def use_credit(self) -> None:
         """From now on a packet leaves only for a credit."""
         if self._credits is None:
@@ -199,6 +222,9 @@ class Sender:
         self._plan_until = -inf
         if "packet_rate" in settings:
             self._slot = -inf
+
+    def _deadlines(self) -> list[TopicQueue]:
+        return [queue for queue in self._queues.values() if queue.deadline_s]
 
     def _depth(self, topic_id: int) -> int:
         depth = self.registry[topic_id].options.queue_depth
@@ -249,7 +275,8 @@ class Sender:
         """When a planned packet may leave: at once if full, else after it has waited for company."""
         if plan.full or self.config.flush_timeout == 0:
             return -inf
-        return min(message.submitted for message in plan.picks) + self.config.flush_timeout
+        waits = (min(message.submitted, self._queues[message.topic_id].since) for message in plan.picks)
+        return min(waits) + self.config.flush_timeout
 
     def _compose(self, plan: Plan, now: float) -> bytes:
         config = self.config
@@ -321,8 +348,7 @@ class Sender:
 
 
 def _queue(topic: Topic) -> TopicQueue:
-    options = topic.options
-    return TopicQueue(options.queue_policy, options.deadline_ms / 1e3, options.max_rate)
+    return TopicQueue(*queue_for(topic.options), topic.options.max_rate)
 
 
 def _packet_qos(plan: Plan) -> int:

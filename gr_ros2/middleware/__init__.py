@@ -14,6 +14,12 @@ MIDDLEWARE = BackendTable(
         "rclpy": Backend(
             "gr_ros2.middleware.rclpy", "RclpyMiddleware", "a sourced ROS 2 (Humble or later)", "a sourced ROS 2 setup"
         ),
+        "zenoh": Backend(
+            "gr_ros2.middleware.zenoh",
+            "ZenohMiddleware",
+            "rmw_zenoh's conventions, experimental",
+            "pip install eclipse-zenoh==1.10.2",
+        ),
         "bag": Backend("gr_ros2.middleware.bag", "BagMiddleware", "a ROS 2 bag, MCAP or sqlite3"),
         "memory": Backend("gr_ros2.middleware.memory", "MemoryMiddleware", "one process, for tests"),
     },

@@ -5,7 +5,8 @@ Law: pure bookkeeping over what discovery reports; nothing here knows a DDS, a t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from gr_ros2.middleware.base import Qos
 
@@ -15,18 +16,47 @@ def settle(asked: Qos, offered: Iterable[Qos]) -> Qos:
     offers = tuple(offered)
     reliable = all(offer.reliability == "reliable" for offer in offers)
     latched = all(offer.durability == "transient_local" for offer in offers)
-    return Qos(
-        asked.reliability or ("reliable" if reliable else "best_effort"),
-        asked.durability or ("transient_local" if latched else "volatile"),
-        asked.depth,
+    return replace(
+        asked,
+        reliability=asked.reliability or ("reliable" if reliable else "best_effort"),
+        durability=asked.durability or ("transient_local" if latched else "volatile"),
     )
+
+
+def offered(qos: Qos) -> Qos:
+    """The QoS of a publisher: what is left open has its default."""
+    return replace(qos, reliability=qos.reliability or "reliable", durability=qos.durability or "volatile")
+
+
+def refused_policies(offer: Qos, request: Qos) -> list[str]:
+    """Policies in which an offer falls short of a request; what a request leaves open adapts and never does."""
+    refused = []
+    if request.reliability == "reliable" and offer.reliability == "best_effort":
+        refused.append("reliability")
+    if request.durability == "transient_local" and offer.durability == "volatile":
+        refused.append("durability")
+    if request.deadline_s and not 0 < offer.deadline_s <= request.deadline_s:
+        refused.append("deadline")
+    return refused
 
 
 def compatible(offer: Qos, request: Qos) -> bool:
     """Whether DDS matches a publisher that offers with a subscription that requests."""
-    return (request.reliability != "reliable" or offer.reliability == "reliable") and (
-        request.durability != "transient_local" or offer.durability == "transient_local"
-    )
+    return not refused_policies(offer, request)
+
+
+def agreed(offers: Sequence[Qos]) -> Qos:
+    """What the publishers of a topic say about its messages, all together.
+
+    History and deadline are of one publisher alone: its newest message replaces its own earlier ones, not those of
+    another. So with several the history is unbounded, there is no deadline, and the longest lifespan counts.
+
+    :param offers: one at least
+    """
+    if len(offers) == 1:
+        return offers[0]
+    lifespans = [offer.lifespan_s for offer in offers]
+    return replace(offers[0], depth=0, lifespan_s=max(lifespans) if all(lifespans) else 0.0, deadline_s=0.0)
 
 
 class Adaptation:

@@ -9,15 +9,16 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.bag_files import BagMessage, bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.registry import normalize_type
 
 __all__ = ["BagMessage", "BagMiddleware", "BagPublisher", "bag_definitions", "bag_topics", "read_bag"]
@@ -64,7 +65,7 @@ class BagPublisher(Publisher):
 class BagSubscription(Subscription):
     """A topic being played."""
 
-    def __init__(self, topic: str, callback: MessageCallback, publishers: int) -> None:
+    def __init__(self, topic: str, callback: MessageCallback, publishers: Sequence[Qos]) -> None:
         self.topic = topic
         self.callback = callback
         self.closed = False
@@ -73,7 +74,11 @@ class BagSubscription(Subscription):
 
     def matched(self) -> int:
         """Number of recorded publishers of this topic."""
-        return 0 if self.closed else self._publishers
+        return 0 if self.closed else len(self._publishers)
+
+    def follow(self, on_offers: OffersCallback) -> None:
+        if self._publishers:
+            on_offers(self._publishers)
 
     def close(self) -> None:
         self.closed = True
@@ -146,7 +151,7 @@ class BagMiddleware(Middleware):
             _log.warning("bag %s: has no topic %s; it has %s", self.path, topic, ", ".join(self._topics) or "none")
         elif info.type_name != type_name:
             raise ConfigError(f"bag {self.path}: {topic} is {info.type_name}, not {type_name}")
-        subscription = BagSubscription(topic, callback, len(info.publishers) if info else 0)
+        subscription = BagSubscription(topic, callback, info.publishers if info else ())
         with self._starting:
             if self._thread is not None:
                 raise MiddlewareError(f"subscribe {topic}: bag {self.path} is playing; subscribe before start()")
@@ -206,8 +211,7 @@ class BagMiddleware(Middleware):
         """
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
         recorder = self._writing(f"advertise {topic}")
-        qos = Qos(qos.reliability or "reliable", qos.durability or "volatile", qos.depth)
-        return BagPublisher(recorder, recorder.channel(topic, type_name, qos))
+        return BagPublisher(recorder, recorder.channel(topic, type_name, offered(qos)))
 
     # Both
 

@@ -17,11 +17,12 @@ from rosbags.interfaces import (
     QosDurability,
     QosHistory,
     QosReliability,
+    QosTime,
 )
 from rosbags.rosbag2 import Reader
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
-from gr_ros2.middleware.base import Qos, TopicInfo
+from gr_ros2.middleware.base import Qos, TopicInfo, finite
 
 
 class BagMessage(NamedTuple):
@@ -97,6 +98,12 @@ def _offered(connection: Connection) -> list[Qos]:
             "best_effort" if profile.reliability is QosReliability.BEST_EFFORT else "reliable",
             "transient_local" if profile.durability is QosDurability.TRANSIENT_LOCAL else "volatile",
             0 if profile.history is QosHistory.KEEP_ALL else profile.depth,
+            _seconds(profile.lifespan),
+            _seconds(profile.deadline),
         )
         for profile in profiles
     ] or [Qos("reliable", "volatile", 10)]
+
+
+def _seconds(time: QosTime) -> float:
+    return finite(time.sec + time.nsec * 1e-9)

@@ -15,10 +15,11 @@ from typing import Any, Final, NamedTuple
 
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.interfaces import Qos as Profile
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware.bag_files import explained
+from gr_ros2.middleware.bag_mcap import BagWriter, TwoTimes
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.type_definitions import definition
 
@@ -43,6 +44,7 @@ class _Message(NamedTuple):
     channel: BagChannel
     stamp_ns: int
     payload: bytes
+    sent_ns: int | None
 
 
 class _Job(NamedTuple):
@@ -72,7 +74,7 @@ class BagRecorder:
         self.error: BagError | None = None
         self._definitions = dict(definitions)
         self._count = count
-        self._writer = Writer(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
+        self._writer = BagWriter(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
         # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
         self._writer.set_custom_data("recorded_by", "gr_ros2")
         self._channels: dict[tuple[str, Qos], BagChannel] = {}
@@ -110,9 +112,11 @@ class BagRecorder:
                 self._channels[topic, qos] = BagChannel(topic, type_name, connection)
             return self._channels[topic, qos]
 
-    def write(self, channel: BagChannel, stamp_ns: int, payload: bytes) -> None:
+    def write(self, channel: BagChannel, stamp_ns: int, payload: bytes, sent_ns: int | None = None) -> None:
         """Queue one message.
 
+        :param stamp_ns: when it was received, ns since 1970
+        :param sent_ns: when it was sent, None = the same; only MCAP keeps it
         :raises MiddlewareError: closed
         :raises BagError: the file could not be written
         """
@@ -120,7 +124,7 @@ class BagRecorder:
             raise MiddlewareError(f"publish on {channel.topic}: bag {self.path} is closed")
         if self.error is not None:
             raise self.error
-        self._queue.put(_Message(channel, stamp_ns, payload))
+        self._queue.put(_Message(channel, stamp_ns, payload, sent_ns))
 
     def close(self) -> None:
         """Write what is queued and the index; the second call does nothing.
@@ -162,6 +166,8 @@ class BagRecorder:
         if self.error is None:
             try:
                 with explained(self.path, "written"):
+                    if isinstance(self._writer.storage, TwoTimes):
+                        self._writer.storage.sent_ns = message.sent_ns
                     self._writer.write(message.channel.connection, message.stamp_ns, message.payload)
                 return
             except BagError as error:
@@ -175,9 +181,13 @@ def _profile(qos: Qos) -> Profile:
         qos.depth,
         QosReliability.BEST_EFFORT if qos.reliability == "best_effort" else QosReliability.RELIABLE,
         QosDurability.TRANSIENT_LOCAL if qos.durability == "transient_local" else QosDurability.VOLATILE,
-        deadline=_FOREVER,
-        lifespan=_FOREVER,
+        deadline=_time(qos.deadline_s),
+        lifespan=_time(qos.lifespan_s),
         liveliness=QosLiveliness.AUTOMATIC,
         liveliness_lease_duration=_FOREVER,
         avoid_ros_namespace_conventions=False,
     )
+
+
+def _time(seconds: float) -> QosTime:
+    return QosTime(*divmod(int(seconds * 1e9), 1_000_000_000)) if seconds else _FOREVER

@@ -12,7 +12,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import ClassVar, Literal
@@ -20,6 +20,8 @@ from typing import ClassVar, Literal
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
 MessageCallback = Callable[[bytes], None]
+FOR_EVER_S = 1e9
+"""A duration from which on it is none: what stands for "infinite" differs between DDS, rclpy and bags."""
 
 _log = logging.getLogger(__name__)
 
@@ -31,12 +33,25 @@ class Qos:
     :param reliability: None adapts a subscription to the publishers found (reliable only if all offer it);
         a publisher with None is reliable
     :param durability: None adapts likewise; a publisher with None is volatile
-    :param depth: history depth in messages, 0 = unbounded (KeepAll)
+    :param depth: history depth in messages, 0 = unbounded (KeepAll); of a publisher found whose discovery data does
+        not tell it, the default
+    :param lifespan_s: of a publisher: s after which a message of it is of no use to anybody, 0 = for ever
+    :param deadline_s: s within which a publisher promises the next message, or a subscription asks for it, 0 = not
     """
 
     reliability: Reliability | None = None
     durability: Durability | None = None
     depth: int = 10
+    lifespan_s: float = 0.0
+    deadline_s: float = 0.0
+
+
+OffersCallback = Callable[[Sequence[Qos]], None]
+
+
+def finite(seconds: float) -> float:
+    """A duration of a graph as a Qos has it: 0 where it is none, or longer than ``FOR_EVER_S``."""
+    return seconds if 0 < seconds < FOR_EVER_S else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +91,12 @@ class Subscription(ABC):
     @abstractmethod
     def matched(self) -> int:
         """Number of publishers currently matched."""
+
+    def follow(self, on_offers: OffersCallback) -> None:  # noqa: B027 - a graph without discovery has nothing to tell
+        """Call ``on_offers`` with what the publishers found offer, now and whenever that has changed.
+
+        It runs in the thread of the caller or of the back-end; without any publisher it is not called.
+        """
 
     @abstractmethod
     def close(self) -> None: ...

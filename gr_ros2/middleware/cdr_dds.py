@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from cyclonedds.internal import DDS
 
 from gr_ros2.errors import MiddlewareError
-from gr_ros2.middleware.base import Qos
+from gr_ros2.middleware.base import Qos, finite
 
 if not version("cyclonedds").startswith("11.0."):
     raise ImportError(f"cyclonedds {version('cyclonedds')} is installed, which lacks a layout this was written for")
@@ -41,6 +41,10 @@ _PUBLICATIONS, _SUBSCRIPTIONS = 0x7FFF0003, 0x7FFF0004
 _BLOCK_NS = 1_000_000_000
 """A reliable write waits this long for a subscriber that does not keep up."""
 _OFFERED_INCOMPATIBLE, _REQUESTED_INCOMPATIBLE, _SAMPLE_LOST = 1 << 3, 1 << 4, 1 << 5
+
+_TELLS_HISTORY = bytes((1, 16))
+"""Vendor id of Cyclone DDS. History is no part of a publisher's discovery data in the standard (Fast DDS leaves it out
+and so would seem to be KeepLast 1); Cyclone DDS sends it."""
 
 _POLICIES = {
     2: "durability",
@@ -192,7 +196,11 @@ _set_lifecycle = _function("dds_qset_writer_data_lifecycle", None, _ptr, c.c_boo
 _set_representation = _function("dds_qset_data_representation", None, _ptr, _u32, c.POINTER(c.c_int16))
 _get_reliability = _function("dds_qget_reliability", c.c_bool, _ptr, c.POINTER(c.c_int), c.POINTER(_i64))
 _get_durability = _function("dds_qget_durability", c.c_bool, _ptr, c.POINTER(c.c_int))
+_set_lifespan = _function("dds_qset_lifespan", None, _ptr, _i64)
+_set_deadline = _function("dds_qset_deadline", None, _ptr, _i64)
 _get_history = _function("dds_qget_history", c.c_bool, _ptr, c.POINTER(c.c_int), c.POINTER(_i32))
+_get_lifespan = _function("dds_qget_lifespan", c.c_bool, _ptr, c.POINTER(_i64))
+_get_deadline = _function("dds_qget_deadline", c.c_bool, _ptr, c.POINTER(_i64))
 _status = {
     name: _function(f"dds_get_{name}_status", _i32, _i32, c.POINTER(_Status))
     for name in (
@@ -262,24 +270,36 @@ def _make_qos(qos: Qos, user_data: bytes) -> int:
     _set_durability_service(pointer, 0, *history, -1, -1, -1)
     _set_lifecycle(pointer, False)  # a publisher that leaves does not dispose what it published
     _set_representation(pointer, 1, c.byref(c.c_int16(0)))
+    if qos.lifespan_s:
+        _set_lifespan(pointer, int(qos.lifespan_s * 1e9))
+    if qos.deadline_s:
+        _set_deadline(pointer, int(qos.deadline_s * 1e9))
     if user_data:
         _set_userdata(pointer, user_data, len(user_data))
     return int(pointer)
 
 
-def _read_qos(pointer: int) -> Qos:
-    kind, depth, blocking = c.c_int(0), _i32(1), _i64(0)
-    _get_reliability(pointer, c.byref(kind), c.byref(blocking))
+def _read_qos(pointer: int, key: bytes) -> Qos:
+    """The QoS of the endpoint with that GUID, which begins with the vendor of its DDS."""
+    kind, depth, nanoseconds = c.c_int(0), _i32(1), _i64(0)
+    _get_reliability(pointer, c.byref(kind), c.byref(nanoseconds))
     reliable = kind.value == 1
     kind.value = 0
     _get_durability(pointer, c.byref(kind))
     latched = kind.value >= 1
     kind.value = 0
     _get_history(pointer, c.byref(kind), c.byref(depth))
+    nanoseconds.value = 0
+    _get_lifespan(pointer, c.byref(nanoseconds))
+    lifespan_s = finite(nanoseconds.value * 1e-9)
+    nanoseconds.value = 0
+    _get_deadline(pointer, c.byref(nanoseconds))
     return Qos(
         "reliable" if reliable else "best_effort",
         "transient_local" if latched else "volatile",
-        0 if kind.value == 1 else depth.value,
+        (0 if kind.value == 1 else depth.value) if key.startswith(_TELLS_HISTORY) else Qos().depth,
+        lifespan_s,
+        finite(nanoseconds.value * 1e-9),
     )
 
 
@@ -429,7 +449,7 @@ class EndpointWatch:
                 changes.append((key, None))
                 continue
             topic, type_name = data.topic_name.decode(errors="replace"), data.type_name.decode(errors="replace")
-            found = DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, _read_qos(data.qos))
+            found = DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, _read_qos(data.qos, key))
             changes.append((key, found))
         if taken:
             _return_loan(self.entity, samples, taken)

@@ -16,6 +16,7 @@ from functools import partial
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.base import MessageCallback, Middleware, Qos, TopicInfo
 from gr_ros2.middleware.cdr_dds import (
     DdsError,
@@ -115,8 +116,7 @@ class DdsMiddleware(Middleware):
     def advertise(self, topic: str, type_name: str, qos: Qos) -> DdsPublisher:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
         self._check_open(f"advertise {topic}")
-        qos = Qos(qos.reliability or "reliable", qos.durability or "volatile", qos.depth)
-        writer = RawWriter(self._participant, self._topic(topic, type_name), qos, self._user_data(type_name))
+        writer = RawWriter(self._participant, self._topic(topic, type_name), offered(qos), self._user_data(type_name))
         publisher = DdsPublisher(self, topic, writer)
         with self._lock:
             self._advertised.append(publisher)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.adapt import settle
-from gr_ros2.middleware.base import MessageCallback, Publisher, Qos, Subscription
+from gr_ros2.middleware.base import MessageCallback, OffersCallback, Publisher, Qos, Subscription
 from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter
 
 if TYPE_CHECKING:
@@ -91,6 +91,8 @@ class DdsSubscription(Subscription):
         self._open_policies = [name for name in ("reliability", "durability") if getattr(qos, name) is None]
         self._lock = threading.RLock()  # held while readers change or deliver
         self._closed = False
+        self._offers: list[Qos] = []
+        self._on_offers: OffersCallback | None = None
         self._qos: Qos | None = None
         self._reader: RawReader | None = None
         self._outdated: list[tuple[float, RawReader]] = []
@@ -107,6 +109,9 @@ class DdsSubscription(Subscription):
         with self._lock:
             if self._closed or (self._reader and not offers):
                 return
+            if offers != self._offers:
+                self._offers = offers
+                self._tell()
             qos = settle(self._wanted, offers or [_LEAST])
             if qos == self._qos:
                 return
@@ -116,6 +121,15 @@ class DdsSubscription(Subscription):
             self._reader = self._middleware.make_reader(self, qos)
             self._qos = qos
         self._middleware.announce()
+
+    def follow(self, on_offers: OffersCallback) -> None:
+        with self._lock:
+            self._on_offers = on_offers
+            self._tell()
+
+    def _tell(self) -> None:
+        if self._on_offers is not None and self._offers:
+            self._on_offers(self._offers)
 
     @property
     def outdated(self) -> float | None:

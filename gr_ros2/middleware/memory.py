@@ -10,27 +10,19 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
+from collections.abc import Callable
 from weakref import WeakValueDictionary
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.adapt import offered, refused_policies
+from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.registry import normalize_type
 
 JOIN_S = 1.0
 """s that close() waits for a callback to return."""
 
 _log = logging.getLogger(__name__)
-
-
-def refused_policies(offered: Qos, requested: Qos) -> list[str]:
-    """Policies in which an offer falls short of a request; what a request leaves open adapts and never falls short."""
-    refused = []
-    if offered.reliability == "best_effort" and requested.reliability == "reliable":
-        refused.append("reliability")
-    if offered.durability == "volatile" and requested.durability == "transient_local":
-        refused.append("durability")
-    return refused
 
 
 class _Graph:
@@ -61,12 +53,14 @@ class _Graph:
         if not refused:
             publisher.matches.append(subscription)
             subscription.matches[publisher] = publisher.published
+            subscription.middleware.call(subscription.tell)
 
     def left(self, endpoint: MemoryPublisher | MemorySubscription) -> None:
         if isinstance(endpoint, MemoryPublisher):
             self.publishers.remove(endpoint)
             for subscription in endpoint.matches:
                 subscription.matches.pop(endpoint, None)
+                subscription.middleware.call(subscription.tell)
                 self.replay(subscription)
         else:
             self.subscriptions.remove(endpoint)
@@ -142,6 +136,7 @@ class MemorySubscription(Subscription):
         self.callback = callback
         self.matches: dict[MemoryPublisher, int] = {}  # messages published before that are yet to be replayed
         self.waiting: deque[bytes] = deque()
+        self.on_offers: OffersCallback | None = None
         self.closed = False
         self.calling = threading.RLock()  # held while calling back
 
@@ -156,7 +151,30 @@ class MemorySubscription(Subscription):
             self.middleware.count(f"samples_lost:{self.topic}", text)
         else:
             self.waiting.append(payload)
-            self.middleware.wake(self)
+            self.middleware.call(self.take)
+
+    def take(self) -> None:
+        """Call back with the oldest message that waits."""
+        with self.calling:
+            with self.middleware.graph.lock:
+                if not self.waiting:
+                    return
+                payload = self.waiting.popleft()
+            if not self.closed:
+                self.middleware.deliver(self.topic, self.callback, payload)
+
+    def follow(self, on_offers: OffersCallback) -> None:
+        with self.middleware.graph.lock:
+            self.on_offers = on_offers
+            self.middleware.call(self.tell)
+
+    def tell(self) -> None:
+        """Say what the publishers offer."""
+        with self.calling:
+            with self.middleware.graph.lock:
+                offers = [publisher.qos for publisher in self.matches]
+            if offers and self.on_offers is not None and not self.closed:
+                self.on_offers(offers)
 
     def matched(self) -> int:
         return len(self.matches)
@@ -190,7 +208,7 @@ class MemoryMiddleware(Middleware):
         with _graphs_lock:
             self.graph = _graphs.setdefault(self.domain_id, _Graph())
         self.closed = False
-        self._pending: deque[MemorySubscription] = deque()  # one token per queued message
+        self._pending: deque[Callable[[], None]] = deque()
         self._wake = threading.Condition(self.graph.lock)
         self._thread = threading.Thread(target=self._run, name=f"memory-{self.domain_id}-{node_name}", daemon=True)
         self._thread.start()
@@ -208,8 +226,7 @@ class MemoryMiddleware(Middleware):
 
     def advertise(self, topic: str, type_name: str, qos: Qos) -> MemoryPublisher:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
-        qos = Qos(qos.reliability or "reliable", qos.durability or "volatile", qos.depth)
-        publisher = MemoryPublisher(self, topic, type_name, qos)
+        publisher = MemoryPublisher(self, topic, type_name, offered(qos))
         with self.graph.lock:
             self._check_open(f"advertise {topic}")
             self.graph.publishers.append(publisher)
@@ -227,9 +244,9 @@ class MemoryMiddleware(Middleware):
                     row[isinstance(endpoint, MemorySubscription)].append(endpoint.qos)
         return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
 
-    def wake(self, subscription: MemorySubscription) -> None:
-        """One more message waits. Called with the graph's lock held."""
-        self._pending.append(subscription)
+    def call(self, step: Callable[[], None]) -> None:
+        """Let the participant's thread do something. Called with the graph's lock held."""
+        self._pending.append(step)
         self._wake.notify()
 
     def close(self) -> None:
@@ -254,13 +271,8 @@ class MemoryMiddleware(Middleware):
                     self._wake.wait()
                 if self.closed:
                     return
-                subscription = self._pending.popleft()
-                if not subscription.waiting:
-                    continue
-                payload = subscription.waiting.popleft()
-            with subscription.calling:
-                if not subscription.closed:
-                    self.deliver(subscription.topic, subscription.callback, payload)
+                step = self._pending.popleft()
+            step()
 
     def _check_open(self, what: str) -> None:
         if self.closed:

@@ -22,6 +22,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -29,7 +30,16 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.adapt import Adaptation, compatible
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import (
+    MessageCallback,
+    Middleware,
+    OffersCallback,
+    Publisher,
+    Qos,
+    Subscription,
+    TopicInfo,
+    finite,
+)
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.registry import normalize_type
 
@@ -78,6 +88,8 @@ def _to_profile(qos: Qos) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL
         if qos.durability == "transient_local"
         else DurabilityPolicy.VOLATILE,
+        lifespan=Duration(nanoseconds=int(qos.lifespan_s * 1e9)),  # 0: not specified, which is for ever
+        deadline=Duration(nanoseconds=int(qos.deadline_s * 1e9)),
     )
 
 
@@ -95,6 +107,8 @@ def _from_profile(profile: Any) -> Qos:
         "reliable" if profile.reliability == ReliabilityPolicy.RELIABLE else "best_effort",
         "transient_local" if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL else "volatile",
         depth,
+        finite(profile.lifespan.nanoseconds * 1e-9),
+        finite(profile.deadline.nanoseconds * 1e-9),
     )
 
 
@@ -335,6 +349,8 @@ class _RclpySubscription(Subscription):
         self._callback = callback
         self._adaptation = Adaptation(qos)
         self._endpoint: Any = None
+        self._offers: list[Qos] = []
+        self._on_offers: OffersCallback | None = None
         self._closed = False
         self._lock = threading.RLock()  # the first join is in the caller's thread, with the executor's already at work
 
@@ -342,10 +358,24 @@ class _RclpySubscription(Subscription):
         """Join the graph, or join it anew, where the publishers call for it."""
         with self._lock:
             if not self._closed:
-                qos = self._adaptation.consider(self._middleware.publishers_of(self._topic, self._type_name))
+                publishers = self._middleware.publishers_of(self._topic, self._type_name)
+                offers = list(publishers.values())
+                if offers != self._offers:
+                    self._offers = offers
+                    self._tell()
+                qos = self._adaptation.consider(publishers)
                 if qos is not None:
                     _log.info("%s: joining as %s, %s", self._topic, qos.reliability, qos.durability)
                     self._join()
+
+    def follow(self, on_offers: OffersCallback) -> None:
+        with self._lock:
+            self._on_offers = on_offers
+            self._tell()
+
+    def _tell(self) -> None:
+        if self._on_offers is not None and self._offers:
+            self._on_offers(self._offers)
 
     def revive(self) -> None:
         """Join anew where rclpy failed to take a message (an empty one, say): it never listens there again."""

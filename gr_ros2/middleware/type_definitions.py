@@ -17,7 +17,7 @@ UNKNOWN = "# The definition of this type was not known where it was recorded; th
 
 
 @cache
-def _store() -> Typestore:
+def typestore() -> Typestore:
     """The types of the sourced ROS distribution, Humble's where none is sourced or rosbags has none of that name."""
     name = f"ROS2_{os.environ.get('ROS_DISTRO', 'humble').upper()}"
     return get_typestore(Stores[name] if name in Stores.__members__ else Stores.ROS2_HUMBLE)
@@ -25,7 +25,7 @@ def _store() -> Typestore:
 
 def known(type_name: str) -> bool:
     """Whether ROS ships ``package/msg/Type``."""
-    return type_name in _store().fielddefs
+    return type_name in typestore().fielddefs
 
 
 def definition(type_name: str, custom: Mapping[str, str] | None = None) -> tuple[str, str]:
@@ -36,11 +36,11 @@ def definition(type_name: str, custom: Mapping[str, str] | None = None) -> tuple
     text = (custom or {}).get(type_name)
     if text is None:
         if known(type_name):
-            return _store().generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name)
+            return typestore().generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name)
         text = UNKNOWN
     store = get_typestore(Stores.EMPTY)
     try:
-        store.register(_store().fielddefs)
+        store.register(typestore().fielddefs)
         store.register(get_types_from_msg(text, type_name))
         return text, str(store.hash_rihs01(type_name))
     except (TypesysError, KeyError):
@@ -49,4 +49,4 @@ def definition(type_name: str, custom: Mapping[str, str] | None = None) -> tuple
 
 def type_hash(type_name: str) -> str:
     """RIHS01 hash of a type ROS ships (REP-2011), '' for others."""
-    return str(_store().hash_rihs01(type_name)) if known(type_name) else ""
+    return str(typestore().hash_rihs01(type_name)) if known(type_name) else ""

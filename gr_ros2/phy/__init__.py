@@ -11,7 +11,7 @@ PHY = BackendTable(
     "phy",
     {
         "direct": Backend("gr_ros2.phy.direct", "DirectPhy", "message loopback, no samples"),
-        "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "GNU Radio's stock OFDM", _GNURADIO),
+        "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "OFDM against echoes, own or stock receiver", _GNURADIO),
         "gfsk": Backend("gr_ros2.phy.gfsk", "GfskPhy", "GMSK bursts, constant envelope", _GNURADIO),
         "psk": Backend("gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO),
         "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format", _GNURADIO),

@@ -1,6 +1,7 @@
 """The gate in front of a simulated transmitter: packets pass at the pace of the air, and credits flow back.
 
-Laws: with pace `airtime` no packet passes before its airtime is over (`throttle` would let bursts through), and
+Laws: with pace `airtime` no packet passes before its airtime is over, or ``early`` before that where a device
+spends the time (`throttle` would let bursts through), and
 the queue is unbounded and counted; with pace `flow` packets pass at once, and credits keep at most ``window`` of
 them between the gate and the place ``progress`` counts at; samples are never touched.
 """
@@ -37,6 +38,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     :param airtime: s one packet occupies, gap included; 0 lets packets pass at once
     :param pace: `airtime` as on the air; `flow` as fast as the flowgraph takes it
     :param lead: s before the air is free at which a credit is given
+    :param early: s before its airtime is over at which a packet passes, see :class:`AirtimeClock`
     :param window: packets under way with pace `flow`, or with airtime 0, 1 or more
     :param progress: number of packets that are through, for the window; None counts those that passed the gate
     :raises ConfigError: for a value out of range
@@ -48,6 +50,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         pace: Pace = "airtime",
         *,
         lead: float = LEAD_S,
+        early: float = 0.0,
         window: int = WINDOW,
         progress: Callable[[], int] | None = None,
     ) -> None:
@@ -60,7 +63,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
         self._clock: AirtimeClock[Any] | None = None
         if pace == "airtime" and airtime > 0:
-            self._clock = AirtimeClock(airtime, lead)
+            self._clock = AirtimeClock(airtime, lead, early)
         self._window = window
         self._progress = progress
         self._granted = 0

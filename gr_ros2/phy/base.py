@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 
 
@@ -48,6 +49,25 @@ class Phy(ABC):
         :param snr_db: mean burst power over noise power in the sampled band, dB
         """
         return 1.0
+
+    def check_channel(self, channel: ChannelConfig) -> None:
+        """Refuse a channel that cannot be had here.
+
+        :raises ConfigError: for a setting that acts on samples where there are none, or a Doppler shift beyond what
+            the samples show; names it
+        """
+        sampled = channel.on_samples()
+        if sampled and not self.has_samples:
+            name, value = next(iter(sampled.items()))
+            raise ConfigError(
+                f"channel.{name} = {value!r}: phy {self.name} has no samples for it to act on; leave it out, or choose "
+                "another phy"
+            )
+        if self.has_samples and channel.doppler_hz > self.sample_rate / 2:
+            raise ConfigError(
+                f"channel.doppler_hz = {channel.doppler_hz:g}: phy {self.name} has {self.sample_rate:g} samples/s; "
+                f"at most {self.sample_rate / 2:g}"
+            )
 
     def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
         """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""

@@ -1,8 +1,8 @@
 """Bursts of fixed length without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
 
-Laws: sans-IO, arrays in and bytes out; every frame is whitened and ends in a CRC-32, so what comes out is what went in;
-a packet comes out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is
-counted and the search goes on right behind its first sample, so that it cannot hide the next one.
+Laws: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet comes
+out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and the
+search goes on right behind its first sample, so that it cannot hide the next one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.phy.fec import Bits, CodeName, Soft, make_code
+from gr_ros2.phy.soft import BitOrder
+
 Samples = NDArray[np.complex64]
 Octets = NDArray[np.uint8]
 
@@ -22,31 +25,56 @@ CRC_LEN = 4
 _SPARE = 1 << 16
 """Samples a receiver's memory holds beside one burst; more of it means less moving."""
 
-_STRETCH = 8192
-"""Samples searched at a time beside a preamble."""
-
 
 class Frame:
-    """A packet with its CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``), whitened with PN9.
+    """Packet, filling, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
 
     :param packet_len: bytes per packet
+    :param fec: name of the code
+    :param order: whether a byte's first bit on the air is its highest or its lowest
+    :param fill: zero bytes behind the packet, within the CRC
+    :param mask: what the bytes are whitened with, that many and four more; None = PN9
     """
 
-    def __init__(self, packet_len: int) -> None:
+    def __init__(
+        self,
+        packet_len: int,
+        fec: CodeName = "none",
+        *,
+        order: BitOrder = "big",
+        fill: int = 0,
+        mask: Octets | None = None,
+    ) -> None:
         self.packet_len = packet_len
-        self.length = packet_len + CRC_LEN
-        self._whitening = whitening(self.length)
+        self.length = packet_len + fill + CRC_LEN
+        self.coded = fec != "none"
+        self._fill, self._order = bytes(fill), order
+        self._mask = whitening(self.length) if mask is None else mask
+        self._code = make_code(fec, 8 * self.length)
 
-    def wrap(self, packet: bytes) -> Octets:
-        """The bytes of a frame."""
-        whole = packet + zlib.crc32(packet).to_bytes(CRC_LEN, "little")
-        return np.frombuffer(whole, np.uint8) ^ self._whitening
+    @property
+    def bits(self) -> int:
+        """Bits on the air."""
+        return self._code.coded_bits
 
-    def unwrap(self, frame: Octets) -> bytes | None:
-        """The packet, or None where the CRC-32 does not match."""
-        whole = (frame ^ self._whitening).tobytes()
-        packet = whole[: self.packet_len]
-        return packet if zlib.crc32(packet) == int.from_bytes(whole[self.packet_len :], "little") else None
+    @property
+    def data_bits(self) -> int:
+        """Bits before coding."""
+        return self._code.bits
+
+    def wrap(self, packet: bytes) -> Bits:
+        """A frame's bits in the order they are sent in."""
+        filled = packet + self._fill
+        whole = filled + zlib.crc32(filled).to_bytes(CRC_LEN, "little")
+        return self._code.encode(np.unpackbits(np.frombuffer(whole, np.uint8) ^ self._mask, bitorder=self._order))
+
+    def unwrap(self, soft: Soft) -> bytes | None:
+        """The packet that soft bits mean, or None where the CRC-32 does not match."""
+        whole = (np.packbits(self._code.decode(soft[: self.bits]), bitorder=self._order) ^ self._mask).tobytes()
+        filled = whole[:-CRC_LEN]
+        if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
+            return None
+        return filled[: self.packet_len]
 
 
 @lru_cache
@@ -71,17 +99,31 @@ class Search:
     start: int | None = None
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What a burst says.
+
+    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; filling may follow
+    :param points: what they were read from, for people to look at; magnitude about 1
+    """
+
+    soft: Soft
+    points: Samples
+
+
 class BurstModem(ABC):
     """A modulation for frames of one length.
 
-    :param packet_len: bytes per packet
+    :param frame: what a burst carries
     """
 
     margin = 0
-    """Samples before a burst's reference sample that ``demodulate`` may look at."""
+    """Samples before a burst's reference sample that ``read`` may look at."""
+    stretch = 8192
+    """Samples searched at a time beside a preamble: what lies behind a burst is looked at again after it."""
 
-    def __init__(self, packet_len: int) -> None:
-        self.frame = Frame(packet_len)
+    def __init__(self, frame: Frame) -> None:
+        self.frame = frame
 
     @property
     @abstractmethod
@@ -112,12 +154,12 @@ class BurstModem(ABC):
         """Look for the first burst."""
 
     def end(self, samples: Samples, start: int) -> int:  # noqa: ARG002
-        """Index behind the last sample that ``demodulate`` needs of the burst whose reference sample is ``start``."""
+        """Index behind the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
         return start + self.span
 
     @abstractmethod
-    def demodulate(self, samples: Samples, start: int) -> bytes | None:
-        """The packet of the burst whose reference sample stands at ``start``, None where it is damaged."""
+    def read(self, samples: Samples, start: int) -> Reading | None:
+        """The burst whose reference sample stands at ``start``, None where there is none after all."""
 
 
 class BurstReceiver:
@@ -130,9 +172,11 @@ class BurstReceiver:
         self._modem = modem
         self._buffer = np.zeros(modem.margin + modem.burst_samples + modem.preamble_samples + _SPARE, np.complex64)
         self._cursor = self._end = modem.margin
-        self._stretch = modem.preamble_samples + _STRETCH
+        self._stretch = modem.preamble_samples + modem.stretch
         self._start: int | None = None
         self._last: int | None = None
+        self.points = np.empty(0, np.complex64)
+        """What the newest packet was read from."""
         self.damaged = 0
         """Bursts found whose CRC-32 was wrong; noise taken for a preamble counts too."""
 
@@ -163,7 +207,6 @@ class BurstReceiver:
         packets: list[bytes] = []
         while True:
             if self._start is None:
-                # A stretch at a time, since what lies behind a burst is looked at again after it.
                 stretch = self._buffer[self._cursor : min(self._end, self._cursor + self._stretch)]
                 found = self._modem.find(stretch)
                 if found.start is not None:
@@ -177,11 +220,13 @@ class BurstReceiver:
                 self._last = self._modem.end(self._buffer[: self._end], self._start)
             if self._end < self._last:
                 return packets
-            packet = self._modem.demodulate(self._buffer[: self._end], self._start)
-            if packet is None:
+            reading = self._modem.read(self._buffer[: self._end], self._start)
+            packet = None if reading is None else self._modem.frame.unwrap(reading.soft)
+            if reading is None or packet is None:
                 self.damaged += 1
                 self._cursor = self._start + self._modem.peak_samples
             else:
                 packets.append(packet)
+                self.points = reading.points
                 self._cursor = self._last - self._modem.margin
             self._start = self._last = None

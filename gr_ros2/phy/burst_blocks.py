@@ -9,16 +9,19 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections import deque
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pmt
 from gnuradio import filter, gr, pdu
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
-from gr_ros2.phy.ofdm_wiring import only_warnings
-from gr_ros2.phy.threads import BlockThread, keep_messages
+from gr_ros2.phy.fec import CodeName
+from gr_ros2.phy.tap import SymbolTap
+from gr_ros2.phy.threads import BlockThread, keep_messages, only_warnings
 
 _PDUS = pmt.intern("pdus")
 _TX_KEY = "gr_ros2_tx_len"
@@ -33,6 +36,18 @@ _stopped: deque[Any] = deque(maxlen=32)
 """GNU Radio calls Python blocks without holding a reference, so a flowgraph whose maker dropped the hier block around
 them would crash. They are held here until they have stopped, and a while longer, since a flowgraph may start again; not
 for ever, since a block holds the buffers in front of it."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class BurstOptions:
+    """Settings that every burst PHY has.
+
+    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
+    :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
+    """
+
+    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
+    fec: CodeName = "none"
 
 
 class BurstPhy(Phy):
@@ -143,6 +158,10 @@ class BurstSink(gr.hier_block2):  # type: ignore[misc]
         """Bursts found whose CRC-32 was wrong."""
         return self._demodulator.damaged
 
+    def tap_symbols(self) -> SymbolTap:
+        """Let the points that packets are read from be seen."""
+        return SymbolTap(self._demodulator.points)
+
 
 class _Demodulator(gr.sync_block):  # type: ignore[misc]
     """Filtered samples in, message port `pdus` out."""
@@ -160,6 +179,11 @@ class _Demodulator(gr.sync_block):  # type: ignore[misc]
     def damaged(self) -> int:
         return self._damaged + (self._engine.damaged if self._engine is not None else 0)
 
+    def points(self) -> Samples:
+        """What the newest packet was read from; empty before the first."""
+        engine = self._engine
+        return np.empty(0, np.complex64) if engine is None else engine.points
+
     def start(self) -> bool:
         _alive.add(self)
         self._block_thread.keep()
@@ -176,11 +200,12 @@ class _Demodulator(gr.sync_block):  # type: ignore[misc]
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
         assert self._engine is not None
         for packet in self._engine.feed(input_items[0]):
-            self.message_port_pub(_PDUS, _pdu(packet))
+            self.message_port_pub(_PDUS, pdu_of(packet))
         return len(input_items[0])
 
 
-def _pdu(data: bytes) -> Any:
+def pdu_of(data: bytes) -> Any:
+    """A packet as a PDU without metadata."""
     # Nine times as fast as pmt.to_pmt of an array, and for long packets as pmt.init_u8vector.
     vector = pmt.deserialize_str(b"\n\x00" + len(data).to_bytes(4, "big") + b"\x01\x00" + data)
     return pmt.cons(pmt.make_dict(), vector)

@@ -1,25 +1,32 @@
-"""The simulated channel: GNU Radio's channel model on the samples, random loss on the packets.
+"""The simulated channel as GNU Radio blocks: fading, taps, offsets and noise on the samples, losses on the packets.
 
 Laws: noise is set from the mean power of a burst as it arrives, so `snr_db` means the same for every PHY; tags stop
 here (a transmitter's length tag would otherwise overrule the header the receiver parses); equal seeds give equal
-losses; every packet lost here is counted.
+noise, fading and losses; every packet lost here is counted. Fading moves on with the samples, which flow while
+something is on the air.
 """
 
 from __future__ import annotations
 
-import random
+import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 import pmt
 from gnuradio import channels, gr
 
-from gr_ros2.config import ChannelConfig, build
+from gr_ros2.config import ChannelConfig, replaced
+from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.threads import BlockThread
 
 _PDUS = pmt.intern("pdus")
+_SINUSOIDS = 16
+"""Of which a fading tap is the sum; GNU Radio's manual recommends 8 or more."""
+_FADING_SEEDS = 1009
+"""Apart, so that neighbouring seeds share no tap: GNU Radio seeds the taps seed, seed + 1, ..."""
+_LARGEST_SEED = 2**31 - 1
 
 
 def noise_voltage(snr_db: float | None, burst_power: float, taps: Sequence[complex] = (1.0,)) -> float:
@@ -36,7 +43,11 @@ def noise_voltage(snr_db: float | None, burst_power: float, taps: Sequence[compl
 
 
 class Channel(gr.hier_block2):  # type: ignore[misc]
-    """Complex stream in, complex stream out: taps, clock and carrier offset, noise."""
+    """Complex stream in, complex stream out: fading, taps, clock and carrier offset, noise.
+
+    With fading every tap is multiplied by a Rayleigh process of its own with mean power 1, so that `snr_db` is the
+    mean over the fades.
+    """
 
     def __init__(self, config: ChannelConfig, phy: Phy) -> None:
         super().__init__(
@@ -44,18 +55,24 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
         )
         self.config = config
         self._burst_power = phy.burst_power()
+        faded = [_fading(config, phy.sample_rate)] if config.doppler_hz else []
         # GNU Radio takes a noise seed of 0 as "seed from the time of day".
         self._model = channels.channel_model(
-            self._voltage(), config.frequency_offset, config.epsilon, list(config.taps), config.seed + 1, True
+            self._voltage(),
+            config.frequency_offset,
+            config.epsilon,
+            [1.0] if faded else list(config.taps),
+            config.seed + 1,
+            True,
         )
-        self.connect(self, self._model, self)
+        self.connect(self, *faded, self._model, self)
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """dB, None = no noise; heard about 8192 samples later, since the noise source has filled its buffer by then.
 
         :raises ConfigError: out of range
         """
-        self.config = _changed(self.config, snr_db=snr_db)
+        self.config = replaced(self.config, snr_db=snr_db)
         self._model.set_noise_voltage(self._voltage())
 
     def set_frequency_offset(self, frequency_offset: float) -> None:
@@ -63,41 +80,49 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
 
         :raises ConfigError: out of range
         """
-        self.config = _changed(self.config, frequency_offset=frequency_offset)
+        self.config = replaced(self.config, frequency_offset=frequency_offset)
         self._model.set_frequency_offset(self.config.frequency_offset)
 
     def _voltage(self) -> float:
         return noise_voltage(self.config.snr_db, self._burst_power, self.config.taps)
 
 
-class PacketLoss(gr.basic_block):  # type: ignore[misc]
-    """Message port `pdus` in and out: each packet is dropped with a probability, and counted either way.
+def _fading(config: ChannelConfig, sample_rate: float) -> Any:
+    """A block in which every tap that is not zero fades by itself."""
+    shift, seed = config.doppler_hz / sample_rate, config.seed * _FADING_SEEDS % _LARGEST_SEED
+    delays = [float(delay) for delay, tap in enumerate(config.taps) if tap]
+    mags = [abs(tap) for tap in config.taps if tap]
+    return channels.selective_fading_model(_SINUSOIDS, shift, False, 0.0, seed, delays, mags, len(config.taps))
 
-    :param probability: 0..1
-    :param seed: same seed, same losses for the same order of packets
-    :raises ConfigError: for a probability out of range
+
+class PacketLoss(gr.basic_block):  # type: ignore[misc]
+    """Message port `pdus` in and out: packets are dropped as the channel says, and counted either way.
+
+    :param config: what drops packets and its seed: same seed, same losses for the same order of packets
     """
 
-    def __init__(self, probability: float = 0.0, seed: int = 0) -> None:
+    def __init__(self, config: ChannelConfig) -> None:
         super().__init__("gr_ros2_packet_loss", None, None)
-        self._random = random.Random(seed)
-        self._probability = 0.0
-        self.set_probability(probability)
+        self._losses = PduLosses(config)
+        self.epoch = time.monotonic()
+        """s, monotonic: when the run began; outages count from here."""
         self.received = 0
-        self.dropped = 0
         self._block_thread = BlockThread()
         self.message_port_register_in(_PDUS)
         self.message_port_register_out(_PDUS)
         self.set_msg_handler(_PDUS, self._pass)
 
-    def set_probability(self, probability: float) -> None:
-        """Change the loss while running.
+    @property
+    def dropped(self) -> Counter[str]:
+        """Packets lost so far, by the setting that lost them."""
+        return Counter(self._losses.dropped)
 
-        :raises ConfigError: out of range
-        """
-        self._probability = build(ChannelConfig, {"packet_loss": probability}).packet_loss
+    def set_packet_loss(self, probability: float) -> None:
+        """Change the random loss while running; the caller checks its range."""
+        self._losses.packet_loss = probability
 
     def start(self) -> bool:
+        self.epoch = time.monotonic()
         self._block_thread.keep()
         return True
 
@@ -106,13 +131,7 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         return True
 
     def _pass(self, pdu: Any) -> None:
+        passes = self._losses.passes(time.monotonic() - self.epoch)
         self.received += 1
-        # Drawn always, so that changing the probability does not shift what the seed does later.
-        if self._random.random() < self._probability:
-            self.dropped += 1
-        else:
+        if passes:
             self.message_port_pub(_PDUS, pdu)
-
-
-def _changed(config: ChannelConfig, **settings: Any) -> ChannelConfig:
-    return build(ChannelConfig, {**{item.name: getattr(config, item.name) for item in fields(config)}, **settings})

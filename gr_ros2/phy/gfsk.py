@@ -16,10 +16,10 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import build
-from gr_ros2.phy.burst import Samples
-from gr_ros2.phy.burst_blocks import BurstPhy
-from gr_ros2.phy.linear import LinearModem, Reals, preamble_steps, shape
-from gr_ros2.phy.theory import packet_success, psk_symbol_error
+from gr_ros2.phy.burst import Frame, Samples
+from gr_ros2.phy.burst_blocks import BurstOptions
+from gr_ros2.phy.fec import Soft
+from gr_ros2.phy.linear import LinearModem, LinearPhy, Reals, preamble_steps, shape
 
 _PULSE_SYMBOLS = 4
 """Length of the Gaussian frequency pulse."""
@@ -30,43 +30,51 @@ _DESIGN_NOISE = 0.1
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class GfskOptions:
-    """Settings of this PHY beside packet length and sample rate.
+class GfskOptions(BurstOptions):
+    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
 
     :param sps: samples per bit, 2..64
     :param bt: bandwidth-time product of the Gaussian filter, 0.3..1; smaller is narrower and needs more SNR
-    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
     """
 
     sps: Annotated[int, Field(ge=2, le=64)] = 4
     bt: Annotated[float, Field(ge=0.3, le=1)] = 0.5
-    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
 
 
 class GfskModem(LinearModem):
     """See :class:`GfskOptions`."""
 
-    def __init__(self, packet_len: int, options: GfskOptions) -> None:
-        super().__init__(packet_len, 2, options.sps, turn=np.pi / 2)
+    def __init__(self, frame: Frame, options: GfskOptions) -> None:
+        super().__init__(frame, 2, options.sps, turn=np.pi / 2)
         self._pulse = frequency_pulse(options.sps, options.bt)
         self.taps: NDArray[np.float32] = wiener(main_pulse(self._pulse, options.sps), options.sps).astype(np.float32)
         self._head = np.concatenate((np.tile([1, -1], _LEAD // 2), preamble_steps()))
+        self._last = np.uint8(np.prod(preamble_steps()) < 0)
+
+    @property
+    def symbol_energy(self) -> float:
+        return float(self.sps)
 
     @property
     def burst_samples(self) -> int:
         return (_LEAD + self.symbols + _TAIL - 2) * self.sps + len(self._pulse)
 
     def modulate(self, packet: bytes) -> Samples:
-        data = 2.0 * np.unpackbits(self.frame.wrap(packet)) - 1
-        bits = np.concatenate((self._head, data, np.tile([1, -1], _TAIL // 2)))
+        data = self.frame.wrap(packet)
+        if self.frame.coded:
+            data = 1 ^ data ^ np.concatenate(([self._last], data[:-1]))
+        bits = np.concatenate((self._head, 2.0 * data - 1, np.tile([1, -1], _TAIL // 2)))
         burst: Samples = np.exp(1j * np.cumsum(shape(bits, self._pulse, self.sps))).astype(np.complex64)
         return burst
 
-    def decided(self, phases: NDArray[np.int64]) -> NDArray[np.int64]:
-        # A bit is the step from the symbol before; the first one's is the preamble's last.
-        last = int(np.prod(preamble_steps()) < 0)
-        changed: NDArray[np.int64] = phases ^ np.concatenate(([last], phases[:-1]))
-        return changed ^ 1
+    def meant(self, soft: Soft) -> Soft:
+        # A bit is 1 where the phase is that of the symbol before, the first one's before is the preamble's last. With a
+        # code the bits were sent so that the phases themselves are the bits, since a decoder minds errors in pairs.
+        if self.frame.coded:
+            return soft
+        certain = np.float32(np.inf if self._last else -np.inf)
+        before = np.concatenate(([certain], soft[:-1]))
+        return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
 
 
 def frequency_pulse(sps: int, bt: float) -> Reals:
@@ -116,10 +124,11 @@ def wiener(pulse: Reals, sps: int) -> Reals:
     return np.asarray(taps[::-1] / np.sqrt((taps**2).sum()))
 
 
-class GfskPhy(BurstPhy):
+class GfskPhy(LinearPhy):
     """For cheap transmitters and nonlinear amplifiers: the envelope is constant while a burst lasts.
 
-    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 14..4095 B.
+    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 14..4095 B. The computed curve is that
+    of antipodal pulses, which GMSK comes near to at a bandwidth-time product of 0.5 (MSK is equal).
 
     :param options: see :class:`GfskOptions`
     :raises ConfigError: for an option that is unknown or out of range
@@ -128,18 +137,6 @@ class GfskPhy(BurstPhy):
     name = "gfsk"
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
-        super().__init__(packet_len, sample_rate)
         self.options = build(GfskOptions, options, "phy gfsk")
-        self.modem: GfskModem = GfskModem(packet_len, self.options)
-        self.gap = self.options.gap
-
-    @property
-    def receiver_taps(self) -> Any:
-        return self.modem.taps
-
-    def burst_power(self) -> float:
-        return 1.0
-
-    def computed_pdr(self, snr_db: float) -> float:
-        """That of antipodal pulses, which GMSK comes near to at a bandwidth-time product of 0.5 (MSK is equal)."""
-        return packet_success(psk_symbol_error(2, 10 ** (snr_db / 10) * self.options.sps), self.modem.payload_symbols)
+        modem = GfskModem(Frame(packet_len, self.options.fec), self.options)
+        super().__init__(packet_len, sample_rate, modem, self.options)

@@ -6,29 +6,25 @@ thread of the link runs, whatever state it was in.
 
 from __future__ import annotations
 
-import logging
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import TracebackType
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig
+from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.airtime import AirtimeGate, Pace
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel, PacketLoss
 from gr_ros2.phy.tap import Samples, Tap
+from gr_ros2.phy.threads import begin
 
 TAP_SIZE = 1024
 """Samples of one look at the received signal."""
-
-
-_START_ATTEMPTS = 20
-"""GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -39,14 +35,19 @@ class LinkCounts:
     :param backlog: in the gate, waiting for the air or on it
     :param transmitted: left the transmitter as samples
     :param received: came out of the receiver
-    :param dropped: lost on purpose (``packet_loss``), after the receiver
+    :param losses: dropped on purpose after the receiver, by the channel's setting that did it
     """
 
     passed: int
     backlog: int
     transmitted: int
     received: int
-    dropped: int
+    losses: Mapping[str, int]
+
+    @property
+    def dropped(self) -> int:
+        """Packets dropped on purpose, whatever the setting."""
+        return sum(self.losses.values())
 
 
 class LoopbackLink(gr.top_block):  # type: ignore[misc]
@@ -55,12 +56,13 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
     :param phy: which physical layer
     :param source: block with message port `pdus` out, and `credit` in where ``paced``
     :param sink: block with message port `pdus` in, which counts the PDUs it is done with in ``handled``
-    :param channel: between transmitter and receiver; a PHY without samples uses its ``packet_loss`` only
+    :param channel: between transmitter and receiver
     :param pace: `airtime` as on the air, `flow` as fast as the flowgraph takes it (see :class:`AirtimeGate`)
     :param paced: the gate's credits pace the source; False offers every packet at once, as the paper does. With a PHY
         without samples there is nothing to pace by, except with pace `flow`
     :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, and taps
         for spectrum and constellation
+    :raises ConfigError: for a channel that this PHY cannot have
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("gr_ros2_loopback", catch_exceptions=True)
         channel = channel if channel is not None else ChannelConfig()
+        phy.check_channel(channel)
         self.phy = phy
         self.source = source
         self.sink = sink
@@ -87,8 +90,8 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         self._gate = (
             AirtimeGate(phy.airtime(), pace, progress=self._progress) if phy.has_samples or pace == "flow" else None
         )
-        lossy = phy.has_samples or channel.packet_loss or instrumented
-        self._loss = PacketLoss(channel.packet_loss, channel.seed) if lossy else None
+        lossy = phy.has_samples or channel.loses_packets or instrumented
+        self._loss = PacketLoss(channel) if lossy else None
         self._config = channel
         self._tap: Tap | None = None
         self._symbols: Tap | None = None
@@ -121,7 +124,7 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         """
         self._running = True
         try:
-            self._start(max_noutput_items)
+            begin(partial(super().start, max_noutput_items))
         except (RuntimeError, MemoryError) as error:
             self.stop()
             raise PhyError(f"phy {self.phy.name}: the flowgraph does not start ({error})") from error
@@ -135,6 +138,11 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
             super().stop()
             self.wait()
 
+    def run_began(self, now: float) -> None:
+        """Let the channel's outages count from now, s, monotonic, and not from the start of the flowgraph."""
+        if self._loss is not None:
+            self._loss.epoch = now
+
     def counts(self) -> LinkCounts:
         """A snapshot."""
         received = int(self.sink.handled) if self._loss is None else self._loss.received
@@ -144,7 +152,7 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
             backlog=0 if self._gate is None else self._gate.backlog,
             transmitted=passed if self._transmitter is None else self._transmitter.packets_sent(),
             received=received,
-            dropped=self._dropped(),
+            losses=self._losses(),
         )
 
     @property
@@ -186,8 +194,8 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
         """
         if self._loss is None:
             raise PhyError(f"packet_loss: phy {self.phy.name} was started without; start with packet_loss above 0")
-        self._loss.set_probability(probability)
-        self._config = replace(self._config, packet_loss=probability)
+        self._config = replaced(self._config, packet_loss=probability)
+        self._loss.set_packet_loss(probability)
 
     def __enter__(self) -> LoopbackLink:
         self.start()
@@ -198,15 +206,6 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
     ) -> None:
         self.stop()
 
-    def _start(self, max_noutput_items: int) -> None:
-        for _ in range(_START_ATTEMPTS - 1):
-            try:
-                super().start(max_noutput_items)
-                return
-            except MemoryError:
-                _log.debug("phy %s: GNU Radio could not map a buffer; starting again", self.phy.name)
-        super().start(max_noutput_items)
-
     def _sampled(self, setting: str) -> Channel:
         if self._channel is None:
             raise PhyError(f"{setting}: phy {self.phy.name} has no samples to change")
@@ -215,11 +214,11 @@ class LoopbackLink(gr.top_block):  # type: ignore[misc]
     def _progress(self) -> int:
         """Packets that are through, as far as a window has to know."""
         if self._transmitter is None:
-            return int(self.sink.handled) + self._dropped()
+            return int(self.sink.handled) + sum(self._losses().values())
         return int(self._transmitter.packets_sent())
 
-    def _dropped(self) -> int:
-        return 0 if self._loss is None else self._loss.dropped
+    def _losses(self) -> Mapping[str, int]:
+        return {} if self._loss is None else self._loss.dropped
 
     def _follow(self, last: Any, block: Any) -> Any:
         self.msg_connect(last, "pdus", block, "pdus")

@@ -17,10 +17,11 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import build
 from gr_ros2.errors import ConfigError
-from gr_ros2.phy.burst import BurstModem, Octets, Samples, Search
-from gr_ros2.phy.burst_blocks import BurstPhy
+from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import summit
-from gr_ros2.phy.theory import at_least, orthogonal_symbol_error, packet_success
+from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 
 MAX_BURST = 1 << 22
 """Samples; a longer burst would take more memory than small computers have."""
@@ -39,40 +40,44 @@ _CHUNK = 2048
 """Samples between two looks at the timing, at least a symbol."""
 _GAIN, _PACE_GAIN = 0.3, 0.05
 """Of the timing loop, per look: place, and speed of its change."""
+_CERTAIN = 50.0
+"""Of a soft bit."""
+_NIBBLE = np.array([8, 4, 2, 1])
+"""Weights of a nibble's bits, in the order they come."""
 _SINC = 12
 """Samples to either side that a value between two samples is made from."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class LoraOptions:
-    """Settings of this PHY beside packet length and sample rate.
+class LoraOptions(BurstOptions):
+    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
 
     :param spreading_factor: bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and
         2.5 dB less SNR
     :param coding_rate: check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none
-    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
     """
 
     spreading_factor: Annotated[int, Field(ge=7, le=12)] = 7
     coding_rate: Annotated[int, Field(ge=1, le=4)] = 4
-    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
 
 
 class LoraModem(BurstModem):
     """See :class:`LoraOptions`. The reference sample is the first of an up-chirp early in the preamble, about."""
 
-    def __init__(self, packet_len: int, options: LoraOptions) -> None:
-        super().__init__(packet_len)
+    def __init__(self, frame: Frame, options: LoraOptions) -> None:
+        super().__init__(frame)
         self.spreading_factor, self.code_bits = options.spreading_factor, 4 + options.coding_rate
         self.chips = 1 << options.spreading_factor
-        self.blocks = -(-2 * self.frame.length // options.spreading_factor)
+        self.blocks = -(-frame.bits // (4 * options.spreading_factor))
         self.symbols = self.blocks * self.code_bits
         n = np.arange(self.chips)
         self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)
         self._down = self._up.conj()
         self._roots = np.exp(2j * np.pi * n / self.chips).astype(np.complex64)
         self._words = code_words(options.coding_rate)
-        self._nibbles = nearest_nibbles(options.coding_rate)
+        gray = n ^ n >> 1
+        self._ones = [np.flatnonzero(gray >> bit & 1) for bit in range(options.spreading_factor)]
+        self._zeros = [np.flatnonzero(~gray >> bit & 1) for bit in range(options.spreading_factor)]
         self.margin = 2 * self.chips
 
     @property
@@ -125,25 +130,41 @@ class LoraModem(BurstModem):
         # What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
         return start + self.span if place is None else int(place[0]) + self.symbols * self.chips - _SINC
 
-    def demodulate(self, samples: Samples, start: int) -> bytes | None:
+    def read(self, samples: Samples, start: int) -> Reading | None:
         place = self._place(samples, start)
         if place is None:
             return None
         begin, carrier = place
         turn = np.exp(-2j * np.pi * carrier * np.arange(self.chips) / self.chips) * self._down
-        values = np.empty(self.symbols, np.int64)
+        soft = np.empty((self.symbols, self.spreading_factor), np.float32)
+        points = np.empty(self.symbols, np.complex64)
         step = max(1, _CHUNK // self.chips)
         pace = 0.0
         for first in range(0, self.symbols, step):
             count = min(step, self.symbols - first)
             at = begin + first * self.chips
             tones = _delayed(samples, at, count * self.chips).reshape(count, self.chips) * turn
-            peaks = np.argmax(np.abs(np.fft.fft(tones)), axis=1)
-            values[first : first + count] = peaks
+            spectrum = np.fft.fft(tones)
+            heights = np.abs(spectrum)
+            peaks = np.argmax(heights, axis=1)
+            points[first : first + count] = spectrum[np.arange(count), peaks] / max(float(heights.max()), _TINY)
+            soft[first : first + count] = self._soft(heights)
             late = self._late(tones, peaks)
             pace -= _PACE_GAIN * late
             begin += pace - _GAIN * late
-        return self.frame.unwrap(self._collect(values))
+        return Reading(self._collect(soft), points)
+
+    def _soft(self, heights: NDArray[np.float64]) -> Soft:
+        """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
+        powers = (heights**2).sum(axis=1)
+        peaks = heights.max(axis=1)
+        noise = max(float((powers - peaks**2).mean()) / (self.chips - 1), _TINY)
+        # For a bin's height h, of amplitude a if its chirp was sent: log I0(2 a h / noise) is 2 a h / noise, nearly.
+        likely = heights * (2 * peaks.mean() / noise)
+        bits = [likely[:, ones].max(1) - likely[:, zeros].max(1)
+                for ones, zeros in zip(self._ones, self._zeros, strict=True)]  # fmt: skip
+        # Beside certainties without limit, those of noisier chirps in the same code word would count for nothing.
+        return np.asarray(np.clip(np.stack(bits, axis=1), -_CERTAIN, _CERTAIN), np.float32)
 
     def _late(self, tones: NDArray[np.complex64], peaks: NDArray[np.int64]) -> float:
         """Samples by which windows lie behind their chirps, -0.5..0.5.
@@ -191,33 +212,32 @@ class LoraModem(BurstModem):
         place = (top + summit(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
         return (place + self.chips / 2) % self.chips - self.chips / 2
 
-    def _spread(self, frame: Octets) -> NDArray[np.int64]:
-        """Bytes to chirp starts: Hamming code, diagonal interleaver, Gray code."""
+    def _spread(self, bits: Bits) -> NDArray[np.int64]:
+        """Bits to chirp starts: Hamming code, diagonal interleaver, Gray code."""
         sf = self.spreading_factor
-        nibbles = np.zeros(self.blocks * sf, np.uint8)
-        nibbles[: 2 * len(frame)] = np.stack((frame >> 4, frame & 15), axis=1).reshape(-1)
-        words = self._words[nibbles].reshape(self.blocks, sf)
-        bits = (words[:, :, None] >> np.arange(self.code_bits)) & 1
+        filled = np.zeros(self.blocks * sf * 4, np.int64)
+        filled[: len(bits)] = bits
+        words = self._words[filled.reshape(-1, 4) @ _NIBBLE].reshape(self.blocks, sf)
+        coded = (words[:, :, None] >> np.arange(self.code_bits)) & 1
         rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
-        mixed = bits[:, rows, np.arange(self.code_bits)[:, None]]
-        values = mixed.reshape(-1, sf) @ (1 << np.arange(sf))
-        out = values.copy()
+        mixed = coded[:, rows, np.arange(self.code_bits)[:, None]]
+        out: NDArray[np.int64] = mixed.reshape(-1, sf) @ (1 << np.arange(sf))
         for shift in (1, 2, 4, 8):
             out ^= out >> shift
         return out
 
-    def _collect(self, values: NDArray[np.int64]) -> Octets:
-        """Chirp starts to bytes."""
+    def _collect(self, soft: Soft) -> Soft:
+        """Soft bits of chirps to those of the frame, through the likeliest code words."""
         sf = self.spreading_factor
-        gray = values ^ values >> 1
-        mixed = ((gray[:, None] >> np.arange(sf)) & 1).reshape(self.blocks, self.code_bits, sf)
+        mixed = soft.reshape(self.blocks, self.code_bits, sf)
         rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
-        bits = np.empty((self.blocks, sf, self.code_bits), np.int64)
-        bits[:, rows, np.arange(self.code_bits)[:, None]] = mixed
-        nibbles = self._nibbles[(bits @ (1 << np.arange(self.code_bits))).reshape(-1)]
-        pairs = nibbles[: 2 * self.frame.length].reshape(-1, 2)
-        octets: Octets = pairs[:, 0] << 4 | pairs[:, 1]
-        return octets
+        coded = np.empty((self.blocks, sf, self.code_bits), np.float32)
+        coded[:, rows, np.arange(self.code_bits)[:, None]] = mixed
+        signs = 2.0 * (self._words[:, None] >> np.arange(self.code_bits) & 1) - 1
+        likely = coded.reshape(-1, self.code_bits) @ (signs.T / 2).astype(np.float32)
+        marks = (np.arange(16)[:, None] & _NIBBLE) > 0
+        bits = [likely[:, mark].max(1) - likely[:, ~mark].max(1) for mark in marks.T]
+        return np.asarray(np.stack(bits, axis=1).reshape(-1), np.float32)
 
 
 @lru_cache
@@ -229,17 +249,6 @@ def code_words(check_bits: int) -> NDArray[np.int64]:
     checks = [d[0] ^ d[1] ^ d[2], d[1] ^ d[2] ^ d[3], d[0] ^ d[1] ^ d[3], d[0] ^ d[2] ^ d[3]]
     chosen = [parity] if check_bits == 1 else checks[:check_bits]
     return np.asarray(data + sum((bit << 4 + i) for i, bit in enumerate(chosen)))
-
-
-@lru_cache
-def nearest_nibbles(check_bits: int) -> Octets:
-    """For every received word the data bits of the nearest code word."""
-    words = code_words(check_bits)
-    apart = np.arange(1 << 4 + check_bits)[:, None] ^ words
-    distance = sum((apart >> i) & 1 for i in range(4 + check_bits))
-    # Of equally near ones the data bits as they came.
-    same = (apart & 15) == 0
-    return np.asarray(np.argmin(2 * distance - same, axis=1), np.uint8)
 
 
 def _delayed(samples: Samples, at: float, count: int) -> Samples:
@@ -269,7 +278,7 @@ class LoraPhy(BurstPhy):
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate)
         self.options = build(LoraOptions, options, "phy lora")
-        self.modem: LoraModem = LoraModem(packet_len, self.options)
+        self.modem: LoraModem = LoraModem(Frame(packet_len, self.options.fec), self.options)
         self.gap = self.options.gap
         if self.modem.burst_samples > MAX_BURST:
             raise ConfigError(
@@ -285,11 +294,13 @@ class LoraPhy(BurstPhy):
         return 1.0
 
     def computed_pdr(self, snr_db: float) -> float:
-        """A block of code words is right if no symbol is wrong, or one where the code corrects an error.
+        """A block of code words is right if no symbol is wrong, or one where the Hamming code corrects an error.
 
-        An upper bound on loss: two wrong symbols need not meet in a code word.
+        For hard decisions, and an upper bound on their loss: two wrong symbols need not meet in a code word.
         """
         modem = self.modem
         wrong = orthogonal_symbol_error(modem.chips, 10 ** (snr_db / 10) * modem.chips)
+        if modem.frame.coded:
+            return coded_orthogonal_success(modem.chips, wrong, modem.frame.data_bits, modem.symbols)
         lost = at_least(2 if self.options.coding_rate >= 3 else 1, modem.code_bits, wrong)
         return packet_success(lost, modem.blocks)

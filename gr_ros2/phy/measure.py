@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import random
 import time
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,14 +18,20 @@ import numpy.typing as npt
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
+from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
+from gr_ros2.phy.burst_blocks import pdu_of
 from gr_ros2.phy.channel import Channel
+from gr_ros2.phy.threads import begin
 
 _PDUS = pmt.intern("pdus")
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
+_BATCH_SAMPLES = 1 << 22
+_BATCH_SEEDS = 7919
+"""Apart, so that no batch has the noise of another scenario's neighbouring seed."""
+_SEEDS = 2**31 - 1
 _TAIL = 2048
 """Zero samples behind the last packet, for what channel and receiver hold back."""
 
@@ -55,27 +63,36 @@ def record(phy: Phy, count: int, seed: int = 0) -> Recording:
     :raises PhyError: for a PHY without samples, or when the samples do not come
     """
     source = random.Random(seed)
-    packets = [bytes(source.getrandbits(8) for _ in range(phy.packet_len)) for _ in range(count)]
+    return modulated(phy, [source.randbytes(phy.packet_len) for _ in range(count)])
+
+
+def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
+    """The samples a PHY's transmitter makes of packets, one behind the other.
+
+    :param packets: of the PHY's packet_len
+    :raises PhyError: for a PHY without samples, or when the samples do not come
+    """
     top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
     top.connect(transmitter, sink)
     outlet = _Outlet()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
-    top.start()
+    wanted = len(packets) * phy.airtime_samples()
+    begin(top.start)
     try:
         for packet in packets:
-            vector = pmt.init_u8vector(len(packet), list(packet))
-            outlet.message_port_pub(_PDUS, pmt.cons(pmt.make_dict(), vector))
-        wanted = count * phy.airtime_samples()
-        deadline = time.monotonic() + _PATIENCE_S
-        while sink.nitems_read(0) < wanted:
-            if time.monotonic() > deadline:
-                raise PhyError(f"phy {phy.name}: {sink.nitems_read(0)} of {wanted} samples came in {_PATIENCE_S} s")
+            outlet.message_port_pub(_PDUS, pdu_of(packet))
+        came, deadline = 0, time.monotonic() + _PATIENCE_S
+        while (now := sink.nitems_read(0)) < wanted:
+            if now > came:
+                came, deadline = now, time.monotonic() + _PATIENCE_S
+            elif time.monotonic() > deadline:
+                raise PhyError(f"phy {phy.name}: {now} of {wanted} samples came, and no more for {_PATIENCE_S} s")
             time.sleep(_POLL_S)
     finally:
         top.stop()
         top.wait()
         release(transmitter)
-    return Recording(packets, np.array(sink.data(), np.complex64))
+    return Recording(list(packets), np.array(sink.data(), np.complex64))
 
 
 def deliver(phy: Phy, recording: Recording, channel: ChannelConfig) -> list[bytes]:
@@ -84,7 +101,8 @@ def deliver(phy: Phy, recording: Recording, channel: ChannelConfig) -> list[byte
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
     top.msg_connect(receiver, "pdus", log, "store")
-    top.run()
+    begin(top.start)
+    top.wait()
     release(receiver)
     vectors = (pmt.cdr(log.get_message(place)) for place in range(log.num_messages()))
     return [bytes(pmt.u8vector_elements(vector)) for vector in vectors]
@@ -103,3 +121,47 @@ def pdr(phy: Phy, recording: Recording, channel: ChannelConfig) -> float:
     """Share of a recording's packets that arrive unaltered, 0..1."""
     arrived = set(deliver(phy, recording, channel))
     return sum(packet in arrived for packet in recording.packets) / len(recording.packets)
+
+
+class Passage:
+    """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
+
+    Nothing of one batch is on the air with another; noise and fading of each are their own.
+
+    :param phy: with samples
+    :param channel: what acts on samples of it
+    :raises ConfigError: for a channel this PHY cannot have
+    """
+
+    def __init__(self, phy: Phy, channel: ChannelConfig) -> None:
+        phy.check_channel(channel)
+        self._phy = phy
+        self._channel = channel
+        self._batches = 0
+        self.batch = max(1, _BATCH_SAMPLES // phy.airtime_samples())
+        """Packets at most at a time, for their samples to fit in memory."""
+
+    def send(self, packets: Sequence[bytes]) -> list[tuple[int, bytes]]:
+        """What a batch becomes: place among the packets sent, and bytes, of each one that arrived, in order."""
+        seed = (self._channel.seed + self._batches * _BATCH_SEEDS) % _SEEDS
+        self._batches += 1
+        arrived = deliver(self._phy, modulated(self._phy, packets), replaced(self._channel, seed=seed))
+        return list(zip(_places(packets, arrived), arrived, strict=True))
+
+
+def _places(packets: Sequence[bytes], arrived: Sequence[bytes]) -> list[int]:
+    """Which of the packets sent each of those that arrived, in their order, was.
+
+    One that was not sent like this was altered on the way: it takes the place behind the one that arrived before it.
+    """
+    sent: dict[bytes, deque[int]] = {}
+    for place, packet in enumerate(packets):
+        sent.setdefault(packet, deque()).append(place)
+    found, last = [], -1
+    for packet in arrived:
+        copies = sent.get(packet, deque())
+        while copies and copies[0] <= last:
+            copies.popleft()
+        last = copies.popleft() if copies else min(last + 1, len(packets) - 1)
+        found.append(last)
+    return found

@@ -6,6 +6,7 @@ keeps the newest ``size`` samples and nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ import numpy.typing as npt
 from gnuradio import blocks, gr
 
 Samples = npt.NDArray[np.complex64]
+
+SYMBOLS_SHOWN = 480
+"""Of a constellation, at a look."""
 
 
 class Tap(gr.hier_block2):  # type: ignore[misc]
@@ -30,3 +34,17 @@ class Tap(gr.hier_block2):  # type: ignore[misc]
         """``size`` consecutive samples, None before that many have passed."""
         newest: Any = np.array(self._probe.level(), dtype=np.complex64)
         return newest if newest.any() else None
+
+
+class SymbolTap:
+    """The newest symbols of a receiver that decides whole packets.
+
+    :param newest: gives the symbols of the last packet, none before the first
+    """
+
+    def __init__(self, newest: Callable[[], Samples]) -> None:
+        self._newest = newest
+
+    def samples(self) -> Samples | None:
+        """Up to ``SYMBOLS_SHOWN`` symbols, None before the first packet."""
+        return self._newest()[-SYMBOLS_SHOWN:] if len(self._newest()) else None

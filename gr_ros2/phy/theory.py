@@ -7,9 +7,11 @@ edition, sections 4.3 (PSK, QAM) and 4.5 (noncoherent orthogonal signals).
 
 from __future__ import annotations
 
-from math import erfc, exp, lgamma, log1p, pi, sin, sqrt
+from functools import lru_cache
+from math import erfc, exp, lgamma, log, log1p, log2, log10, pi, sin, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def q(x: float) -> float:
@@ -78,6 +80,53 @@ def at_least(least: int, count: int, probability: float) -> float:
     return min(1.0, sum(terms))
 
 
+def coded_success(points: NDArray[np.complex64], snr: float, data_bits: int, coded_bits: int) -> float:
+    """Probability that the best code of this length and rate delivers, whatever code it is.
+
+    The normal approximation of Polyanskiy, Poor and Verdu (IEEE Trans. Inf. Theory 56-5, 2010): what the points of a
+    frame tell together is about normal, and must be more than the data.
+
+    :param points: of the constellation, equally likely
+    :param snr: mean energy of a point over N0
+    :param coded_bits: on the air, log2 of the number of points each
+    """
+    told = _information(points.tobytes(), round(10 * log10(max(snr, 1e-6)), 2))
+    return _enough(coded_bits / log2(len(points)), *told, data_bits)
+
+
+def coded_orthogonal_success(order: int, error: float, data_bits: int, count: int) -> float:
+    """The same for ``count`` orthogonal signals that are decided one by one.
+
+    :param order: signals to choose from
+    :param error: probability that a decision is wrong
+    """
+    error = min(max(error, 1e-12), 1 - 1 / order)
+    wrong = log2(error / (order - 1))
+    right = log2(1 - error)
+    mean = log2(order) + (1 - error) * right + error * wrong
+    return _enough(count, mean, error * (1 - error) * (right - wrong) ** 2, data_bits)
+
+
+def _enough(count: float, mean: float, variance: float, data_bits: int) -> float:
+    """Probability that ``count`` symbols tell more than the data, bits, each of this mean and variance."""
+    spread = sqrt(max(count * variance, 1e-12))
+    return 1 - q((count * mean - data_bits + 0.5 * log2(count)) / spread)
+
+
+@lru_cache(maxsize=4096)
+def _information(points: bytes, snr_db: float) -> tuple[float, float]:
+    """Mean and variance of what one received point tells of the one sent, bits."""
+    sent = np.frombuffer(points, np.complex64).astype(np.complex128)
+    noise = np.mean(np.abs(sent) ** 2) / 10 ** (snr_db / 10)
+    nodes, weights = np.polynomial.hermite.hermgauss(24)  # type: ignore[no-untyped-call]
+    added = sqrt(noise) * (nodes[:, None] + 1j * nodes).reshape(-1)
+    share = (weights[:, None] * weights).reshape(-1) / pi
+    apart = np.abs(sent[:, None, None] - sent[None, :, None] + added) ** 2
+    told = log2(len(sent)) - np.logaddexp.reduce((np.abs(added) ** 2 - apart) / noise, axis=1) / log(2)
+    mean = float(np.mean(told @ share))
+    return mean, float(np.mean(told**2 @ share)) - mean**2
+
+
 def half_point(success: object) -> float:
     """dB at which a function of dB that rises from 0 to 1 passes one half, between -60 and 80."""
     assert callable(success)
@@ -90,6 +139,8 @@ def half_point(success: object) -> float:
 
 __all__ = [
     "at_least",
+    "coded_orthogonal_success",
+    "coded_success",
     "half_point",
     "orthogonal_symbol_error",
     "packet_success",

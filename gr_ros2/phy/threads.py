@@ -7,9 +7,14 @@ its messages; nothing is kept of a thread that has ended.
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from gnuradio import gr
 
 SWITCH_INTERVAL_S = 5e-5
 """Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
@@ -17,6 +22,11 @@ default of 5 ms (two hops), 0.2 ms with this."""
 
 _MAX_MESSAGES = "GR_CONF_DEFAULT_MAX_MESSAGES"
 """Environment variable of GNU Radio's setting ``max_messages``, read when a flowgraph starts."""
+
+_START_ATTEMPTS = 20
+"""GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
+
+_log = logging.getLogger(__name__)
 
 
 def quicken_threads() -> None:
@@ -33,6 +43,32 @@ def keep_messages() -> None:
     that off. For flowgraphs started afterwards in this process; a setting of the user's own stays.
     """
     os.environ.setdefault(_MAX_MESSAGES, "-1")
+
+
+def begin(start: Callable[[], None]) -> None:
+    """Start a flowgraph, again and again where GNU Radio could not map a buffer.
+
+    :raises MemoryError: when it still cannot after many attempts
+    """
+    for _ in range(_START_ATTEMPTS - 1):
+        try:
+            start()
+            return
+        except MemoryError:
+            _log.debug("GNU Radio could not map a buffer; starting again")
+    start()
+
+
+@contextmanager
+def only_warnings() -> Iterator[None]:
+    """Blocks made in here log warnings only, not each buffer set on them."""
+    logging = gr.logging()
+    level = logging.default_level()
+    logging.set_default_level(gr.log_levels.warn)
+    try:
+        yield
+    finally:
+        logging.set_default_level(level)
 
 
 class BlockThread:

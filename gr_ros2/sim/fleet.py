@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,11 +100,14 @@ class Fleet:
         """Rows x, y at those times."""
         return np.array([self.true_pose(robot_id, float(t))[:2] for t in times]).reshape(-1, 2)
 
-    def messages(self, duration_s: float, start_time: float | None = None) -> Iterator[SimMessage]:
+    def messages(
+        self, duration_s: float, start_time: float | None = None, topics: Collection[str] | None = None
+    ) -> Iterator[SimMessage]:
         """All messages with 0 <= t < duration_s, in time order, made as they are asked for.
 
         :param duration_s: s, may be infinite
         :param start_time: stamps are this + t; None takes ``settings.start_time``
+        :param topics: absolute names of those wanted, None = all; the others change no byte of them
         """
         start_ns = round((self.settings.start_time if start_time is None else start_time) * 1e9)
         sensors = {i: Sensors(self.settings, self.world, i, self.state(i, 0.0), start_ns) for i in self.robot_ids}
@@ -117,13 +120,16 @@ class Fleet:
                 heapq.heapreplace(schedule, (following, order, robot_id, count + 1, topic, rate, phase))
             else:
                 heapq.heappop(schedule)
+            name = f"/robot_{robot_id}/{topic}"
+            if topics is not None and name not in topics:
+                continue
             state = self.state(robot_id, t)
             if topic == "cmd_vel":  # the command of this period is the motion at its end
                 tick = int(t / TICK)
                 state = self._log[robot_id - 1][tick].after(TICK)
             others = [self.state(i, t) for i in self.robot_ids if i != robot_id] if topic == "scan" else ()
             payload = sensors[robot_id].read(topic, t, state, others)
-            yield SimMessage(t, robot_id, f"/robot_{robot_id}/{topic}", TYPES[topic], payload)
+            yield SimMessage(t, robot_id, name, TYPES[topic], payload)
 
     def _first_events(self, robot_id: int) -> Iterator[tuple[float, int, int, int, str, float, float]]:
         phases = np.random.default_rng([self.settings.seed, 3, robot_id]).uniform(size=len(TYPES)).tolist()

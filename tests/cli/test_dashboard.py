@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import socket
+import subprocess
 import sys
+import urllib.request
+from pathlib import Path
 
 import pytest
 
@@ -32,6 +37,13 @@ def test_no_place(text: str) -> None:
         parse_place(text)
 
 
+@pytest.fixture
+def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No other program of this user can be looked at."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.mark.usefixtures("alone")
 def test_nothing_there(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as held:  # bound and not listening: nobody answers, nobody else takes it
         held.bind(("127.0.0.1", 0))
@@ -72,3 +84,23 @@ def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
         assert run(["run", "paper-direct", f"--dashboard={held.getsockname()[1]}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "choose another port" in line
+
+
+@pytest.mark.usefixtures("alone")
+def test_beside_a_run_that_was_started_without(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    memory = ["--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory"]
+    command = [sys.executable, "-m", "gr_ros2.cli.main", "run", "paper-direct", "--duration", "600", *memory]
+    with subprocess.Popen([*command, "--out", str(tmp_path / "out")], stdout=subprocess.DEVNULL) as running:
+        try:
+            assert run(["dashboard", "0", "--wait", "60", "--no-browser"]) == 0
+            url = capsys.readouterr().out.strip()
+            with urllib.request.urlopen(f"{url}alive") as answer:
+                assert "instance" in json.load(answer)
+            # Asked again, it says where it is.
+            assert run(["dashboard", "0", "--pid", str(running.pid), "--no-browser"]) == 0
+            assert capsys.readouterr().out.strip() == url
+        finally:
+            running.send_signal(signal.SIGINT)
+            running.wait()

@@ -47,6 +47,25 @@ def test_damaged_messages_end_in_a_message_or_a_codec_error(type_name: str, seed
         assert error.row in ("damaged", "unsupported", "unknown_dictionary")
 
 
+@given(
+    st.sampled_from([ODOMETRY, "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"]),
+    st.integers(0, 1 << 32),
+    st.sampled_from(["auto", "none", "fields", "zstd"]),
+    st.booleans(),
+    st.sampled_from("<>"),
+)
+@settings(max_examples=300, deadline=None)
+def test_what_comes_out_is_the_canonical_form(type_name: str, seed: int, codec: str, rounded: bool, order: str) -> None:
+    steps = {ODOMETRY: "pose.pose=0.001", "sensor_msgs/msg/LaserScan": "ranges=0.01"}.get(type_name, "")
+    link = codec_for(type_name, codec=codec, quantize=steps * rounded)
+    payload, clean = Writer(random.Random(seed), order).message(type_name)
+    canonical = link.canonical(0, payload)
+    assert link.decode(0, link.encode(0, payload)) == canonical
+    assert link.canonical(0, canonical) == canonical
+    if not (steps and rounded):
+        assert canonical == (payload if codec == "none" else clean)
+
+
 def test_nothing_larger_than_the_bound_comes_out() -> None:
     large = bytes(100_000)
     for coded in (

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.compression import LinkCodec
+from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions
 from gr_ros2.errors import CrcError, PadError, RunError
 from gr_ros2.experiment.ledger import REORDER_WINDOW, Ledger, TopicLedger
 from gr_ros2.link import Receiver, Sender
 from gr_ros2.link.events import Accepted, Delivered, Lost, Refused, Rejected, SenderEvent, SentEntry, SentPacket
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
+from tests.compression.support import Writer
 
 SRC = 1
 
@@ -247,6 +249,41 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
         assert books[topic_id].sent == topics.count(topic_id) == books[topic_id].rows.total()
     assert all(book.rows["delivered"] == sum(not isnan(t) for t in book.t_delivered) for book in books.values())
     assert ledger.unresolved() == 0
+
+
+class Erring(LinkCodec):
+    """Gives every third message back with one bit of its last eight bytes wrong."""
+
+    count = 0
+
+    def decode(self, topic_id: int, coded: bytes) -> bytes:
+        payload = super().decode(topic_id, coded)
+        self.count += 1
+        return payload[:-8] + bytes([payload[-8] ^ 1]) + payload[-7:] if self.count % 3 == 0 else payload
+
+
+@pytest.mark.parametrize(("decoder", "wrong"), [(LinkCodec, 0), (Erring, 20)])
+def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decoder: type[LinkCodec], wrong: int) -> None:
+    """Fields quantised, garbage in the alignment gaps: as sent, unless the codec errs."""
+    options = TopicOptions(quantize="pose.pose=0.001 twist.twist.linear=0.01")
+    registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options)])
+    ledger = Ledger()
+    config = SourceConfig(robot_id=SRC, packet_len=220, compression=True)
+    sender = Sender(registry, config, codec=LinkCodec(registry), observer=lambda event: ledger.sender_event(SRC, event))
+    receiver = Receiver(registry, SinkConfig(packet_len=220, compression=True), codec=decoder(registry))
+    delivered: list[bytes] = []
+    sent = [Writer(random.Random(seed)).message("nav_msgs/msg/Odometry")[0] for seed in range(60)]
+    for now, payload in enumerate(sent):
+        sender.submit(0, payload, now)
+        while (data := sender.next_packet(now)) is not None:
+            ledger.packet_received(data)
+            for event in receiver.receive(data, now):
+                ledger.receiver_event(event, now)
+                assert isinstance(event, Delivered)
+                delivered.append(event.payload)
+    book = only(ledger.finish())
+    assert not set(sent) & set(delivered), "every message was changed on the way"
+    assert (book.rows["delivered"], book.corrupt) == (60 - wrong, wrong)
 
 
 @settings(max_examples=40, deadline=None)

@@ -77,7 +77,7 @@ def test_only_the_topics_asked_for_are_listed() -> None:
         "/robot_1/fix",
         "/robot_1/raw",
     ]
-    assert [topic.topic for topic in Recorder(REGISTRY, {1: ""}, topic_ids={1}).finish(1, 1)] == ["/fix"]
+    assert [topic.topic for topic in Recorder(REGISTRY, {1: ""}, topic_ids={1: [1]}).finish(1, 1)] == ["/fix"]
     assert Recorder(REGISTRY, {1: ""}).airtime(1.0)["airtime_per_message_s"] is None
 
 

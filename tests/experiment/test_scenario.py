@@ -7,20 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.scenario import (
-    builtin_scenarios,
-    dump,
-    load_scenario,
-    parse_override,
-    scenario_from,
-)
+from gr_ros2.experiment.scenario import builtin_scenarios, dump, load_scenario, scenario_from
+from gr_ros2.settings_file import parse_override
 
 BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
 
 
 def test_the_built_in_ones() -> None:
-    assert {"demo", "paper-direct", "paper-ofdm", "paper-ofdm-paced"} <= set(BUILTIN)
+    assert {"demo", "paper-direct", "paper-ofdm", "paper-ofdm-paced", "six-topics-paced", "two-way"} <= set(BUILTIN)
+    channels = ("awgn", "multipath", "cfo", "clock-offset", "rayleigh", "burst-loss", "unplugged")
+    assert {f"channel-{name}" for name in channels} <= set(BUILTIN)
+    assert all(BUILTIN[f"channel-{name}"].channel != ChannelConfig(seed=0) for name in channels)
     demo, direct, ofdm = BUILTIN["demo"], BUILTIN["paper-direct"], BUILTIN["paper-ofdm"]
     assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", 0, 1.2)
     assert (direct.packet_len, direct.sim.odom_rate, direct.duration_s, direct.phy.name) == (64, 30, 15, "direct")
@@ -34,6 +33,7 @@ def test_the_built_in_ones() -> None:
 def test_each_is_ready_to_run(name: str) -> None:
     scenario = BUILTIN[name]
     assert scenario.description
+    assert scenario.duration_s + scenario.drain_s <= 40
     assert scenario.ros_source.src_id() == 1
     assert scenario.ros_source.packet_len == scenario.ros_sink.packet_len == scenario.packet_len
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
@@ -69,6 +69,28 @@ def test_a_seed_of_its_own_stays() -> None:
     assert (scenario.channel.seed, scenario.sim.seed) == (9, 5)
 
 
+def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
+    changes = ["ros_source.compression=true", "ros_source.robot_id=1", "ros_sink.robot_id=2", "channel.snr_db=20"]
+    changes += ["back.ros_source.namespace=/robot_2", "back.ros_sink.publisher_depth=7", "phy.sample_rate=2e5"]
+    there, back = load_scenario("demo", changes, seed=5).directions()
+    assert there == load_scenario("demo", [change for change in changes if not change.startswith("back")], seed=5)
+    assert back.back is None
+    assert (back.ros_source.domain_id, back.ros_sink.domain_id) == (
+        there.ros_sink.domain_id,
+        there.ros_source.domain_id,
+    )
+    assert (back.ros_source.src_id(), back.ros_sink.robot_id) == (2, -1)  # a robot's own settings stay its own
+    assert back.ros_source.compression
+    assert (there.ros_sink.publisher_depth, back.ros_sink.publisher_depth) == (1000, 7)
+    assert back.ros_source.registry == there.registry
+    assert (back.channel.snr_db, back.phy) == (20, there.phy)
+    assert back.channel.seed != there.channel.seed == 5
+
+
+def test_a_one_way_scenario_has_one_direction() -> None:
+    assert BUILTIN["demo"].directions() == (BUILTIN["demo"],)
+
+
 def test_override_values_are_yaml() -> None:
     assert parse_override("a.b = 2e5") == (("a", "b"), 200_000.0)
     assert parse_override("a=true") == (("a",), True)
@@ -98,6 +120,27 @@ def test_override_values_are_yaml() -> None:
         ("duration_s=0", "the simulator has no end"),
         ("channel.taps=[", "the value is no YAML"),
         ("packet_len", "write key=value"),
+        ("channel.snr_db=101", "channel.snr_db = 101: .* less than or equal to 100"),
+        ("channel.doppler_hz=-1", "channel.doppler_hz = -1"),
+        ("channel.taps=[]", "channel.taps = .*at least 1"),
+        ("channel.outages=[[5, 3]]", r"outages: \[5, 3\] ends before it begins"),
+        ("channel.outages=[[1, 3], [2, 4]]", r"outages: \[2, 4\] .* before the one before it has ended"),
+        ("channel.burst_loss={p_good_to_bad: 0.1}", "channel.burst_loss.p_bad_to_good is missing"),
+        (
+            "channel.burst_loss={p_good_to_bad: 0.1, p_bad_to_good: 0}",
+            "channel.burst_loss.p_bad_to_good = 0: .* greater than 0",
+        ),
+        (
+            "channel.burst_loss={p_good_to_bad: 0.1, p_bad_to_good: 1, loss: 1}",
+            "unknown key channel.burst_loss.loss; known are p_good_to_bad, p_bad_to_good, loss_good, loss_bad",
+        ),
+        ("repetitions=0", "repetitions = 0: .* greater than or equal to 1"),
+        ("back={}", "back.ros_source: .* set robot_id to 0..254"),
+        ("back=5", "back = 5"),
+        ("back={ros_source: 5}", "back.ros_source = 5"),
+        ("back={ros_source: {namespace: /robot_1}}", "back.ros_source: source id 1 is that of ros_source"),
+        ("back={ros_source: {colour: 1}}", "unknown key back.ros_source.colour; known are registry"),
+        ("back={ros_sink: {packet_len: 9}}", "back.ros_sink.packet_len = 9: both ends share it"),
         (".packet_len=1", "write key=value"),
     ],
 )
@@ -105,6 +148,11 @@ def test_what_is_wrong_is_named(override: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as caught:
         load_scenario("demo", [override])
     assert "\n" not in str(caught.value)
+
+
+def test_a_recording_speaks_for_one_robot() -> None:
+    with pytest.raises(ConfigError, match="back: source = 'bag:here' speaks for one robot"):
+        load_scenario("two-way", ["source=bag:here"])
 
 
 def test_a_file_with_a_registry_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,5 +167,7 @@ def test_a_file_with_a_registry_beside_it(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_neither_a_file_nor_built_in() -> None:
-    with pytest.raises(ConfigError, match=r"'dmeo' is neither a file nor built in; built in are demo, .*paper-direct"):
+    with pytest.raises(
+        ConfigError, match=r"'dmeo' is neither a file nor built in; built in are channel-awgn, .*paper-direct"
+    ):
         load_scenario("dmeo")

@@ -23,6 +23,9 @@ class Sized:
         self._sizes = sizes
         self._messages: list[bytes] = []
 
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002
+        return payload
+
     def encode(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002 - all topics are alike
         number = len(self._messages)
         self._messages.append(payload)

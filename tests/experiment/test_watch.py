@@ -7,13 +7,15 @@ from gr_ros2.experiment.recorder import Recorder
 from gr_ros2.experiment.result import Result
 from gr_ros2.experiment.runner import run_scenario
 from gr_ros2.experiment.scenario import load_scenario
-from gr_ros2.experiment.watch import Fanout, LiveRun
+from gr_ros2.experiment.watch import Audience, Fanout, LiveRun
 from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent
 from gr_ros2.registry import Registry
 
 
 class Onlooker:
     """Counts what it hears."""
+
+    instruments = True
 
     def __init__(self) -> None:
         self.heard: list[str] = []
@@ -69,3 +71,30 @@ def test_the_rows_of_an_open_ledger_add_up() -> None:
     assert recorder.ledger.rows() == {(1, 0): {"in_flight": 10}}
     assert recorder.ledger.rows() == {(1, 0): {"in_flight": 10}}
     assert Ledger().rows() == {}
+
+
+def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
+    audience, early, late = Audience(), Onlooker(), Onlooker()
+    audience.add(early)
+
+    class Invites(Onlooker):
+        """Lets the late one in when the first message is delivered."""
+
+        def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+            if not self.heard:
+                audience.add(late)
+            super().receiver_event(event, now)
+
+        def sender_event(self, src_id: int, event: SenderEvent) -> None:
+            """Not counted."""
+
+        def packet_received(self, data: bytes, now: float) -> None:
+            """Not counted."""
+
+    ends = ["ros_source.middleware=memory", "ros_sink.middleware=memory"]
+    watchers = [Invites(), audience]
+    result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), watchers=watchers).result
+    assert late.run is early.run
+    assert late.result is early.result is result
+    assert 0 < late.heard.count("Delivered") <= early.heard.count("Delivered") == result.topics[0].delivered
+    assert late.heard.count("Accepted") < early.heard.count("Accepted")

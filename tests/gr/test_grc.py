@@ -76,6 +76,12 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
         assert hasattr(BLOCKS[name][0], callback.split("(")[0])
 
 
+def test_the_phys_blocks_are_as_their_settings_say() -> None:
+    tool = Path(__file__).resolve().parents[2] / "tools" / "write-grc"
+    done = subprocess.run([sys.executable, tool, "--check"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_options_are_the_tables() -> None:
     for name in BLOCKS:
         options = {item["id"]: item.get("options") for item in description(name)["parameters"]}

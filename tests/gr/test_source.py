@@ -18,10 +18,11 @@ from gnuradio import gr
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Accepted, Refused, SentPacket
-from gr_ros2.middleware import Qos
+from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 from gr_ros2.wire import decode
+from tests.e2e.support import free_domains
 from tests.gr.probe import Probe, wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
@@ -81,6 +82,44 @@ def test_a_message_leaves_as_packets_with_metadata(rig: Rig) -> None:
     assert [item["seq"] for item in metadata] == [packet.seq for packet in packets]
     assert all(item["src_id"] == 1 and item["dst_id"] == 9 and item["qos"] == 0 for item in metadata)
     assert all(before <= item["t_src_wall"] <= time.time() for item in metadata)
+
+
+@pytest.mark.parametrize("middleware", ["memory", "dds"])
+def test_queues_follow_the_qos_of_the_publishers(middleware: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    (domain,) = free_domains(1)
+    source = RosSource(
+        REGISTRY,
+        namespace="/robot_1",
+        middleware=middleware,
+        domain_id=domain,
+        topic_options={"/tf": {"queue": "fifo"}},
+    )
+    with MIDDLEWARE.load(middleware)(domain_id=domain) as robot:
+        for name, topic in source.subscribed.items():
+            robot.advertise(name, topic.type_name, Qos(depth=1, lifespan_s=0.05))
+
+        def queues() -> list[str]:
+            return [topic["queue"] for topic in source.stats()["topics"].values()]
+
+        wait_for(lambda: queues() == ["latest", "fifo"])
+        source.middleware.close()
+    source.close()
+
+
+def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
+    refused: list[Refused] = []
+    rig.make(observer=lambda event: refused.append(event) if isinstance(event, Refused) else None)
+    publisher = rig.robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=5, lifespan_s=0.01))
+    rig.source.use_credit()
+    rig.start(credit=True)
+    publisher.publish(b"\0\1\0\0abcd")
+    wait_for(lambda: rig.source.stats()["topics"]["/robot_1/odom"]["submitted"] == 1)
+    published = time.monotonic()
+    wait_for(lambda: time.monotonic() > published + 0.01)
+    rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
+    wait_for(lambda: bool(refused))
+    assert refused[0].reason == "stale"
 
 
 def test_all_topics_or_a_subset(rig: Rig) -> None:

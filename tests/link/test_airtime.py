@@ -31,6 +31,20 @@ def test_packets_queue_for_the_air_and_idle_time_is_not_saved_up() -> None:
     assert clock.backlog == 0
 
 
+def test_a_device_gets_packets_when_their_airtime_begins_or_a_little_before() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0, early=1.25)
+    clock.offer("a", 10.0)
+    assert clock.due(10.0) == ["a"]
+    clock.offer("b", 10.5)
+    assert clock.due(10.7) == []
+    assert clock.next_timeout(10.7) == 10.75
+    assert clock.due(10.75) == ["b"]
+    assert clock.grants(11.0) == 0, "the air is b's until 12"
+    assert clock.grants(12.0) == 1
+    with pytest.raises(ConfigError, match="early"):
+        AirtimeClock(1.0, early=-0.1)
+
+
 def test_one_credit_at_the_start_and_the_next_just_before_the_air_is_free() -> None:
     clock: AirtimeClock[str] = AirtimeClock(0.1, lead=0.005)
     assert clock.grants(0.0) == 1

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.link import Sender
+from gr_ros2.link.queues import queue_for
 from tests.link.engines import delivered, drain, read, receiver, sender
 
 
@@ -47,9 +48,45 @@ def test_latest_holds_a_recording_back_while_one_waits() -> None:
 
 
 def test_a_queue_follows_the_depth_of_its_topic() -> None:
-    assert TopicOptions(depth=1).queue_policy == "latest"
-    assert TopicOptions(depth=10).queue_policy == TopicOptions().queue_policy == "fifo"
-    assert TopicOptions(depth=1, queue="fifo").queue_policy == "fifo"
+    assert queue_for(TopicOptions(depth=1)) == ("latest", 0.0)
+    assert queue_for(TopicOptions(depth=10)) == queue_for(TopicOptions()) == ("fifo", 0.0)
+    assert queue_for(TopicOptions(depth=1, queue="fifo")) == ("fifo", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "depth", "lifespan_s", "period_s", "queue"),
+    [
+        ({}, 1, 0.0, 0.0, ("latest", 0.0)),
+        ({}, 10, 0.2, 0.0, ("deadline", 0.2)),
+        ({}, 1, 0.2, 0.0, ("latest", 0.2)),
+        ({}, 10, 0.0, 0.1, ("latest", 0.0)),
+        ({}, 0, 0.0, 0.0, ("fifo", 0.0)),
+        ({"depth": 5}, 1, 0.0, 0.1, ("fifo", 0.0)),
+        ({"queue": "fifo"}, 1, 0.2, 0.1, ("fifo", 0.0)),
+        ({"deadline_ms": 50}, 10, 0.2, 0.0, ("deadline", 0.05)),
+        ({"queue": "latest", "deadline_ms": 50}, 10, 0.2, 0.0, ("latest", 0.05)),
+    ],
+)
+def test_a_queue_follows_its_publishers_where_it_is_not_configured(
+    options: dict[str, Any], depth: int, lifespan_s: float, period_s: float, queue: tuple[str, float]
+) -> None:
+    source = engine(**options)
+    before = source.queue(0)
+    assert source.follow(0, depth=depth, lifespan_s=lifespan_s, period_s=period_s) == (source.queue(0) != before)
+    assert source.queue(0) == queue
+
+
+def test_a_lifespan_found_late_holds_for_what_waits() -> None:
+    source = engine()
+    source.submit(0, b"old", 0.0)
+    source.follow(0, lifespan_s=0.1)
+    source.submit(0, b"young", 0.09)
+    assert [read(data).entries[0].payload for data in drain(source, 0.15)] == [b"young"]
+    assert refused(source) == {"stale": 1}
+    source.submit(0, b"for ever again", 0.2)
+    source.follow(0)
+    assert source.queue(0) == ("fifo", 0.0)
+    assert len(drain(source, 9.0)) == 1
 
 
 def test_a_deadline_queue_needs_a_deadline() -> None:

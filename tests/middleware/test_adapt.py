@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.middleware.adapt import Adaptation, compatible, settle
+from gr_ros2.middleware.adapt import Adaptation, agreed, compatible, settle
 from gr_ros2.middleware.base import Qos
 
 RELIABLE = Qos("reliable", "volatile")
@@ -25,6 +25,16 @@ def test_settling_takes_the_strictest_that_all_offer() -> None:
 def test_what_dds_does_not_match() -> None:
     assert not compatible(BEST_EFFORT, RELIABLE)
     assert not compatible(RELIABLE, LATCHED)
+    assert not compatible(RELIABLE, Qos(deadline_s=1.0))
+    assert not compatible(Qos(deadline_s=2.0), Qos(deadline_s=1.0))
+    assert compatible(Qos(deadline_s=1.0), Qos(deadline_s=1.0))
+
+
+def test_a_message_of_one_publisher_does_not_replace_another_ones() -> None:
+    brief, long = Qos(depth=1, lifespan_s=0.1, deadline_s=0.5), Qos(depth=1, lifespan_s=3.0, deadline_s=0.2)
+    assert agreed([brief]) == brief
+    assert agreed([brief, long]) == Qos(depth=0, lifespan_s=3.0)
+    assert agreed([brief, Qos(depth=1)]) == Qos(depth=0), "one says for ever"
 
 
 @given(st.lists(offers, min_size=1))

@@ -32,6 +32,7 @@ class World(ABC):
 
     padding = 0
     custom_types = True
+    tells_depth = True
 
     @abstractmethod
     def publishing(self) -> Middleware: ...
@@ -52,9 +53,10 @@ class World(ABC):
 class LiveWorld(World):
     """Two participants of one domain."""
 
-    def __init__(self, name: str, padding: int = 0, *, custom_types: bool = True) -> None:
+    def __init__(self, name: str, padding: int = 0, *, custom_types: bool = True, tells_depth: bool = True) -> None:
         self.padding = padding
         self.custom_types = custom_types
+        self.tells_depth = tells_depth
         make = MIDDLEWARE.load(name)
         self._ends: list[Middleware] = [make(domain_id=domain(), node_name=f"end_{i}") for i in range(2)]
 
@@ -125,12 +127,16 @@ class BagWorld(World):
             self._reader.close()
 
 
-@pytest.fixture(params=["memory", "dds", "bag-mcap", "bag-sqlite3", "rclpy"])
+@pytest.fixture(params=["memory", "dds", "zenoh", "bag-mcap", "bag-sqlite3", "rclpy"])
 def world(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     if request.param == "rclpy":
         pytest.importorskip("rclpy", reason="rclpy is not importable: no ROS 2 is sourced")
-        world: World = LiveWorld("rclpy", 3, custom_types=False)
+        world: World = LiveWorld("rclpy", 3, custom_types=False, tells_depth=False)
+    elif request.param == "zenoh":
+        pytest.importorskip("zenoh", reason="zenoh is not installed: pip install eclipse-zenoh==1.10.2")
+        request.getfixturevalue("zenoh_router")
+        world = LiveWorld("zenoh")
     elif request.param == "dds":
         world = LiveWorld("dds", 3)
     elif request.param == "memory":
@@ -183,6 +189,27 @@ def test_discover_tells_topic_type_and_qos(world: World) -> None:
     (info,) = [info for info in other.discover() if info.topic == "/robot_1/map"]
     assert info.type_name == STRING
     assert [(qos.reliability, qos.durability) for qos in info.publishers] == [("reliable", "transient_local")]
+
+
+def test_a_subscription_hears_what_its_publishers_offer(world: World) -> None:
+    """Two publishers before the subscription; where the graph is live, one leaves and another one comes."""
+    heard: list[list[tuple[int, float, float]]] = []
+
+    def hear(offers: Sequence[Qos]) -> None:
+        heard.append(sorted((qos.depth * world.tells_depth, qos.lifespan_s, qos.deadline_s) for qos in offers))
+
+    newest, timed = Qos("reliable", "volatile", 1), Qos("reliable", "volatile", 5, 0.25, 1.5)
+    brief, long = (1 * world.tells_depth, 0.0, 0.0), (5 * world.tells_depth, 0.25, 1.5)
+    first = world.publishing().advertise("/topic", STRING, newest)
+    world.publishing().advertise("/topic", STRING, timed)
+    subscription = world.subscribing().subscribe("/topic", STRING, RELIABLE, lambda _: None)
+    subscription.follow(hear)
+    wait_for(lambda: [brief, long] in heard, "both publishers")
+    if isinstance(world, LiveWorld):
+        first.close()
+        wait_for(lambda: heard[-1] == [long], "the departure")
+        world.publishing().advertise("/topic", STRING, newest)
+        wait_for(lambda: heard[-1] == [brief, long], "the return")
 
 
 def test_discover_leaves_own_endpoints_out(world: World) -> None:
@@ -273,7 +300,8 @@ def test_no_callback_after_close(world: World) -> None:
     wait_for(running.is_set, "the first callback")
     middleware.close()
     closed = True
-    threads = [thread for thread in threading.enumerate() if thread.name.startswith(("dds-", "memory-", "bag-"))]
+    ours = ("dds-", "memory-", "zenoh-", "bag-")
+    threads = [thread for thread in threading.enumerate() if thread.name.startswith(ours)]
     assert not late
     assert len(threads) <= (1 if isinstance(world, LiveWorld) else 0)  # that of the other end
 

@@ -54,6 +54,8 @@ def peer(program: Path) -> Iterator[Callable[..., Peer]]:
     def make(role: str, topic: str, qos: Qos) -> Peer:
         names = [ros_graph.dds_topic(topic), ros_graph.dds_type(CUSTOM)]
         words = [qos.reliability or "", qos.durability or "", str(qos.depth)]
+        if qos.lifespan_s and qos.deadline_s:
+            words += [str(qos.lifespan_s * 1e3), str(qos.deadline_s * 1e3)]
         made.append(Peer([str(program), str(domain(2)), *names, role, *words]))
         wait_for(lambda: made[-1].ready, "the Fast DDS process")
         return made[-1]
@@ -168,3 +170,14 @@ def test_discovery_of_fast_dds_endpoints(middleware: DdsMiddleware, peer: Callab
     assert (published.topic, published.type_name) == ("/robot_1/odom", CUSTOM)
     assert [(q.reliability, q.durability) for q in published.publishers] == [("reliable", "transient_local")]
     assert [(q.reliability, q.durability) for q in subscribed.subscribers] == [("best_effort", "volatile")]
+
+
+def test_lifespan_and_deadline_are_told_and_the_depth_is_not(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    peer("pub", "/odom", Qos("reliable", "volatile", 1, 0.25, 1.5))
+    wait_for(middleware.discover, "the topic")
+    (found,) = middleware.discover()
+    (offer,) = found.publishers
+    assert (offer.lifespan_s, offer.deadline_s) == pytest.approx((0.25, 1.5), abs=1e-6)
+    assert offer.depth == Qos().depth, "what is not told is no depth of 1"

@@ -1,6 +1,6 @@
 // A peer on an independent DDS (Fast DDS 2.9), speaking as rmw_fastrtps does: opaque CDR messages, ROS 2 names.
 //
-//     fastdds_peer DOMAIN DDS_TOPIC DDS_TYPE pub|sub RELIABILITY DURABILITY DEPTH
+//     fastdds_peer DOMAIN DDS_TOPIC DDS_TYPE pub|sub RELIABILITY DURABILITY DEPTH [LIFESPAN_MS DEADLINE_MS]
 //
 // Out: `ready`, `matched N` whenever the number of matched endpoints changes, `data HEX` per message received
 // (encapsulation header included). In, for pub: one message per line, in hex. End of input ends it.
@@ -26,6 +26,7 @@
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
 
 using namespace eprosima::fastdds::dds;
+using eprosima::fastrtps::Duration_t;
 using eprosima::fastrtps::rtps::InstanceHandle_t;
 using eprosima::fastrtps::rtps::SerializedPayload_t;
 using Bytes = std::vector<unsigned char>;
@@ -138,6 +139,11 @@ void apply(EndpointQos& qos, const std::string& reliability, const std::string& 
     qos.data_sharing().off();
 }
 
+Duration_t milliseconds(const char* text)
+{
+    return Duration_t(std::stod(text) / 1000.0L);
+}
+
 int fail(const std::string& what)
 {
     std::cerr << "fastdds_peer: " << what << std::endl;
@@ -148,8 +154,8 @@ int fail(const std::string& what)
 
 int main(int argc, char** argv)
 {
-    if (argc != 8) {
-        return fail("DOMAIN DDS_TOPIC DDS_TYPE pub|sub RELIABILITY DURABILITY DEPTH");
+    if (argc != 8 && argc != 10) {
+        return fail("DOMAIN DDS_TOPIC DDS_TYPE pub|sub RELIABILITY DURABILITY DEPTH [LIFESPAN_MS DEADLINE_MS]");
     }
     const std::string topic_name = argv[2], type_name = argv[3], role = argv[4], reliability = argv[5], durability = argv[6];
     const int depth = std::stoi(argv[7]);
@@ -180,6 +186,10 @@ int main(int argc, char** argv)
         DataWriterQos qos = DATAWRITER_QOS_DEFAULT;
         apply(qos, reliability, durability, depth);
         qos.publish_mode().kind = ASYNCHRONOUS_PUBLISH_MODE;
+        if (argc == 10) {
+            qos.lifespan().duration = milliseconds(argv[8]);
+            qos.deadline().period = milliseconds(argv[9]);
+        }
         writer = participant->create_publisher(PUBLISHER_QOS_DEFAULT)->create_datawriter(topic, qos, &writer_events);
         if (writer == nullptr) {
             return fail("no writer");

@@ -1,6 +1,8 @@
-"""The channel: as much noise as asked for, losses that repeat with the seed, changes while running."""
+"""The channel: as much noise and fading as asked for, losses that repeat with the seed, changes while running."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 
@@ -15,15 +17,19 @@ from gr_ros2.phy.channel import Channel, PacketLoss, noise_voltage
 from gr_ros2.phy.ofdm import OfdmPhy
 from tests.gr.probe import Probe, wait_for
 
-SAMPLES = 200_000
+SAMPLES, RATE = 200_000, 1e6
 
 
 def through(config: ChannelConfig, value: complex = 0j) -> np.ndarray:
     """What a constant becomes on its way through a channel."""
+    return samples_through(config, np.full(SAMPLES, value))
+
+
+def samples_through(config: ChannelConfig, samples: np.ndarray) -> np.ndarray:
     top = gr.top_block()
-    channel = Channel(config, OfdmPhy(64, 1e6))
+    channel = Channel(config, OfdmPhy(64, RATE))
     sink = blocks.vector_sink_c()
-    top.connect(blocks.vector_source_c([value] * SAMPLES), channel, sink)
+    top.connect(blocks.vector_source_c(samples), channel, sink)
     top.run()
     return np.array(sink.data())
 
@@ -62,32 +68,72 @@ def test_a_change_out_of_range_is_refused() -> None:
         channel.set_frequency_offset(3.0)
 
 
-def lose(probability: float, seed: int, count: int = 400) -> tuple[list[bytes], PacketLoss]:
+def test_fading_is_rayleigh_with_the_doppler_asked_for() -> None:
+    doppler_hz = 2000.0
+    gain = through(ChannelConfig(doppler_hz=doppler_hz, seed=2), 1.0)
+    power = np.abs(gain) ** 2
+    assert np.mean(power) == pytest.approx(1.0, abs=0.03)
+    for level in (0.1, 0.5, 2.0):
+        assert np.mean(power < level) == pytest.approx(1 - np.exp(-level), abs=0.04)
+    for lag in (50, 100, 191, 300):  # samples; Clarke's autocorrelation J0(2 pi f_d t), first zero at 191
+        similar = np.mean(gain[:-lag] * np.conj(gain[lag:])).real
+        assert similar == pytest.approx(bessel_j0(2 * np.pi * doppler_hz * lag / RATE), abs=0.1)
+
+
+def bessel_j0(x: float) -> float:
+    """By its integral, so that nothing but numpy is needed."""
+    return float(np.mean(np.cos(x * np.sin((np.arange(1000) + 0.5) / 1000 * np.pi))))
+
+
+def test_every_tap_fades_by_itself_where_it_stands() -> None:
+    spacing, delay = 100, 3
+    impulses = np.zeros(SAMPLES)
+    impulses[::spacing] = 1.0
+    config = ChannelConfig(doppler_hz=5000, taps=(1, 0, 0, 0.5j), seed=1)
+    out = samples_through(config, impulses)
+    out = out[: len(out) // spacing * spacing].reshape(-1, spacing)
+    place = int(np.argmax(np.mean(np.abs(out) ** 2, axis=0)))
+    first, second = out[:, place], out[:, (place + delay) % spacing]
+    assert np.mean(np.abs(second) ** 2) == pytest.approx(0.25 * np.mean(np.abs(first) ** 2), rel=0.15)
+    assert np.abs(np.corrcoef(np.abs(first), np.abs(second))[0, 1]) < 0.2
+
+
+def test_equal_seeds_give_equal_fades() -> None:
+    first, again = (through(ChannelConfig(doppler_hz=100, seed=3), 1.0) for _ in range(2))
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, through(ChannelConfig(doppler_hz=100, seed=4), 1.0), atol=0.1)
+
+
+def lose(seed: int, count: int = 400, **settings: Any) -> tuple[list[bytes], PacketLoss]:
     top = gr.top_block()
     probe = Probe()
-    loss = PacketLoss(probability, seed)
+    loss = PacketLoss(ChannelConfig(seed=seed, **settings))
     top.msg_connect((probe, "pdus"), (loss, "pdus"))
     top.msg_connect((loss, "pdus"), (probe, "pdus"))
     top.start()
     for number in range(count):
         probe.post(number.to_bytes(2, "big"))
     wait_for(lambda: loss.received == count)
-    wait_for(lambda: probe.handled + loss.dropped == count)
+    wait_for(lambda: probe.handled + loss.dropped.total() == count)
     top.stop()
     top.wait()
     return probe.packets, loss
 
 
 def test_losses_are_counted_and_repeat_with_the_seed() -> None:
-    first, loss = lose(0.3, 1)
-    assert len(first) + loss.dropped == 400
-    assert 60 < loss.dropped < 180
-    assert lose(0.3, 1)[0] == first
-    assert lose(0.3, 2)[0] != first
+    first, loss = lose(1, packet_loss=0.3)
+    assert len(first) + loss.dropped["packet_loss"] == 400
+    assert 60 < loss.dropped["packet_loss"] < 180
+    assert lose(1, packet_loss=0.3)[0] == first
+    assert lose(2, packet_loss=0.3)[0] != first
 
 
 def test_none_or_all() -> None:
-    assert len(lose(0.0, 1, 50)[0]) == 50
-    assert lose(1.0, 1, 50)[0] == []
-    with pytest.raises(ConfigError, match="packet_loss"):
-        PacketLoss(1.5)
+    assert len(lose(1, 50)[0]) == 50
+    assert lose(1, 50, packet_loss=1.0)[0] == []
+
+
+def test_an_unplugged_link_passes_nothing() -> None:
+    packets, loss = lose(1, 50, outages=((0.0, 3600.0),))
+    assert packets == []
+    assert loss.dropped == {"outages": 50}

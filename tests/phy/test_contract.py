@@ -16,6 +16,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, pdr, record
+from gr_ros2.phy.tap import SYMBOLS_SHOWN
 from gr_ros2.phy.theory import half_point
 from tests.gr.probe import Probe, wait_for
 
@@ -25,19 +26,23 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     *(("ofdm", {"payload_modulation": name}) for name in ("qpsk", "8psk", "16qam", "64qam")),
     ("ofdm", {"fft_len": 256, "scramble": True}),
     ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "64qam"}),
+    ("ofdm", {"gap": 16, "fec": "cc"}),
     ("ofdm", {"detection_threshold": "stock", "gap": 112}),
     ("gfsk", {"sps": 2, "bt": 0.3, "gap": 16}),
-    ("gfsk", {"sps": 8, "bt": 1.0}),
+    ("gfsk", {"sps": 8, "bt": 1.0, "fec": "polar"}),
     ("psk", {"modulation": "bpsk", "sps": 2, "gap": 16}),
     ("psk", {"modulation": "8psk", "rolloff": 0.2}),
     ("psk", {"modulation": "qpsk", "sps": 8, "rolloff": 1.0}),
+    ("psk", {"fec": "ldpc"}),
     ("lora", {"coding_rate": 1, "gap": 16}),
     ("lora", {"spreading_factor": 9, "coding_rate": 3}),
+    ("lora", {"coding_rate": 1, "fec": "cc"}),
 ]
 LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
 IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
 IN_NOISE = [
-    ("ofdm", {"detection_threshold": 0.6}),
+    ("ofdm", {}),
+    *(("ofdm", {"payload_modulation": name}) for name in ("qpsk", "8psk", "16qam", "64qam")),
     ("gfsk", {}),
     ("psk", {}),
     ("psk", {"modulation": "bpsk"}),
@@ -89,6 +94,19 @@ def test_all_zeros_and_all_ones_pass(name: str) -> None:
     assert sink.packets == sent
 
 
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_the_symbols_of_the_last_packet_can_be_seen(name: str) -> None:
+    source, sink = Probe(), Probe()
+    with LoopbackLink(make(name, {}), source, sink, pace="flow", instrumented=True) as link:
+        assert link.symbols() is None
+        source.post(bytes(range(64)))
+        wait_for(lambda: sink.handled == 1, "the packet")
+        symbols = link.symbols()
+        assert symbols is not None
+        assert 100 < len(symbols) <= SYMBOLS_SHOWN
+        assert np.abs(symbols) == pytest.approx(np.ones(len(symbols)), abs=0.35)
+
+
 @pytest.mark.parametrize("frequency_offset", [0.0, 0.0025, -0.005])
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_at_20_db_nothing_is_lost_at_default_settings(name: str, frequency_offset: float) -> None:
@@ -129,8 +147,8 @@ def test_the_computed_share_rises_with_snr(name: str, options: dict[str, Any]) -
         ("lora", {"coding_rate": 0}, "coding_rate = 0"),
         ("ofdm", {"fft_len": 63}, "fft_len = 63"),
         ("ofdm", {"cp_len": 33}, "cp_len = 33"),
-        ("ofdm", {"gap": 111}, "gap = 111"),
-        ("ofdm", {"detection_threshold": 0.4}, "detection_threshold"),
+        ("ofdm", {"gap": 15}, "gap = 15"),
+        ("ofdm", {"detection_threshold": 0.01}, "detection_threshold"),
         ("ofdm", {"detection_threshold": "best"}, "detection_threshold"),
     ],
 )

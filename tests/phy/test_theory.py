@@ -6,6 +6,7 @@ import pytest
 
 from gr_ros2.phy.theory import (
     at_least,
+    coded_orthogonal_success,
     half_point,
     orthogonal_symbol_error,
     packet_success,
@@ -38,3 +39,9 @@ def test_packets_and_half_points() -> None:
     assert at_least(2, 8, 0.0) == 0.0
     assert at_least(2, 8, 1.0) == 1.0
     assert half_point(lambda db: float(db > 3.0)) == pytest.approx(3.0, abs=0.01)
+
+
+def test_chirps_that_are_always_right_carry_all_their_bits_and_blind_guesses_none() -> None:
+    assert coded_orthogonal_success(128, 1e-9, 690, 100) > 0.999
+    assert coded_orthogonal_success(128, 1e-9, 720, 100) < 0.001
+    assert coded_orthogonal_success(128, 127 / 128, 50, 100) < 0.001

@@ -201,3 +201,11 @@ def test_prefixed_frames() -> None:
 def test_bad_settings_are_named(key: str, value: float) -> None:
     with pytest.raises(ConfigError, match=key):
         build(SimSettings, {key: value}, "sim")
+
+
+def test_topics_that_nobody_wants_change_no_byte_of_the_others() -> None:
+    wanted = {"/robot_1/scan", "/robot_2/odom"}
+    fleet = Fleet(SimSettings(seed=3))
+    chosen = list(fleet.messages(2.0, topics=wanted))
+    assert chosen == [message for message in fleet.messages(2.0) if message.topic in wanted]
+    assert {message.topic for message in chosen} == wanted

@@ -1,0 +1,162 @@
+"""Every PHY: a recorded drive at 20 dB, and what source and sink cost beside its bare flowgraph.
+
+The drive goes through the PHY's own transmitter, channel and receiver as fast as these run. The bare flowgraph is the
+same three between two Python blocks; it and the whole link are measured in turn, so that a slow moment of the machine
+hits both.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import pmt
+from gnuradio import gr
+
+from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait
+from bench.report import Row
+from bench.runs import HUSKY, HUSKY_TOPICS
+from gr_ros2.config import ChannelConfig, SourceConfig
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.link import Sender
+from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.airtime import WINDOW
+from gr_ros2.phy.channel import Channel
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.measure import deliver, modulated, release
+from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.registry import Registry
+
+SNR_DB = 20.0
+LEAST = 0.95
+"""Share of the bare flowgraph's packets/s that is left with source and sink."""
+BATCH_SAMPLES = 2_000_000
+REPEATS = 3
+_SMALL = b"\0\1\0\0" + bytes(44)
+"""A message that is one packet."""
+_COUNTS = {"lora": (300, 20)}
+_COUNT = (4000, 200)
+"""Packets for a rate, and for a latency."""
+
+
+def drive() -> list[Row]:
+    """The recorded drive over every PHY with samples at its default settings, 64 B packets in noise."""
+    if not HUSKY.is_dir():
+        return [Row(f"recorded drive: skipped, {HUSKY} is missing", 0)]
+    packets = drive_packets()
+    return [_drive(_phy(name), packets) for name in PHY if PHY.load(name).has_samples]
+
+
+def drive_packets() -> list[bytes]:
+    """What the sending engine makes of the recording: every message, uncompressed."""
+    registry = Registry.from_rows(HUSKY_TOPICS)
+    sender = Sender(registry, SourceConfig(packet_len=PACKET_LEN, robot_id=1, queue_depth=0))
+    ids = {f"/robot_1/{topic.name}": topic.topic_id for topic in registry}
+    packets = []
+    for message in read_bag(HUSKY, list(ids)):
+        now = message.stamp_ns * 1e-9
+        sender.submit(ids[message.topic], message.payload, now)
+        while (packet := sender.next_packet(now)) is not None:
+            packets.append(packet)
+    return packets
+
+
+def _drive(phy: Phy, packets: list[bytes]) -> Row:
+    """In batches, each with noise of its own."""
+    begin, batch = time.monotonic(), max(1, BATCH_SAMPLES // phy.airtime_samples())
+    lost = 0
+    for first in range(0, len(packets), batch):
+        sent = packets[first : first + batch]
+        arrived = deliver(phy, modulated(phy, sent), ChannelConfig(snr_db=SNR_DB, seed=first))
+        lost += len(sent) - sum(packet in set(arrived) for packet in sent) if arrived != sent else 0
+    took = time.monotonic() - begin
+    note = f"{len(packets)} packets of {PACKET_LEN} B, {phy.airtime_samples()} samples each; {took:.0f} s"
+    return Row(f"recorded drive over {phy.name} at {SNR_DB:g} dB: packets lost", lost, "", "=", 0, note=note)
+
+
+def beside() -> list[Row]:
+    """Packets/s and latency with source and sink, beside the bare flowgraph."""
+    return [row for name in PHY if PHY.load(name).has_samples for row in _beside(name)]
+
+
+def _beside(name: str) -> list[Row]:
+    many, few = _COUNTS.get(name, _COUNT)
+    bare, ours = [], []
+    for _ in range(REPEATS):
+        bare.append(_bare(_phy(name), many, few))
+        ours.append(_ours(_phy(name), many, few))
+    rate, own_rate = (median(one[0] for one in runs) for runs in (bare, ours))
+    wait, own_wait = (1e3 * median(one[1] for one in runs) for runs in (bare, ours))
+    note = f"{own_rate:,.0f} of {rate:,.0f} packets/s"
+    return [
+        Row(f"{name}: packets/s beside the bare flowgraph", own_rate / rate, "", "≥", LEAST, "{:.2f}", note),
+        Row(f"{name}: latency added by source and sink, p50", own_wait - wait, "ms", form="{:.2f}",
+            note=f"{own_wait:.2f} ms, bare {wait:.2f} ms"),
+    ]  # fmt: skip
+
+
+def _phy(name: str) -> Phy:
+    phy: Phy = PHY.load(name)(PACKET_LEN, 1e6)
+    return phy
+
+
+def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
+    """Packets/s, and s for a single one, from Python block to Python block."""
+    quicken_threads()
+    poster, taker, graph = _Poster(), _Taker(), gr.top_block()
+    transmitter, receiver = phy.transmitter(), phy.receiver()
+    graph.msg_connect(poster, "out", transmitter, "pdus")
+    graph.connect(transmitter, Channel(ChannelConfig(), phy), receiver)
+    graph.msg_connect(receiver, "pdus", taker, "in")
+    graph.start()
+    phy.prefer_latency()
+    packet = pmt.cons(pmt.make_dict(), pmt.init_u8vector(PACKET_LEN, [7] * PACKET_LEN))
+    single = _latency(lambda: poster.message_port_pub(_OUT, packet), lambda: taker.taken, few)
+    begin = time.perf_counter()
+    for number in range(few, few + many):
+        # As many at once as the link lets under way; without a limit everything waits behind the modulator.
+        _wait(transmitter.packets_sent, number - WINDOW)
+        poster.message_port_pub(_OUT, packet)
+    _wait(lambda: taker.taken, few + many)
+    rate = many / (time.perf_counter() - begin)
+    graph.stop()
+    graph.wait()
+    for part in (transmitter, receiver):
+        release(part)
+    return rate, single
+
+
+def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
+    """The same from a message at the source to the message at the sink."""
+    registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    robot, base = _Graph(1), _Graph(2)
+    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=PACKET_LEN, backpressure=True)
+    sink = RosSink(registry, middleware=base, packet_len=PACKET_LEN)
+    with LoopbackLink(phy, source, sink, pace="flow"):
+        phy.prefer_latency()
+        single = _latency(lambda: robot.callback(_SMALL), lambda: base.counter.published, few)
+        begin = time.perf_counter()
+        feeder = threading.Thread(target=lambda: [robot.callback(_SMALL) for _ in range(many)])
+        feeder.start()
+        _wait(lambda: base.counter.published, few + many)
+        rate = many / (time.perf_counter() - begin)
+        feeder.join()
+    source.close()
+    sink.close()
+    return rate, single
+
+
+def _latency(send: Callable[[], Any], arrived: Callable[[], int], count: int) -> float:
+    """Median of single packets, each sent when the one before has arrived."""
+    waits = []
+    for number in range(count):
+        begin = time.perf_counter()
+        send()
+        while arrived() <= number:
+            time.sleep(2e-5)
+        waits.append(time.perf_counter() - begin)
+    return median(waits)

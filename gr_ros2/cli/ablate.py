@@ -1,0 +1,37 @@
+"""`gr-ros2 ablate`: what each part of a link is worth."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.params import SCENARIO
+from gr_ros2.experiment.ablation import Variant, run_variants, worth_grid
+from gr_ros2.experiment.compare import write_comparison
+from gr_ros2.experiment.table import as_table
+
+
+@click.command()
+@click.argument("scenario", type=SCENARIO)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/ablate-NAME-TIME.")
+@click.option("--seed", type=int, help="Seed of robots, channel and sender.")
+@click.option("--duration", type=float, help="Seconds of each run during which messages are sent.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+def ablate(
+    scenario: str, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]
+) -> None:
+    """Run SCENARIO as it is, then without compression, pull, freshness and queue latest, one at a time."""
+    out = out or Path("results") / f"ablate-{Path(scenario).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    console = make_console()
+
+    def announce(variant: Variant) -> None:
+        console.print(f"{variant.name}: " + (", ".join(variant.settings) or "as it is"), soft_wrap=True)
+
+    runs = run_variants(scenario, out, overrides, announce, seed=seed, duration_s=duration)
+    grid = worth_grid(runs)
+    written = write_comparison(runs, out, [grid])
+    console.print(as_table(grid))
+    console.print(f"Written: {written[0]} and {len(written) - 1} files beside it", soft_wrap=True)

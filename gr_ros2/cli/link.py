@@ -1,0 +1,89 @@
+"""`gr-ros2 link`: one robot's end of a link, until Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.status import Status
+
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.pcap import PacketCapture
+from gr_ros2.radio.config import load_link
+
+_SHOW_S = 0.5
+_LOG_S = 10.0
+"""Between two status lines where the output is no terminal and lines stay."""
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@click.option("--pcap", type=click.Path(path_type=Path), help="Write every packet to this file, for Wireshark.")
+def link(config: Path, duration: float | None, overrides: tuple[str, ...], pcap: Path | None) -> None:
+    """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
+    settings = load_link(config, overrides)
+    from gr_ros2.radio.link import RobotLink  # needs GNU Radio, which a wrong setting must not wait for
+
+    console = make_console()
+    # A service manager's SIGTERM ends a link as Ctrl-C does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with ExitStack() as stack:
+        capture = None if pcap is None else stack.enter_context(PacketCapture(pcap))
+        running = RobotLink(settings, observer=capture)
+        stack.callback(running.stop)
+        try:
+            running.start()
+            console.print(_opening(running), soft_wrap=True)
+            _show(console, running, duration)
+        except KeyboardInterrupt:
+            pass  # how a link ends
+        console.print(status_line(running.stats()), soft_wrap=True)
+
+
+def _opening(running: Any) -> str:
+    phy, front_end, source = running.phy, running.front_end, running.source
+    rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
+    every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
+    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}; Ctrl-C ends it"
+
+
+def _show(console: Console, running: Any, duration: float | None) -> None:
+    """Show one status line until the time is over or nothing more can come."""
+    end = float("inf") if duration is None else time.monotonic() + duration
+    live = console.is_terminal
+    with Status("", console=console) if live else ExitStack() as status:
+        shown = time.monotonic()
+        while (now := time.monotonic()) < end and not running.finished:
+            time.sleep(min(_SHOW_S, end - now))
+            running.check()
+            if isinstance(status, Status):
+                status.update(status_line(running.stats()))
+            elif time.monotonic() - shown >= _LOG_S:
+                shown = time.monotonic()
+                console.print(status_line(running.stats()), soft_wrap=True)
+
+
+def status_line(stats: Mapping[str, Any]) -> str:
+    """What passes, in one line, from :meth:`RobotLink.stats`."""
+    source, sink, packets = stats["source"], stats["sink"], stats["packets"]
+    taken = sum(topic["submitted"] for topic in source["topics"].values())
+    given = sum(topic["delivered"] for topic in sink["topics"].values())
+    parts = [
+        f"{stats['uptime_s']:.0f} s",
+        f"sent {taken} messages in {packets['out']} packets",
+        f"received {given} messages in {packets['in']} packets",
+    ]
+    if sink["packet_loss_est"]:
+        parts.append(f"about {sink['packet_loss_est']} packets lost")
+    troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
+    quiet = ("name", "bursts_in", "bursts_out")
+    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
+    return "; ".join(parts)

@@ -1,0 +1,136 @@
+"""`--pcap FILE`: every packet that leaves or arrives, as a capture that Wireshark reads.
+
+A pcapng file of link type USER0 with two interfaces, `sent` (packets composed by a source of ours) and `received`
+(packets the PHY handed to the sink). Laws: a packet is in the file as soon as its call returns; the file ends after a
+whole record whatever happens to the process; times are wall time, also of runs in simulated time, which start now.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+import click
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.result import Result
+from gr_ros2.experiment.watch import LiveRun
+from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+
+LINK_TYPE = 147
+"""DLT_USER0: ours to give a meaning; the dissector does."""
+
+_SENT, _RECEIVED = 0, 1
+_SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
+_ORDER_MAGIC = 0x1A2B3C4D
+_OPT_APPLICATION, _OPT_NAME, _OPT_TIME_RESOLUTION, _OPT_FLAGS = 4, 2, 9, 2
+_INBOUND, _OUTBOUND = 1, 2
+_NANOSECONDS = 9
+
+
+class PacketCapture:
+    """A capture under way: a :class:`gr_ros2.experiment.watch.Watcher`, and for a link without runs its ears.
+
+    :param path: file to write, replaced if it is there
+    :param clock: s, the clock of the events, until a run brings its own
+    :raises ConfigError: when the file cannot be written
+    """
+
+    instruments = False
+
+    def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        self._offset = time.time() - clock()
+        self._lock = threading.Lock()
+        try:
+            # Unbuffered: what a process wrote before it was killed is what there is to look at.
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise ConfigError(
+                f"--pcap {path}: cannot be written ({error.strerror}); name a file in a folder of yours"
+            ) from error
+        application = _option(_OPT_APPLICATION, b"gr-ros2")
+        self._file.write(_block(_SECTION, struct.pack("<IHHq", _ORDER_MAGIC, 1, 0, -1), application))
+        for name in (b"sent", b"received"):
+            options = _option(_OPT_NAME, name) + _option(_OPT_TIME_RESOLUTION, bytes([_NANOSECONDS]))
+            self._file.write(_block(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0), options))
+
+    def run_started(self, run: LiveRun) -> None:
+        """Take the run's clock."""
+        self._offset = time.time() - run.clock()
+
+    def run_ended(self, result: Result | None) -> None:
+        """Whoever opened the capture closes it."""
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - an EventSink's signature
+        """Write a packet that leaves."""
+        if isinstance(event, SentPacket):
+            self._write(_SENT, event.data, event.now)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        """Write a packet that arrived."""
+        self._write(_RECEIVED, data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What became of packets is not in a capture."""
+
+    def close(self) -> None:
+        """Idempotent."""
+        with self._lock:
+            self._file.close()
+
+    def __enter__(self) -> PacketCapture:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write(self, interface: int, data: bytes, now: float) -> None:
+        stamp = int((now + self._offset) * 1e9)
+        fixed = struct.pack("<IIIII", interface, stamp >> 32, stamp & 0xFFFFFFFF, len(data), len(data))
+        direction = _OUTBOUND if interface == _SENT else _INBOUND
+        record = _block(_PACKET, fixed + _padded(data), _option(_OPT_FLAGS, struct.pack("<I", direction)))
+        with self._lock:
+            if not self._file.closed:
+                self._file.write(record)
+
+
+pcap_option = click.option(
+    "--pcap",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Capture every packet for Wireshark (see `gr-ros2 wireshark`).",
+)
+
+
+@contextmanager
+def capture(path: Path | None) -> Iterator[list[PacketCapture]]:
+    """The captures of a command: one where a file is named.
+
+    :raises ConfigError: when the file cannot be written
+    """
+    if path is None:
+        yield []
+        return
+    with PacketCapture(path) as one:
+        yield [one]
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 4)
+
+
+def _option(code: int, value: bytes) -> bytes:
+    return struct.pack("<HH", code, len(value)) + _padded(value)
+
+
+def _block(kind: int, body: bytes, options: bytes = b"") -> bytes:
+    body += options + bytes(4) if options else b""
+    length = struct.pack("<I", len(body) + 12)
+    return struct.pack("<I", kind) + length + body + length

@@ -1,0 +1,75 @@
+"""`gr-ros2 race`: gr-ros2 against DDS and Zenoh over the same radio."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import click
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.config import build
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.table import as_table
+from gr_ros2.race.report import notes, race_grid, write_race
+from gr_ros2.race.runner import run_race
+from gr_ros2.race.settings import RaceSettings
+
+_SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
+
+
+@click.command()
+@click.option("--short", is_flag=True, help="5 s a contender, at load 200 % and loss 5 % unless told otherwise.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
+@click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20.")
+@click.option("--load", metavar="PERCENT,...", help="Of the link's capacity by the messages as they are; 50,200.")
+@click.option("--sample-rate", type=float, help="Samples/s instead of --load.")
+@click.option("--peers", metavar="NAME,...", help="Who races; default all.")
+@click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
+@click.option("--topic", help="Of the bag, where it has several.")
+@click.option("--duration", "duration_s", type=float, help="Seconds of the recording; default 15.")
+@click.option("--packet-len", type=int, help="Bytes of gr-ros2's packets; default 64.")
+@click.option("--seed", type=int, help="Of robot, losses and sender.")
+def race(
+    short: bool, out: Path | None, loss: str | None, load: str | None, peers: str | None, **options: object
+) -> None:
+    """Carry one recording by gr-ros2, Cyclone DDS and Zenoh over the same radio, and compare. Needs root."""
+    given = {
+        "loss": None if loss is None else _shares("loss", loss),
+        "load": None if load is None else _shares("load", load),
+        "peers": None if peers is None else tuple(name.strip() for name in peers.split(",") if name.strip()),
+        **options,
+    }
+    chosen = {name: value for name, value in given.items() if value is not None}
+    settings = build(RaceSettings, {**(_SHORT if short else {}), **chosen}, "race")
+    out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
+    console = make_console()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(number: int, total: int, what: str) -> None:
+            bar.update(task, completed=number, total=total, description=what)
+            if not console.is_terminal:
+                console.print(f"{number + 1} of {total}: {what}")
+
+        found = run_race(settings, show)
+    if not found.cells:
+        raise found.error or KeyboardInterrupt
+    written = write_race(found, out)
+    console.print(as_table(race_grid(found)))
+    for line in notes(found):
+        console.print(line, soft_wrap=True)
+    console.print(f"\nWritten to {out}: {', '.join(path.name for path in written)}", soft_wrap=True)
+    if found.error is not None:
+        raise found.error
+
+
+def _shares(name: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) / 100 for part in text.split(","))
+    except ValueError as error:
+        raise ConfigError(f"--{name} {text}: write percentages with commas between, such as 0,5,20") from error

@@ -1,0 +1,161 @@
+"""How a live link is doing: its counters over the last seconds, judged against limits.
+
+Laws: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left out,
+never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are those
+of diagnostic_msgs/DiagnosticStatus.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from gr_ros2.config import DiagnosticsConfig
+
+Stats = Mapping[str, Any]
+
+
+class Level(IntEnum):
+    """How bad it is."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass
+class Status:
+    """One part of a link.
+
+    :ivar problems: what is past a limit, in words; none where the level is OK
+    :ivar values: figures by name, as text
+    """
+
+    name: str
+    level: Level = Level.OK
+    problems: list[str] = field(default_factory=list)
+    values: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def message(self) -> str:
+        return "; ".join(self.problems) or "OK"
+
+    def judge(self, what: str, value: float, unit: str, warn: float, error: float = 0.0) -> None:
+        """Add a figure, and raise the level where it is past a limit (0: no limit)."""
+        self.values[f"{what} ({unit})" if unit else what] = f"{value:.3g}"
+        level = Level.ERROR if error and value > error else Level.WARN if warn and value > warn else Level.OK
+        if level:
+            self.level = max(self.level, level)
+            self.problems.append(f"{what} {value:.3g} {unit}".strip())
+
+
+class _Look(NamedTuple):
+    """The counters that matter at one moment; of a topic, messages delivered and messages lost."""
+
+    now: float
+    sent: int
+    received: int
+    missing: int
+    rejected: int
+    topics: dict[str, tuple[int, int]]
+
+
+class LinkHealth:
+    """Judges the snapshots of one link, taken at regular times.
+
+    :param name: before the name of every part
+    :param queue_depth: messages that may wait per topic, 0 unbounded
+    """
+
+    def __init__(self, config: DiagnosticsConfig, name: str, queue_depth: int) -> None:
+        self._config = config
+        self._name = name
+        self._queue_depth = queue_depth
+        self._looks: deque[_Look] = deque()
+        self._heard_at: float | None = None
+
+    def judge(self, stats: Stats, now: float) -> list[Status]:
+        """Receiver, transmitter, and every topic received.
+
+        :param stats: of a ``RobotLink``
+        :param now: s, monotonic
+        """
+        look = _look(stats, now)
+        if look.received > (self._looks[-1].received if self._looks else 0):
+            self._heard_at = now
+        while len(self._looks) > 1 and self._looks[1].now <= now - self._config.window_s:
+            self._looks.popleft()
+        before = self._looks[0] if self._looks else look
+        self._looks.append(look)
+        topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
+        return [self._receiver(stats, before, look), self._transmitter(stats, before, look), *topics]
+
+    def _receiver(self, stats: Stats, before: _Look, look: _Look) -> Status:
+        status, limits = Status(f"{self._name}: receiver"), self._config
+        received, missing = look.received - before.received, look.missing - before.missing
+        if received + missing > 0:
+            lost = max(missing, 0) / (received + max(missing, 0))
+            status.judge("packet loss", lost, "", limits.packet_loss_warn, limits.packet_loss_error)
+        status.judge("packets received", _rate(received, before, look), "1/s", 0)
+        status.judge("packets rejected", _rate(look.rejected - before.rejected, before, look), "1/s", 0)
+        if self._heard_at is None:
+            status.values["silence (s)"] = "nothing received yet"
+        else:
+            silence = look.now - self._heard_at
+            status.judge("silence", silence, "s", limits.silence_warn_s, limits.silence_error_s)
+        status.values["packets damaged"] = str(stats["packets"]["damaged"])
+        status.values["held (B)"] = str(stats["sink"]["held_bytes"])
+        snr = stats["phy"].get("snr_db")
+        if snr is not None:
+            status.values["SNR (dB)"] = f"{snr:.1f}"
+        return status
+
+    def _transmitter(self, stats: Stats, before: _Look, look: _Look) -> Status:
+        status = Status(f"{self._name}: transmitter")
+        rate = _rate(look.sent - before.sent, before, look)
+        status.judge("packets sent", rate, "1/s", 0)
+        status.values["airtime of a packet (s)"] = f"{stats['phy']['airtime_s']:.3g}"
+        status.values["airtime used"] = f"{min(1.0, rate * stats['phy']['airtime_s']):.3g}"
+        status.values["packets waiting"] = str(stats["packets"]["backlog"])
+        topics = stats["source"]["topics"].values()
+        waiting = max((topic["queued"] for topic in topics), default=0)
+        status.values["messages waiting"] = str(sum(topic["queued"] for topic in topics))
+        if self._queue_depth:
+            status.judge("fullest queue", waiting / self._queue_depth, "", self._config.queue_warn)
+        refused: dict[str, int] = {}
+        for topic in topics:
+            for reason, count in topic["refused"].items():
+                refused[reason] = refused.get(reason, 0) + count
+        status.values |= {f"messages dropped: {reason}": str(count) for reason, count in sorted(refused.items())}
+        return status
+
+    def _topic(self, name: str, topic: Stats, before: _Look, look: _Look) -> Status:
+        status, limits = Status(f"{self._name}: {name}"), self._config
+        delivered, lost = (
+            new - old for new, old in zip(look.topics[name], before.topics.get(name, (0, 0)), strict=True)
+        )
+        if delivered + lost:
+            share = lost / (delivered + lost)
+            status.judge("messages lost", share, "", limits.message_loss_warn, limits.message_loss_error)
+        status.judge("messages", _rate(delivered, before, look), "1/s", 0)
+        latency = topic["recent_latency_s"]
+        if latency is not None:
+            status.judge("latency", latency["p50"], "s", limits.latency_warn_s, limits.latency_error_s)
+            status.values["latency, 95 % (s)"] = f"{latency['p95']:.3g}"
+        if topic["age_s"] is not None:
+            status.judge("age", topic["age_s"], "s", limits.age_warn_s, limits.age_error_s)
+        return status
+
+
+def _look(stats: Stats, now: float) -> _Look:
+    sink = stats["sink"]
+    topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
+    rejected = sum(sink["rejected"].values())
+    return _Look(now, stats["packets"]["out"], sink["packets"], sink["packet_loss_est"], rejected, topics)
+
+
+def _rate(count: int, before: _Look, look: _Look) -> float:
+    return count / (look.now - before.now) if look.now > before.now else 0.0

@@ -1,0 +1,61 @@
+"""Packets the channel loses whole: at random, in bursts, and while the link is unplugged.
+
+Laws: equal seeds give equal losses for the same order of packets; every packet draws the same number of random
+values, so that a change of one setting does not shift what the seed does later; each loss is counted under the name
+of the setting that caused it.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+
+from gr_ros2.config import BurstLoss, ChannelConfig
+
+
+class PduLosses:
+    """Decides packet by packet what comes through, wherever the packets come from.
+
+    :param config: ``packet_loss``, ``burst_loss``, ``outages`` and ``seed`` of it
+    """
+
+    def __init__(self, config: ChannelConfig) -> None:
+        self.packet_loss = config.packet_loss
+        self.dropped: Counter[str] = Counter()
+        """Packets lost so far, by setting."""
+        self._outages = config.outages
+        self._bursts = None if config.burst_loss is None else GilbertElliott(config.burst_loss, config.seed)
+        self._random = random.Random(config.seed)
+
+    def passes(self, now: float) -> bool:
+        """Whether the next packet comes through.
+
+        :param now: s since the run began
+        """
+        by_chance = self._random.random() < self.packet_loss
+        in_burst = self._bursts is not None and self._bursts.loses()
+        for name, lost in (("outages", self._unplugged(now)), ("burst_loss", in_burst), ("packet_loss", by_chance)):
+            if lost:
+                self.dropped[name] += 1
+                return False
+        return True
+
+    def _unplugged(self, now: float) -> bool:
+        return any(begin <= now < end for begin, end in self._outages)
+
+
+class GilbertElliott:
+    """The two-state channel of Gilbert (1960) and Elliott (1963), stationary from its first packet on."""
+
+    def __init__(self, config: BurstLoss, seed: int = 0) -> None:
+        self._config = config
+        self._random = random.Random(f"burst_loss {seed}")  # not the sequence of packet_loss
+        self.bad = self._random.random() < config.share_bad
+
+    def loses(self) -> bool:
+        """Whether the next packet is lost; the state moves on after it."""
+        config = self._config
+        lost = self._random.random() < (config.loss_bad if self.bad else config.loss_good)
+        if self._random.random() < (config.p_bad_to_good if self.bad else config.p_good_to_bad):
+            self.bad = not self.bad
+        return lost

@@ -1,0 +1,231 @@
+"""Forward error correction of a frame's bits, by GNU Radio's FEC objects, called without its scheduler.
+
+Laws: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a 1;
+what a code sends is spread over the whole frame, so that a fade takes a little of everything; a code only guesses,
+whether a frame is right its CRC says.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from abc import ABC, abstractmethod
+from math import gcd
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gnuradio import fec, gr
+from numpy.typing import NDArray
+
+from gr_ros2.errors import BackendMissingError
+
+Bits = NDArray[np.uint8]
+Soft = NDArray[np.float32]
+CodeName = Literal["none", "cc", "ldpc", "polar"]
+
+_CONSTRAINT, _POLYNOMIALS = 7, [0o117, 0o155]
+_CC_TAIL = 2 * (_CONSTRAINT - 1)
+_CC_MIDDLE, _CC_STEP = 127.5, 12.0
+"""The Viterbi decoder takes bytes: a soft bit of 10, which is certain enough, is next to their end."""
+_LDPC = ((152, 300, "n_0300_k_0152_gap_03"), (902, 1800, "n_1800_k_0902_gap_28"))
+"""GNU Radio's codes of rate one half: data bits, coded bits, file."""
+_LDPC_SIGMA, _LDPC_ROUNDS = 0.5, 25
+_LIMIT = 20.0
+"""Beyond this a soft bit is certain; the LDPC decoder works with its exponential."""
+_LEAST = 1e-3
+_POLAR_MOST = 2048
+_POLAR_RATE = 0.625
+"""Above this rate a code of twice the length is taken."""
+_POLAR_DESIGN_DB = 1.0
+_GOLDEN = 0.618
+
+
+class Code(ABC):
+    """A code for one number of bits.
+
+    :param bits: per frame, before coding
+    """
+
+    coded_bits: int
+
+    def __init__(self, bits: int) -> None:
+        self.bits = bits
+
+    @abstractmethod
+    def encode(self, bits: Bits) -> Bits:
+        """``bits`` zeros and ones to ``coded_bits`` of them."""
+
+    @abstractmethod
+    def decode(self, soft: Soft) -> Bits:
+        """``coded_bits`` soft bits to the likeliest ``bits``."""
+
+
+class Uncoded(Code):
+    """Bits as they are."""
+
+    def __init__(self, bits: int) -> None:
+        super().__init__(bits)
+        self.coded_bits = bits
+
+    def encode(self, bits: Bits) -> Bits:
+        return bits
+
+    def decode(self, soft: Soft) -> Bits:
+        return (soft > 0).astype(np.uint8)
+
+
+class Spread(Code):
+    """Another code, with its bits sent in another order: neighbours end up far apart."""
+
+    def __init__(self, inner: Code) -> None:
+        super().__init__(inner.bits)
+        self._inner = inner
+        self.coded_bits = count = inner.coded_bits
+        step = next(step for step in range(int(_GOLDEN * count), count + 1) if gcd(step, count) == 1)
+        self._order = np.arange(count) * step % count
+
+    def encode(self, bits: Bits) -> Bits:
+        spread: Bits = self._inner.encode(bits)[self._order]
+        return spread
+
+    def decode(self, soft: Soft) -> Bits:
+        ordered = np.empty_like(soft)
+        ordered[self._order] = soft
+        return self._inner.decode(ordered)
+
+
+class Convolutional(Code):
+    """Rate 1/2, constraint length 7, ended with zeros; soft decisions, Viterbi."""
+
+    def __init__(self, bits: int) -> None:
+        super().__init__(bits)
+        self.coded_bits = 2 * bits + _CC_TAIL
+        arguments = (bits, _CONSTRAINT, 2, _POLYNOMIALS, 0)
+        self._encoder = fec.cc_encoder.make(*arguments, fec.CC_TERMINATED, False)
+        self._decoder = fec.cc_decoder.make(*arguments, -1, fec.CC_TERMINATED, False)
+
+    def encode(self, bits: Bits) -> Bits:
+        return _work(self._encoder, bits, self.coded_bits)
+
+    def decode(self, soft: Soft) -> Bits:
+        levels = np.clip(_CC_MIDDLE + _CC_STEP * soft, 0, 255).astype(np.uint8)
+        return _work(self._decoder, levels, self.bits)
+
+
+class Blocks(Code):
+    """A block code for any number of bits: cut into as few blocks as do, each of the same number of bits.
+
+    Bits a block has room for beyond that are zeros that both ends know and nobody sends ("shortening").
+
+    :param room: data bits of a block
+    """
+
+    def __init__(self, bits: int, room: int) -> None:
+        super().__init__(bits)
+        self.count = -(-bits // room)
+        self.each = -(-bits // self.count)
+
+    def blocks_of(self, bits: Bits) -> Bits:
+        padded = np.zeros(self.count * self.each, np.uint8)
+        padded[: self.bits] = bits
+        return padded.reshape(self.count, self.each)
+
+
+class Ldpc(Blocks):
+    """Rate 1/2 and below, the smaller or larger of two of GNU Radio's matrices; sum-product decoder.
+
+    :raises BackendMissingError: where GNU Radio's matrices are not installed
+    """
+
+    def __init__(self, bits: int) -> None:
+        self._room, self._size, name = next((code for code in _LDPC if bits <= code[0]), _LDPC[-1])
+        super().__init__(bits, self._room)
+        path = Path(gr.prefix()) / "share" / "gnuradio" / "fec" / "ldpc" / f"{name}.alist"
+        if not path.is_file():
+            raise BackendMissingError(f"fec 'ldpc' needs {path}, which comes with GNU Radio (apt install gnuradio)")
+        self._checks = self._size - self._room
+        self.coded_bits = self.count * (self.each + self._checks)
+        self._encoder = fec.ldpc_encoder.make(str(path))
+        self._decoder = fec.ldpc_decoder.make(str(path), _LDPC_SIGMA, _LDPC_ROUNDS)
+
+    def encode(self, bits: Bits) -> Bits:
+        word = np.zeros(self._room, np.uint8)
+        out = []
+        for block in self.blocks_of(bits):
+            word[: self.each] = block
+            # The data stand behind the checks.
+            out.append(_work(self._encoder, word, self._size)[: self._checks + self.each])
+        return np.concatenate(out)
+
+    def decode(self, soft: Soft) -> Bits:
+        levels = np.full(self._size, -_LIMIT, np.float32)
+        out = []
+        # It also divides by what is 0 for a bit of which nothing is known.
+        known = np.where(np.abs(soft) < _LEAST, np.float32(_LEAST), np.clip(soft, -_LIMIT, _LIMIT))
+        for block in known.reshape(self.count, -1):
+            levels[: block.size] = block
+            # The decoder makes likelihoods of exp(-level / (2 sigma^2)).
+            out.append(_work(self._decoder, levels * np.float32(2 * _LDPC_SIGMA**2), self._room)[: self.each])
+        data: Bits = np.concatenate(out)[: self.bits]
+        return data
+
+
+class Polar(Blocks):
+    """Rate 0.31 to 0.625, blocks of up to 2048 bits, frozen bits after Arikan; successive cancellation decoder."""
+
+    def __init__(self, bits: int) -> None:
+        super().__init__(bits, int(_POLAR_MOST * _POLAR_RATE))
+        size = 1 << int(np.ceil(np.log2(self.each / _POLAR_RATE)))
+        self._size = size
+        self.coded_bits = self.count * size
+        frozen = np.sort(np.argsort(capacities(size, _POLAR_DESIGN_DB), kind="stable")[: size - self.each]).tolist()
+        zeros = [0] * len(frozen)
+        self._encoder = fec.polar_encoder.make(size, self.each, frozen, zeros, False)
+        self._decoder = fec.polar_decoder_sc.make(size, self.each, frozen, zeros)
+
+    def encode(self, bits: Bits) -> Bits:
+        return np.concatenate([_work(self._encoder, block, self._size) for block in self.blocks_of(bits)])
+
+    def decode(self, soft: Soft) -> Bits:
+        blocks = soft.reshape(self.count, self._size)
+        data: Bits = np.concatenate([_work(self._decoder, block, self.each) for block in blocks])[: self.bits]
+        return data
+
+
+def capacities(size: int, design_db: float) -> NDArray[np.float64]:
+    """Of a polar code's bit channels, for an erasure channel as good as white noise at this Es/N0 (Arikan, 2009).
+
+    :param size: coded bits, a power of 2
+    """
+    capacity = np.array([1 - np.exp(-(10 ** (design_db / 10)))])
+    while len(capacity) < size:
+        capacity = np.stack((capacity**2, 2 * capacity - capacity**2), axis=1).reshape(-1)
+    return capacity
+
+
+def make_code(name: CodeName, bits: int) -> Code:
+    """The code of this name for frames of so many bits.
+
+    :raises BackendMissingError: where GNU Radio lacks what it needs
+    """
+    if name == "none":
+        return Uncoded(bits)
+    made: dict[str, type[Convolutional | Ldpc | Polar]] = {"cc": Convolutional, "ldpc": Ldpc, "polar": Polar}
+    return Spread(made[name](bits))
+
+
+def _work(coder: Any, given: NDArray[Any], size: int) -> Bits:
+    """One call of a GNU Radio encoder or decoder: it takes the addresses of its input and of its output."""
+    given = np.ascontiguousarray(given)
+    out = np.empty(size, np.uint8)
+    coder.generic_work(_address(given), _address(out))
+    return out
+
+
+def _address(array: NDArray[Any]) -> Any:
+    return _new_capsule(array.ctypes.data, None, None)
+
+
+_new_capsule = ctypes.pythonapi.PyCapsule_New
+_new_capsule.restype = ctypes.py_object
+_new_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]

@@ -1,0 +1,175 @@
+"""The frame of the `ofdm` PHY on the air: carriers, sync words, constellations, as GNU Radio's blocks have them.
+
+Laws: at equal settings every implementation makes the same samples; numpy's global generator, which the stock sync
+words reseed, is left as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from gnuradio import digital
+from gnuradio.digital import ofdm_txrx
+from numpy.typing import NDArray
+
+BITS = {"bpsk": 1, "qpsk": 2, "8psk": 3, "16qam": 4, "64qam": 6}
+"""Payload bits on one carrier of one symbol, by modulation."""
+_SCRAMBLER = {"mask": 0x8A, "seed": 0x7F, "len": 7}
+
+
+HEAD_SYMBOLS = 3
+"""Two sync words and one header symbol."""
+CRC_LEN = 4
+_MAX_FRAME_LEN = 4095
+"""The stock header counts the bytes of its frame, CRC-32 included, in 12 bits."""
+_HEADER_SEED = 0x6F
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What transmitter and receiver must agree on.
+
+    :param fft_len: carriers, used or not, a power of 2 from 64 on
+    :param cp_len: samples of the cyclic prefix
+    :param modulation: of the payload, a name of ``BITS``
+    :param scramble: header and payload bits
+    """
+
+    fft_len: int
+    cp_len: int
+    modulation: str
+    scramble: bool
+
+    @property
+    def symbol_samples(self) -> int:
+        """Samples of one symbol, cyclic prefix included."""
+        return self.fft_len + self.cp_len
+
+    @property
+    def bits_per_carrier(self) -> int:
+        """Payload bits on one carrier of one symbol."""
+        return BITS[self.modulation]
+
+    def fill(self, packet_len: int) -> int:
+        """Bytes a packet is filled up with, so that it and its CRC-32 take whole constellation points."""
+        return -(packet_len + CRC_LEN) % (3 if self.bits_per_carrier % 3 == 0 else 1)
+
+    def fits_header(self, packet_len: int) -> bool:
+        """Whether the header has room for the length of a frame with a CRC-32."""
+        return packet_len + self.fill(packet_len) + CRC_LEN <= _MAX_FRAME_LEN
+
+    def symbols(self, bits: int) -> int:
+        """Of a frame with so many bits of payload: sync words, header, payload."""
+        return HEAD_SYMBOLS + -(-bits // (self.bits_per_carrier * len(self.data[0])))
+
+    def mask(self, length: int) -> NDArray[np.uint8]:
+        """What scrambling adds to the bytes of a payload, zeros where it is off."""
+        seed = _SCRAMBLER["seed"] if self.scramble else 0
+        return np.packbits(_register(seed, 8 * length), bitorder="little")
+
+    def header_bits(self, length: int) -> NDArray[np.uint8]:
+        """The header of frame number 0: length in bytes (of which it has room for 12 bits), number, CRC-8."""
+        size = len(self.data[0])
+        fields = (length % (_MAX_FRAME_LEN + 1)).to_bytes(2, "little") + bytes(2)
+        value = int.from_bytes(fields[:2], "little") | _crc8(fields) << 24
+        bits = np.array([value >> place & 1 if place < 32 else 0 for place in range(size)], np.uint8)
+        return bits ^ _register(_HEADER_SEED if self.scramble else 0, size)
+
+    @property
+    def pilots(self) -> tuple[tuple[int, ...], ...]:
+        """Pilot carriers: 7 and 21 either side of 64, spread over more as far."""
+        scale = self.fft_len // 64
+        return (tuple(place * scale for place in (-21, -7, 7, 21)),)
+
+    @property
+    def data(self) -> tuple[tuple[int, ...], ...]:
+        """Data carriers: 26 either side of 64 without pilots and the middle one."""
+        edge = 26 * self.fft_len // 64
+        return (tuple(place for place in range(-edge, edge + 1) if place and place not in self.pilots[0]),)
+
+    @property
+    def pilot_symbols(self) -> tuple[tuple[int, ...], ...]:
+        """What the pilots carry."""
+        return ((1, 1, 1, -1),)
+
+    def sync_words(self) -> list[list[complex]]:
+        """Those of the stock blocks."""
+        with _numpy_state_kept():
+            arguments = (self.fft_len, self.data, self.pilots)
+            return [
+                [complex(point) for point in make(*arguments)]
+                for make in (ofdm_txrx._make_sync_word1, ofdm_txrx._make_sync_word2)
+            ]
+
+    def header(self, packet_key: str, frame_key: str) -> Any:
+        """The stock header's format: length, number, CRC-8; one symbol of BPSK."""
+        bits = BITS[self.modulation]
+        return digital.packet_header_ofdm(
+            self.data, 1, packet_key, frame_key, "packet_num", 1, bits, scramble_header=self.scramble
+        )
+
+    def scrambler(self, key: str) -> Any:
+        """Scrambles or descrambles bytes, afresh with each packet."""
+        seed = _SCRAMBLER["seed"] if self.scramble else 0
+        return digital.additive_scrambler_bb(
+            _SCRAMBLER["mask"], seed, _SCRAMBLER["len"], 0, bits_per_byte=8, reset_tag_key=key
+        )
+
+
+def constellation(modulation: str) -> Any:
+    """Points of mean magnitude 1. GNU Radio's own QPSK has magnitude 2, 6 dB above preamble and header.
+
+    :param modulation: a name of ``BITS``
+    """
+    if modulation == "bpsk":
+        return digital.constellation_bpsk()
+    if modulation == "8psk":
+        return digital.constellation_8psk()
+    side = 1 << BITS[modulation] // 2
+    gray = np.argsort(np.arange(side) ^ np.arange(side) >> 1)
+    levels = 2.0 * gray - (side - 1)
+    points = (levels[:, None] + 1j * levels).reshape(-1)
+    size = float(np.abs(points).mean())
+    symmetry, width = 4, 2 / size
+    order = list(range(side * side))
+    return digital.constellation_rect(list(points / size), order, symmetry, side, side, width, width)
+
+
+@lru_cache
+def point_power(modulation: str) -> float:
+    """Mean squared magnitude of the points."""
+    return float(np.mean(np.abs(constellation(modulation).points()) ** 2))
+
+
+@contextmanager
+def _numpy_state_kept() -> Iterator[None]:
+    """The stock sync words reseed numpy's global generator; that is the user's, so put it back."""
+    state = np.random.get_state()
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
+
+
+def _register(seed: int, count: int) -> NDArray[np.uint8]:
+    """Bits of GNU Radio's linear feedback shift register."""
+    state, bits = seed, np.empty(count, np.uint8)
+    for place in range(count):
+        bits[place] = state & 1
+        state = state >> 1 | ((state & _SCRAMBLER["mask"]).bit_count() & 1) << _SCRAMBLER["len"]
+    return bits
+
+
+def _crc8(data: bytes) -> int:
+    """Polynomial 0x07, start 0xFF, highest bit first."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x07 if crc & 0x80 else 0)) & 0xFF
+    return crc

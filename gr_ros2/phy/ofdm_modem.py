@@ -1,0 +1,322 @@
+"""OFDM bursts without GNU Radio's scheduler: found by a repeated half symbol, read with every symbol as reference.
+
+Laws: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a short
+impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the payload
+is decided to be, weighted with how sure that is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
+from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
+from gr_ros2.phy.soft import Points
+
+_FALSE_ALARM = 1e-3
+"""Share of samples of noise that are looked at closely."""
+_ALIKE = 0.2
+"""Correlation of the sync words over their power, from which on a burst is one: noise has it once in 10^5 looks."""
+_SHIFTS = (-4, -2, 0, 2, 4)
+"""Carriers by which the signal may be off, beside the one that the repeated half symbol tells."""
+_CHUNK = 16
+"""Payload symbols decided together, and between two looks at timing and channel."""
+_PACE_GAIN = 0.5
+"""Of the timing loop, for the speed of its change."""
+_MEMORY = 32.0
+"""Symbols the channel estimate remembers."""
+_RIDGE = 0.001
+"""Noise over signal per carrier that the channel estimate is made for."""
+_TURN = 0.4
+"""Radians per symbol that the carrier offset may still be wrong by after the sync words."""
+_DOUBT = 1e-3
+"""Of the power of what was sent: with less doubt about it symbols are not decided again in order to estimate."""
+_TINY = 1e-20
+
+
+class _Place(NamedTuple):
+    """Where a burst is: first sample, radians per sample, and how much of the power is sync words, 0..1."""
+
+    begin: int
+    frequency: float
+    alike: float
+
+
+class _Clock(NamedTuple):
+    """Where a burst's first sample would be, and samples by which each symbol comes later than the one before."""
+
+    begin: float
+    pace: float
+
+
+class _Channel(NamedTuple):
+    """Gain of each used carrier, the weight of what it was estimated from, and the noise on each."""
+
+    gains: NDArray[np.complex128]
+    weight: NDArray[np.float64]
+    noise: float
+
+
+class OfdmModem(BurstModem):
+    """See :class:`gr_ros2.phy.ofdm.OfdmOptions`. The reference sample is the first of the first sync word's prefix.
+
+    :param frame: what a burst carries, lowest bit of a byte first
+    :param layout: carriers and constellation
+    :param threshold: of the preamble's metric, 0..1; None = by the share of false alarms
+    """
+
+    def __init__(self, frame: Frame, layout: Layout, threshold: float | None) -> None:
+        super().__init__(frame)
+        self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
+        self._bpsk = Points(np.array([-1, 1], complex), "little")
+        self._layout = layout
+        self._size, self._prefix, self._symbol = layout.fft_len, layout.cp_len, layout.symbol_samples
+        self._half = self._size // 2
+        self._window = self._symbol - self._half
+        self._level = 1 - _FALSE_ALARM ** (1 / (self._window - 1)) if threshold is None else threshold
+        self._back = self._prefix // 4
+        self.margin = self._prefix
+        self.stretch = max(2048, 16 * self._size)
+        self.symbols = layout.symbols(frame.bits)
+        self._carriers = np.array(sorted(layout.data[0] + layout.pilots[0]))
+        self._data = np.flatnonzero(np.isin(self._carriers, layout.data[0]))
+        self._pilots = np.searchsorted(self._carriers, layout.pilots[0])
+        self._known = np.zeros(len(self._carriers), np.complex64)
+        self._known[self._pilots] = layout.pilot_symbols[0]
+        self._header = self._bpsk.map(layout.header_bits(-(-frame.bits // 8)))
+        words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
+        self._words = words[:, self._carriers].astype(np.complex64)
+        self._prepare_search(words)
+        self._prepare_estimate()
+
+    def _prepare_search(self, words: NDArray[np.complex128]) -> None:
+        even = np.flatnonzero(np.abs(words[0]) > 0)
+        turns = np.zeros((len(_SHIFTS), self._size), np.complex64)
+        for row, shift in zip(turns, _SHIFTS, strict=True):
+            row[(even + shift) % self._size] = (words[0] * words[1].conj())[even]
+        self._turns = turns
+        self._repeat = 1 - 2 * int(even[0] % 2)
+        """Sign with which the second half of the first sync word repeats the first: its carriers are even or odd."""
+        self._whole = words.conj().astype(np.complex64)
+        self._energy = float((np.abs(words) ** 2).sum())
+
+    def _prepare_estimate(self) -> None:
+        delays = np.arange(self._prefix)
+        basis = np.exp(-2j * np.pi * np.outer(self._carriers, delays) / self._size)
+
+        def smoother(weight: NDArray[np.float64]) -> NDArray[np.complex64]:
+            gram = basis.conj().T @ (basis * weight[:, None])
+            gram += _RIDGE * len(self._carriers) * np.eye(len(delays))
+            return np.asarray(basis @ np.linalg.solve(gram, basis.conj().T), np.complex64)
+
+        self._word_weight = (np.abs(self._words) ** 2).sum(axis=0).astype(np.float64)
+        self._smooth_words = smoother(self._word_weight)
+        self._smooth = smoother(np.ones(len(self._carriers)))
+        self._degrees = 2 * len(self._carriers) - len(delays)
+
+    @property
+    def burst_samples(self) -> int:
+        return self.symbols * self._symbol
+
+    @property
+    def span(self) -> int:
+        return self.burst_samples - self._back
+
+    @property
+    def preamble_samples(self) -> int:
+        return 4 * self._symbol
+
+    @property
+    def peak_samples(self) -> int:
+        return self._symbol
+
+    def modulate(self, packet: bytes) -> Samples:
+        grid = np.zeros((self.symbols, self._size), np.complex64)
+        grid[:2, self._carriers] = self._words
+        payload = np.zeros((self.symbols - 2, len(self._carriers)), np.complex64)
+        payload[:] = self._known
+        points = np.zeros((self.symbols - 2, len(self._data)), np.complex64)
+        points[0] = self._header
+        mapped = self.constellation.map(self.frame.wrap(packet))
+        points[1:].reshape(-1)[: len(mapped)] = mapped
+        payload[:, self._data] = points
+        grid[2:, self._carriers] = payload
+        bodies = np.fft.ifft(grid) * self._size
+        whole = np.concatenate((bodies[:, -self._prefix :], bodies), axis=1)
+        return np.asarray(whole.reshape(-1), np.complex64)
+
+    def find(self, samples: Samples) -> Search:
+        half, window = self._half, self._window
+        # What a closer look at the last place needs, and as far again for it to be moved.
+        positions = len(samples) - 2 * self._symbol - self._prefix
+        if positions <= 0:
+            return Search(0)
+        used = samples[: positions + window + half]
+        products = np.cumsum(np.concatenate(([0], used[half:] * used[:-half].conj())), dtype=np.complex128)
+        powers = np.cumsum(np.concatenate(([0], used.real**2 + used.imag**2)), dtype=np.float64)
+        alike = np.abs(products[window:] - products[:-window])[:positions]
+        power = powers[window:] - powers[:-window]
+        power = (power[:positions] + power[half : half + positions]) / 2
+        above = np.flatnonzero(alike > np.sqrt(self._level) * power + _TINY * (powers[-1] + _TINY))
+        at = 0
+        while at < len(above):
+            first = int(above[at])
+            if first + self._symbol > positions:  # the highest point may still be to come
+                return Search(first)
+            ratio = alike[first : first + self._symbol] / (power[first : first + self._symbol] + _TINY)
+            best = first + int(np.argmax(ratio))
+            place = self._place(samples, best)
+            if place.alike > _ALIKE:
+                return Search(max(0, min(first, place.begin)), place.begin)
+            at = int(np.searchsorted(above, best + 1))
+        return Search(positions)
+
+    def read(self, samples: Samples, start: int) -> Reading:
+        begin, frequency, _ = self._place(samples, start)
+        clock = _Clock(float(begin), 0.0)
+        rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
+        channel = self._first_estimate(rows[:2])
+        channel, _, _, _ = self._decide(rows[2:], channel, self._bpsk, np.ones((1, len(self._data)), bool), rounds=1)
+        count = self.symbols - HEAD_SYMBOLS
+        points = -(-self.frame.bits // self.constellation.bits)
+        used = np.arange(count * len(self._data)).reshape(count, -1) < points
+        soft, looked = [], []
+        for first in range(0, count, _CHUNK):
+            last = min(count, first + _CHUNK)
+            rows = self._rows(samples, clock, frequency, HEAD_SYMBOLS + first, last - first)
+            channel, likely, seen, late = self._decide(rows, channel, self.constellation, used[first:last])
+            soft.append(self.constellation.soft(likely))
+            looked.append(seen)
+            pace = clock.pace + _PACE_GAIN * late / _CHUNK
+            clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
+        return Reading(np.concatenate(soft), np.concatenate(looked))
+
+    def _place(self, samples: Samples, at: int) -> _Place:
+        """Look closely at a place where the first half of a symbol is repeated."""
+        window = samples[at : at + self._window + self._half]
+        step = self._repeat * np.vdot(window[: -self._half], window[self._half :])
+        frequency = float(np.angle(step)) / self._half
+        first = max(0, at + self._prefix - self._back)
+        part = samples[first : first + self._symbol + self._size]
+        if len(part) < self._symbol + self._size:
+            return _Place(at, frequency, 0.0)
+        part = part * np.exp(-1j * frequency * np.arange(len(part)))
+        spectra = np.fft.fft(np.stack((part[: self._size], part[self._symbol :])))
+        shift = _SHIFTS[int(np.argmax(np.abs(self._turns @ (spectra[0].conj() * spectra[1]))))]
+        if shift:
+            frequency += 2 * np.pi * shift / self._size
+            spectra = np.roll(spectra, -shift, axis=1)
+            # A roll leaves what the carriers turn between the two symbols.
+            spectra[1] *= np.exp(-2j * np.pi * shift * self._symbol / self._size)
+        gains = spectra * self._whole
+        turn = float(np.angle(np.vdot(gains[0], gains[1])))
+        profile = np.abs(np.fft.ifft(gains[0] + gains[1] * np.exp(-1j * turn)))
+        peak = int(np.argmax(profile))
+        power = float(np.vdot(spectra, spectra).real)
+        alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
+        late = (peak + self._half) % self._size - self._half
+        return _Place(first - self._prefix + late, frequency + turn / self._symbol, alike)
+
+    def _rows(
+        self, samples: Samples, clock: _Clock, frequency: float, symbol: int, count: int
+    ) -> NDArray[np.complex64]:
+        """Used carriers of some of a burst's symbols."""
+        drift = clock.pace * (symbol + np.arange(count))
+        first = round(clock.begin + float(drift[0])) + symbol * self._symbol + self._prefix - self._back
+        first = max(0, first)
+        part = samples[first : first + (count - 1) * self._symbol + self._size]
+        whole = np.zeros(count * self._symbol, np.complex64)
+        whole[: len(part)] = part * np.exp(-1j * frequency * (first + np.arange(len(part))))
+        spectra = np.fft.fft(whole.reshape(count, -1)[:, : self._size])[:, self._carriers] / self._size
+        late = clock.begin + drift - round(clock.begin + float(drift[0]))
+        if late.any():
+            spectra = spectra * self._advance(late[:, None])
+        return np.asarray(spectra, np.complex64)
+
+    def _advance(self, samples: Any) -> NDArray[np.complex128]:
+        """What brings carriers forward by a fraction of a sample, or some."""
+        return np.asarray(np.exp(2j * np.pi / self._size * self._carriers * samples))
+
+    def _first_estimate(self, rows: NDArray[np.complex64]) -> _Channel:
+        gains = self._smooth_words @ (rows * self._words.conj()).sum(axis=0)
+        rest = rows - gains * self._words
+        noise = float((np.abs(rest) ** 2).sum()) / self._degrees
+        return _Channel(gains, self._word_weight, max(noise, _TINY))
+
+    def _decide(
+        self, rows: NDArray[np.complex64], channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
+    ) -> tuple[_Channel, NDArray[np.float32], Samples, float]:
+        """Symbols to likelihoods of points, with a channel estimate that they have made better.
+
+        Also tells by how many samples they came late.
+
+        :param used: symbols by data carriers: which hold a point
+        :param rounds: how often to decide in order to estimate, at most
+        """
+        gains, noise = channel.gains, channel.noise
+        turn = self._tone(rows[:, self._pilots] @ (gains[self._pilots] * self._known[self._pilots]).conj())
+        rows = rows * turn[:, None]
+        model = np.empty(rows.shape, np.complex64)
+        energy = np.ones(rows.shape, np.float32)
+        late = 0.0
+        for _ in range(rounds):
+            likely, _ = self._weigh(rows, gains, noise, points, used)
+            expected, squared = points.expected(likely)
+            model[:] = self._known
+            model[:, self._data] = 0
+            model[:, self._data] = _put(expected, used)
+            energy[:, self._data] = _put(squared, used)
+            turns = rows * (gains * model).conj()
+            turn = self._tone(turns.sum(axis=1))
+            more = self._late(turn @ turns)
+            late += more
+            rows = rows * turn[:, None] * self._advance(more)
+            weight = np.minimum(channel.weight, _MEMORY)
+            total = weight + energy.sum(axis=0)
+            gains = self._smooth @ ((weight * channel.gains + (rows * model.conj()).sum(axis=0)) / total)
+            if np.vdot(expected, expected).real > (1 - _DOUBT) * squared.sum():
+                break
+        likely, seen = self._weigh(rows, gains, noise, points, used)
+        return _Channel(gains, total, noise), likely, seen, late
+
+    def _weigh(
+        self, rows: NDArray[np.complex64], gains: NDArray[np.complex128], noise: float, points: Points,
+        used: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.float32], Samples]:  # fmt: skip
+        gains = gains[self._data]
+        power = np.abs(gains) ** 2 + _TINY
+        seen = (rows[:, self._data] * (gains.conj() / power))[used].astype(np.complex64)
+        return points.weigh(seen, np.tile(noise / power, len(used))[used.reshape(-1)]), seen
+
+    def _tone(self, turns: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """What straightens symbols of which each is turned further than the one before by the same angle."""
+        count = len(turns)
+        size = 8 << max(0, (count - 1).bit_length())
+        spectrum = np.fft.fft(turns, size)
+        reach = int(size * _TURN / (2 * np.pi))
+        places = np.arange(-reach, reach + 1)
+        heights = np.abs(spectrum[places])
+        place = int(np.argmax(heights))
+        exact = float(places[place])
+        if 0 < place < len(places) - 1:
+            before, at, after = heights[place - 1 : place + 2]
+            bend = before - 2 * at + after
+            exact += 0.5 * (before - after) / bend if bend < 0 else 0.0
+        back = np.exp(-2j * np.pi * exact / size * np.arange(count))
+        phase = float(np.angle((turns * back).sum()))
+        return np.asarray(back * np.exp(-1j * phase), np.complex64)
+
+    def _late(self, turns: NDArray[np.complex128]) -> float:
+        """Samples by which symbols come late, from by how little their carriers are turned."""
+        slope = float(self._carriers @ turns.imag) / max(float(self._carriers**2 @ np.abs(turns.real)), _TINY)
+        return -slope * self._size / (2 * np.pi)
+
+
+def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:
+    """Values at the places that are used, zeros elsewhere."""
+    out = np.zeros(used.shape, values.dtype)
+    out[used] = values
+    return out

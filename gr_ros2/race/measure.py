@@ -1,0 +1,224 @@
+"""What one contender did under one condition, in numbers, and who did best.
+
+Laws: a message is delivered when its bytes come out as they went in (alignment gaps and the padding of DDS aside),
+once; a number that does not apply is None; winners are computed from the numbers as they are shown, and all who show
+the same win together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gr_ros2.compression import LinkCodec
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.metrics import age, latency
+from gr_ros2.race.air import AirLog, AirReport
+from gr_ros2.race.settings import Recording
+from gr_ros2.registry import Registry
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One contender under one condition. Times in s, sizes in bytes; both directions of the air count.
+
+    :param load: share of the air that the recording needs as it is, one frame per message
+    :param loss: probability that a frame is lost
+    :param matched: both ends found each other before the first message
+    :param delivered: of ``sent``, as they went in; ``altered`` and ``duplicates`` come beside them
+    :param airtime_per_message: of all frames from the first message on, per message delivered
+    :param air_bytes_per_message: likewise, bytes of frames
+    :param air_bytes_back: share of those bytes that went back
+    :param discovery_bytes: of all frames before the first message
+    :param first_message: from joining the network to the first delivery
+    :param drops: frames and messages that were dropped on the way, by name
+    :param busy: programs that wanted a processor, per processor; above 1 times are the computer's, not the radio's
+    """
+
+    contender: str
+    load: float
+    loss: float
+    sample_rate: float
+    matched: bool
+    sent: int
+    delivered: int
+    altered: int
+    duplicates: int
+    pdr: float | None
+    latency_p50: float | None
+    latency_p99: float | None
+    age_mean: float | None
+    airtime_per_message: float | None
+    air_bytes_per_message: float | None
+    air_bytes_back: float | None
+    discovery_bytes: float
+    first_message: float | None
+    drops: dict[str, int]
+    busy: float
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number by which contenders are compared.
+
+    :param better: which end of its scale wins
+    """
+
+    heading: str
+    better: Literal["most", "least"]
+    shown: Callable[[float], str]
+
+
+def _ms(value: float) -> str:
+    return f"{value * 1e3:.0f}" if value >= 0.1 else f"{value * 1e3:.1f}"
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}"
+
+
+COLUMNS = {
+    "pdr": Column("PDR", "most", "{:.3f}".format),
+    "latency_p50": Column("latency p50 [ms]", "least", _ms),
+    "latency_p99": Column("latency p99 [ms]", "least", _ms),
+    "age_mean": Column("age mean [ms]", "least", _ms),
+    "airtime_per_message": Column("airtime /msg [ms]", "least", _ms),
+    "air_bytes_per_message": Column("air bytes /msg", "least", _whole),
+    "discovery_bytes": Column("discovery bytes", "least", _whole),
+    "first_message": Column("first message [s]", "least", "{:.2f}".format),
+}
+"""By the field of :class:`Cell`."""
+
+
+class Identity:
+    """Tells which message of a recording some bytes are.
+
+    :raises ConfigError: where two of its messages are the same
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._codec = LinkCodec(Registry.from_rows([(recording.topic, recording.type_name)]))
+        self._numbers = {self._plain(payload): number for number, payload in enumerate(recording.payloads)}
+        if len(self._numbers) < len(recording.payloads):
+            raise ConfigError(
+                f"{recording.path}: {recording.topic} holds the same message twice, so that it is not known which of "
+                "them arrived; choose a topic with a stamp"
+            )
+
+    def number(self, payload: bytes) -> int | None:
+        """Place in the recording, from 0; None of other bytes."""
+        return self._numbers.get(self._plain(payload))
+
+    def _plain(self, payload: bytes) -> bytes:
+        """Without what DDS and the codec may change: bytes in alignment gaps, and zeros behind the message."""
+        return self._codec.decode(0, self._codec.encode(0, payload)).rstrip(b"\0")
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was seen of one contender. All times s, monotonic.
+
+    :param began: when the first end began to join
+    :param t_sent: when each message was due, in the recording's order
+    :param heard: when something arrived, and what
+    :param busy: see :class:`Cell`
+    """
+
+    began: float
+    matched: bool
+    t_sent: Sequence[float]
+    heard: Sequence[tuple[float, bytes]]
+    air: AirReport
+    busy: float
+
+
+def measure(
+    seen: Observed, identity: Identity, *, contender: str, load: float, loss: float, sample_rate: float
+) -> Cell:
+    """All numbers of a cell."""
+    t_sent = np.array(seen.t_sent)
+    t_delivered = np.full(len(t_sent), np.nan)
+    altered = duplicates = 0
+    for now, payload in seen.heard:
+        number = identity.number(payload)
+        if number is None or number >= len(t_sent):
+            altered += 1
+        elif not np.isnan(t_delivered[number]):
+            duplicates += 1
+        else:
+            t_delivered[number] = now
+    done = ~np.isnan(t_delivered)
+    delivered = int(done.sum())
+    times = latency(np.sort(t_delivered[done] - t_sent[done]))
+    first, last = (t_sent[0], t_sent[-1]) if len(t_sent) else (np.inf, np.inf)
+    ages = age(t_sent[done], t_delivered[done], float(last))
+    logs = (seen.air.there, seen.air.back)
+    before, _ = _traffic(logs, -np.inf, first)
+    size, airtime = _traffic(logs, first, np.inf)
+    back, _ = _traffic(logs[1:], first, np.inf)
+    return Cell(
+        contender=contender,
+        load=load,
+        loss=loss,
+        sample_rate=sample_rate,
+        matched=seen.matched,
+        sent=len(t_sent),
+        delivered=delivered,
+        altered=altered,
+        duplicates=duplicates,
+        pdr=delivered / len(t_sent) if len(t_sent) else None,
+        latency_p50=None if times is None else times.p50,
+        latency_p99=None if times is None else times.p99,
+        age_mean=None if ages is None else ages.mean,
+        airtime_per_message=airtime / delivered if delivered else None,
+        air_bytes_per_message=size / delivered if delivered else None,
+        air_bytes_back=back / size if size else None,
+        discovery_bytes=before,
+        first_message=float(t_delivered[done].min()) - seen.began if delivered else None,
+        drops={name: count for name, count in seen.air.drops.items() if count},
+        busy=seen.busy,
+    )
+
+
+def shown(cell: Cell, column: str) -> str:
+    """A number as the tables have it; a dash where there is none."""
+    value = getattr(cell, column)
+    return "–" if value is None else COLUMNS[column].shown(value)
+
+
+def winners(cells: Sequence[Cell]) -> dict[str, list[str]]:
+    """Column -> the contenders that did best in it; of cells under the same condition."""
+    best: dict[str, list[str]] = {}
+    for name, column in COLUMNS.items():
+        values = {cell.contender: getattr(cell, name) for cell in cells if getattr(cell, name) is not None}
+        if not values:
+            best[name] = []
+            continue
+        top = (max if column.better == "most" else min)(values.values())
+        best[name] = [contender for contender, value in values.items() if column.shown(value) == column.shown(top)]
+    return best
+
+
+def by_condition(cells: Sequence[Cell]) -> Mapping[tuple[float, float], list[Cell]]:
+    """The cells by (load, loss)."""
+    groups: dict[tuple[float, float], list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault((cell.load, cell.loss), []).append(cell)
+    return groups
+
+
+def _traffic(logs: Sequence[AirLog], begin: float, end: float) -> tuple[float, float]:
+    """Bytes and s of the air between two times."""
+    size = airtime = 0.0
+    for log in logs:
+        t = np.array(log.t)
+        inside = (t >= begin) & (t < end)
+        size += float(np.array(log.size)[inside].sum())
+        airtime += float(np.array(log.airtime)[inside].sum())
+    return size, airtime

@@ -1,0 +1,110 @@
+"""An IP interface of a network namespace whose packets this process carries: a TUN device.
+
+Laws: what the radio cannot take yet waits in the kernel, in a queue bounded in bytes in front of the device, as with a
+real interface, so that senders feel the link being full; what that queue drops is counted; the device is gone when
+it is closed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import struct
+import subprocess
+from pathlib import Path
+
+from gr_ros2.errors import RunError
+from gr_ros2.race.namespaces import inside
+
+INTERFACE = "air0"
+QUEUE_BYTES = 4000
+"""Bytes that wait in front of the device at most, as a short ``txqueuelen``: longer ones only make messages older."""
+
+_RING_PACKETS = 8
+_TUNSETIFF = 0x400454CA
+_TUN_WITHOUT_HEADER = 0x1001
+_FRAGMENTS_KEPT_S = 3
+
+
+class Tun:
+    """A point-to-point interface.
+
+    :param namespace: path of the network namespace it stands in
+    :param address, peer: IPv4 addresses of this end and the other
+    :param mtu: bytes of the largest IP packet
+    :param byte_rate: bytes/s the link carries
+    :param overhead: bytes that each packet costs beyond its own
+    :raises RunError: when it cannot be made
+    """
+
+    def __init__(self, namespace: str, address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float) -> None:
+        self._namespace = namespace
+        commands = (
+            "ip link set lo up",
+            f"ip link set {INTERFACE} mtu {mtu} txqueuelen {_RING_PACKETS} up",
+            f"ip addr add {address} peer {peer} dev {INTERFACE}",
+            f"tc qdisc replace dev {INTERFACE} root tbf rate {8 * byte_rate:.0f}bit burst {mtu + round(overhead)} "
+            f"limit {QUEUE_BYTES} overhead {round(overhead)} linklayer ethernet",
+        )
+        self._file = inside(namespace, _open)
+        try:
+            for command in commands:
+                inside(namespace, lambda command=command: _run(command))  # type: ignore[misc]
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self, timeout_s: float) -> bytes | None:
+        """The next IP packet to be sent, None when there is none for so long."""
+        if not select.select([self._file], [], [], timeout_s)[0]:
+            return None
+        return os.read(self._file, 1 << 16)
+
+    def write(self, packet: bytes) -> None:
+        """An IP packet has arrived.
+
+        :raises OSError: when the kernel refuses it
+        """
+        os.write(self._file, packet)
+
+    def dropped(self) -> int:
+        """Packets the queue in front of the device had no room for."""
+        text = inside(self._namespace, lambda: _run(f"tc -s -j qdisc show dev {INTERFACE}"))
+        return int(json.loads(text)[0]["drops"])
+
+    def close(self) -> None:
+        """Remove the interface. Idempotent."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+def loopback_up(namespace: str) -> None:
+    """Switch on the loopback interface of a namespace.
+
+    :raises RunError: when that fails
+    """
+    inside(namespace, lambda: _run("ip link set lo up"))
+
+
+def _open() -> int:
+    settings = Path("/proc/sys/net")
+    if (settings / "ipv6").exists():  # neighbours and routers are not to be asked for over the radio
+        (settings / "ipv6/conf/all/disable_ipv6").write_text("1")
+    (settings / "ipv4/ipfrag_time").write_text(str(_FRAGMENTS_KEPT_S))
+    file = os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        fcntl.ioctl(file, _TUNSETIFF, struct.pack("16sH22x", INTERFACE.encode(), _TUN_WITHOUT_HEADER))
+    except OSError as error:
+        os.close(file)
+        raise RunError(f"TUN device {INTERFACE}: cannot be made ({error.strerror}); it needs root") from error
+    return file
+
+
+def _run(command: str) -> str:
+    done = subprocess.run(command.split(), capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RunError(f"{command}: {' '.join(done.stderr.split())}")
+    return done.stdout

@@ -1,0 +1,108 @@
+"""Processes of the race: an object in a process of its own, in a network namespace of its own, called from here.
+
+Laws: a worker lives no longer than the ``with`` of its owner, nor than its owner, whatever ends that; Ctrl-C is for the
+owner only, who then ends the workers at once; what fails in a worker fails in its owner, in the same words.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from gr_ros2.errors import GrRos2Error, RunError
+from gr_ros2.race.namespaces import enter
+
+_START_S = 60.0
+_END_S = 10.0
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class Worker:
+    """An object made by ``make(*arguments)`` in another process.
+
+    :param name: for error messages
+    :param namespace: path of the network namespace to enter first, '' to stay
+    :param make: a class or function of a module, which gives a context manager
+    :raises RunError: when the object cannot be made
+    """
+
+    def __init__(
+        self, name: str, namespace: str, make: Callable[..., AbstractContextManager[Any]], *arguments: Any
+    ) -> None:
+        self._name = name
+        self._ours, theirs = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(
+            target=_serve, args=(theirs, namespace, make, arguments), name=f"gr-ros2-{name}", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            self._answer(_START_S)
+        except BaseException:
+            self.close(at_once=True)
+            raise
+
+    def call(self, method: str, *, timeout_s: float = _START_S) -> Any:
+        """What a method of the object returns, or the value of an attribute.
+
+        :raises RunError: when it fails, takes longer, or the process has ended
+        """
+        try:
+            self._ours.send(method)
+        except OSError as error:
+            raise RunError(f"the race's {self._name} has ended before its time") from error
+        return self._answer(timeout_s)
+
+    def close(self, at_once: bool = False) -> None:
+        """End the process: by closing its line, and if it does not hear that, by force. Idempotent.
+
+        :param at_once: by force, without waiting for what it is doing
+        """
+        self._ours.close()
+        self._process.join(0 if at_once else _END_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(at_once=kind is not None)
+
+    def _answer(self, timeout_s: float) -> Any:
+        try:
+            if not self._ours.poll(timeout_s):
+                raise RunError(f"the race's {self._name} has not answered for {timeout_s:g} s")
+            failed, value = self._ours.recv()
+        except (EOFError, ConnectionError) as error:
+            raise RunError(f"the race's {self._name} has ended before its time") from error
+        if failed:
+            raise RunError(f"the race's {self._name}: {value}")
+        return value
+
+
+def _serve(
+    line: Connection, namespace: str, make: Callable[..., AbstractContextManager[Any]], arguments: tuple[Any, ...]
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        if namespace:
+            enter(namespace)
+        with make(*arguments) as served:
+            line.send((False, None))
+            while True:
+                found = getattr(served, line.recv())
+                line.send((False, found() if callable(found) else found))
+    except (EOFError, ConnectionError):
+        return  # the owner is done, or gone
+    except Exception as error:  # noqa: BLE001 - told to the owner
+        text = str(error) if isinstance(error, GrRos2Error) else f"{type(error).__name__}: {error}"
+        line.send((True, text))

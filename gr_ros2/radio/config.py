@@ -1,0 +1,112 @@
+"""What `gr-ros2 link` is told: one robot's end of a link as one YAML file.
+
+Law: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level; whatever
+a front end needs stands under `front_end`, and its sample rate is the PHY's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.config import ChannelConfig, DiagnosticsConfig, PacketLen, PhyConfig, SinkConfig, SourceConfig, build
+from gr_ros2.errors import ConfigError
+from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.phy import PHY
+from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.registry import Registry
+from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
+class LinkConfig:
+    """One robot's end: its ROS graph -> RosSource -> PHY -> front end, and back the same way.
+
+    :param name: what errors and the status line call it
+    :param registry: CSV path, relative to the YAML file, or the name of a built-in one; the same at every robot
+    :param packet_len: bytes on the wire, 14..4095; the same at every robot
+    :param ros_source: the sending block; its robot_id must be another at every robot
+    :param ros_sink: the receiving block; its robot_id -1 means this robot's, except with a front end that loops back
+    :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
+    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/radios.md)
+    :param channel: impairments of what is received, for front ends without a radio
+    :param record: SigMF recording to write of all samples received, '' = none
+    :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/ros2.md)
+    :param localhost_only: DDS stays on the loopback interface; None takes ROS_LOCALHOST_ONLY
+    """
+
+    registry: Annotated[str, Field(min_length=1)]
+    name: Annotated[str, Field(min_length=1)] = "link"
+    packet_len: PacketLen = 220
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
+    phy: PhyConfig = Field(default_factory=PhyConfig)
+    front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
+    record: str = ""
+    diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
+    localhost_only: bool | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> LinkConfig:
+        if "name" not in self.front_end:
+            raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
+        for key, name, table in (
+            ("ros_source.middleware", self.ros_source.middleware, MIDDLEWARE),
+            ("ros_sink.middleware", self.ros_sink.middleware, MIDDLEWARE),
+            ("phy.name", self.phy.name, PHY),
+            ("front_end.name", self.front_end_name, FRONT_ENDS),
+        ):
+            if name not in table:
+                raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
+        if self.phy.sample_rate == 0 and self.phy.name != "direct":
+            raise ValueError("phy.sample_rate = 0: a link needs one; set it to what the radio can do, samples/s")
+        self.ros_source.src_id()
+        return self
+
+    @property
+    def front_end_name(self) -> str:
+        """The row of the table."""
+        return str(self.front_end["name"])
+
+    @property
+    def front_end_options(self) -> dict[str, Any]:
+        """The settings of that front end."""
+        return {key: value for key, value in self.front_end.items() if key != "name"}
+
+    def load_registry(self) -> Registry:
+        """The registry every robot works with.
+
+        :raises RegistryError: file, line, what is wrong
+        """
+        return Registry.from_csv(self.registry)
+
+
+def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
+    """Make a link's configuration from a mapping.
+
+    :param where: what to call the mapping in errors, for instance its file name
+    :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; names it
+    """
+    shared = {key: values[key] for key in SHARED_KEYS if key in values}
+    return build(LinkConfig, {**values, **with_shared(values, shared, f"{where}: " if where else "")}, where)
+
+
+def load_link(path: str | Path, overrides: Sequence[str] = ()) -> LinkConfig:
+    """Read the YAML file of a link.
+
+    :param overrides: `key=value` with dotted keys and YAML values (`front_end.gain_tx=30`), in this order
+    :raises ConfigError: when there is no such file, or a setting is wrong
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"link {str(path)!r}: no such file; examples lie in {EXAMPLES_DIR}")
+    return link_from(read_settings(path, overrides), str(path))
+
+
+EXAMPLES_DIR = Path(__file__).resolve().parent.parent / "examples"
+"""Where a configuration for each front end lies, ``link-*.yaml``."""

@@ -1,0 +1,116 @@
+"""Says on the ROS graph how a link is doing: ``/diagnostics`` for people's tools, and all its counters as JSON.
+
+Laws: one thread, which lives on when a message cannot be published and counts that; nothing is published after
+``stop`` has returned; all judgement is in ``gr.health``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gr_ros2.config import DiagnosticsConfig
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.gr.health import LinkHealth, Status
+from gr_ros2.middleware import Middleware, Qos
+from gr_ros2.middleware.type_definitions import typestore
+
+DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
+STATISTICS_TYPE = "std_msgs/msg/String"
+
+_QOS = Qos("reliable", "volatile", 10)
+_JOIN_S = 1.0
+_log = logging.getLogger(__name__)
+
+
+class Diagnostics:
+    """Publishes both, every ``period_s``.
+
+    :param node_name: of the link on the graph; its counters come out as ``/<node_name>/statistics``
+    :param stats: a snapshot of the link's counters
+    :param queue_depth: messages that may wait per topic at the source
+    :param clock: s, monotonic
+    :ivar failed: messages that could not be published
+    :raises MiddlewareError: when the topics cannot be announced
+    """
+
+    def __init__(
+        self,
+        config: DiagnosticsConfig,
+        middleware: Middleware,
+        node_name: str,
+        stats: Callable[[], Mapping[str, Any]],
+        *,
+        queue_depth: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._period_s = config.period_s
+        self._node_name = node_name
+        self._stats = stats
+        self._clock = clock
+        self._health = LinkHealth(config, node_name, queue_depth)
+        self._array = middleware.advertise(DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE, _QOS)
+        self._counters = middleware.advertise(f"/{node_name}/statistics", STATISTICS_TYPE, _QOS)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gr-ros2-diagnostics", daemon=True)
+        self.failed = 0
+
+    def start(self) -> None:
+        """Begin; once only."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and take both topics off the graph. Idempotent."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
+        self._array.close()
+        self._counters.close()
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._period_s):
+            stats = self._stats()
+            statuses = self._health.judge(stats, self._clock())
+            try:
+                self._array.publish(diagnostic_array(statuses, self._node_name, time.time_ns()))
+                self._counters.publish(statistics(stats))
+            except MiddlewareError as error:
+                self.failed += 1
+                if self.failed == 1:
+                    _log.warning("%s: diagnostics were not published: %s", self._node_name, error)
+
+
+def diagnostic_array(statuses: list[Status], hardware_id: str, stamp_ns: int) -> bytes:
+    """A diagnostic_msgs/DiagnosticArray, serialized.
+
+    :param stamp_ns: ns since the epoch
+    """
+    types = typestore().types
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    key_value = types["diagnostic_msgs/msg/KeyValue"]
+    message = types[DIAGNOSTICS_TYPE](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds), frame_id=""
+        ),
+        status=[
+            types["diagnostic_msgs/msg/DiagnosticStatus"](
+                level=int(status.level),
+                name=status.name,
+                message=status.message,
+                hardware_id=hardware_id,
+                values=[key_value(key=key, value=value) for key, value in status.values.items()],
+            )
+            for status in statuses
+        ],
+    )
+    return bytes(typestore().serialize_cdr(message, DIAGNOSTICS_TYPE))
+
+
+def statistics(stats: Mapping[str, Any]) -> bytes:
+    """A std_msgs/String with the counters as one line of JSON, serialized."""
+    message = typestore().types[STATISTICS_TYPE](data=json.dumps(stats))
+    return bytes(typestore().serialize_cdr(message, STATISTICS_TYPE))

@@ -1,0 +1,147 @@
+"""The `file` front end: what would be sent goes into a SigMF recording, what was recorded is received again.
+
+Laws: a replay comes at its sample rate by the clock, whole packets' worth of zeros behind it, so that its last packet
+comes out too; a transmission is recorded without the silence between packets, each burst annotated.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from gnuradio import gr
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.phy import Phy
+from gr_ros2.phy.threads import BlockThread
+from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
+from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
+
+_STEP_S = 0.005
+_LONGEST_WAIT_S = 0.1
+_BEHIND = 2
+"""Packets' worth of zeros behind a replay."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class FileOptions(FrontEndOptions):
+    """Settings of this front end; at least one of the two paths. Paths are relative to the current directory.
+
+    :param write: recording to make of what is sent, '' = send nothing
+    :param read: recording to receive, '' = receive nothing
+    :param speed: of the replay, 1 = as recorded, 0 = as fast as the receiver takes it
+    :param repeat: begin again at its end
+    """
+
+    write: str = ""
+    read: str = ""
+    speed: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    repeat: bool = False
+
+    @model_validator(mode="after")
+    def _something(self) -> FileOptions:
+        if not self.write and not self.read:
+            raise ValueError("write and read are both empty; set one of them to the path of a SigMF recording")
+        return self
+
+
+class FileFrontEnd(FrontEnd):
+    """See :class:`FileOptions`."""
+
+    name = "file"
+    Options = FileOptions
+
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        super().__init__(phy, **options)
+        self._recorder: SigmfRecorder | None = None
+        self._replay: _Replay | None = None
+        if self.options.read:
+            about, samples = read_recording(Path(self.options.read))
+            if about.sample_rate != phy.sample_rate:
+                raise ConfigError(
+                    f"recording {self.options.read}: {about.sample_rate:g} samples/s; set phy.sample_rate to that "
+                    f"instead of {phy.sample_rate:g}"
+                )
+            self._replay = _Replay(samples, phy, self.options)
+        if self.options.write:
+            about = Recording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
+            self._recorder = SigmfRecorder(Path(self.options.write), about, phy.airtime_samples())
+
+    @property
+    def sink(self) -> Any:
+        return self._recorder
+
+    @property
+    def source(self) -> Any:
+        return self._replay
+
+    @property
+    def finished(self) -> bool:
+        return self._replay is not None and self._replay.finished and self._recorder is None
+
+    def counters(self) -> dict[str, int]:
+        """``unwritten``: samples that could not be written, as on a full disk."""
+        return {} if self._recorder is None else {"unwritten": self._recorder.failed}
+
+    def close(self) -> None:
+        if self._recorder is not None:
+            self._recorder.close()
+
+
+class _Replay(gr.sync_block):  # type: ignore[misc]
+    """Samples of a recording out, by the clock."""
+
+    def __init__(self, samples: NDArray[np.complex64], phy: Phy, options: FileOptions) -> None:
+        super().__init__("gr_ros2_replay", None, [np.complex64])
+        self._samples = samples
+        self._zeros = _BEHIND * phy.airtime_samples()
+        self._rate = phy.sample_rate * options.speed
+        self._repeat = options.repeat
+        self._at = 0
+        self._given = 0
+        self._begin: float | None = None
+        self.finished = False
+        """Whether the last sample, and the zeros behind it, are out."""
+        self.set_blkd_input_timer_value(AGAIN_MS)
+        self._block_thread = BlockThread()
+
+    def start(self) -> bool:
+        self._block_thread.keep()
+        return True
+
+    def stop(self) -> bool:
+        self._block_thread.release()
+        return True
+
+    def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
+        out = output_items[0]
+        total = len(self._samples) + self._zeros
+        if self._at == total:
+            if not self._repeat:
+                self.finished = True
+                return -1
+            self._at = 0
+        count = min(len(out), total - self._at, self._due(len(out)))
+        recorded = self._samples[self._at : self._at + count]
+        out[: len(recorded)] = recorded
+        out[len(recorded) : count] = 0
+        self._at += count
+        self._given += count
+        return count
+
+    def _due(self, most: int) -> int:
+        """Samples that may go now, after waiting for some."""
+        if not self._rate:
+            return most
+        if self._begin is None:
+            self._begin = time.monotonic()
+        due = int((time.monotonic() - self._begin) * self._rate) - self._given
+        if due <= 0:
+            time.sleep(min(max(_STEP_S, (1 - due) / self._rate), _LONGEST_WAIT_S))
+            due = int((time.monotonic() - self._begin) * self._rate) - self._given
+        return max(0, due)

@@ -1,0 +1,274 @@
+"""One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
+
+Laws: the two directions share nothing but the front end and the ROS graph, so that one cannot hold up the other;
+packets leave at the pace of the air, and are composed just before; a robot does not take its own packets, except from
+a front end that loops back; everything opened is given back by `stop`, also when opening failed half-way.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+from gnuradio import gr
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.gr import AirtimeGate, RosSink, RosSource
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.channel import Channel, PacketLoss
+from gr_ros2.phy.threads import begin
+from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.config import LinkConfig
+from gr_ros2.radio.diagnostics import Diagnostics
+from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.sigmf import Recording, SigmfRecorder
+
+_log = logging.getLogger(__name__)
+
+
+class LinkObserver(Protocol):
+    """What hears a link; called from its threads, must be quick and never raise."""
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """What the sender reports."""
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        """Bytes the PHY handed to the sink, before the sink reads them."""
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What the receiver reports; of a delivery once it is published."""
+
+
+class RobotLink(gr.top_block):  # type: ignore[misc]
+    """A robot's end of a link.
+
+    :param config: see :class:`LinkConfig`
+    :param middleware: an open one for both blocks, closed by who opened it; None opens what the configuration says
+    :param observer: told of everything that is sent and received
+    :param clock: s, monotonic, of events and blocks
+    :raises ConfigError: when the parts do not fit each other
+    :raises MiddlewareError: when the ROS graph cannot be joined
+    :raises RadioError: when the front end cannot be opened
+    """
+
+    def __init__(
+        self,
+        config: LinkConfig,
+        *,
+        middleware: Middleware | None = None,
+        observer: LinkObserver | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(f"gr_ros2_link_{config.name}", catch_exceptions=True)
+        self.config = config
+        self.registry = config.load_registry()
+        self._clock = clock
+        self._started: float | None = None
+        self._running = False
+        self._stack = ExitStack()
+        try:
+            self._open(middleware, observer)
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def _open(self, middleware: Middleware | None, observer: LinkObserver | None) -> None:
+        config = self.config
+        self.phy: Phy = PHY.load(config.phy.name)(config.packet_len, config.phy.sample_rate, **config.phy.options)
+        self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
+        self._stack.callback(self.front_end.close)
+        self.phy.check_channel(config.channel)
+        if self.front_end.has_radio and config.channel != type(config.channel)():
+            raise ConfigError(f"channel: front_end {self.front_end.name} has a real one; leave channel out")
+        graphs = self._graphs(middleware)
+        self.source = RosSource(
+            self.registry,
+            middleware=graphs[0],
+            observer=None if observer is None else partial(observer.sender_event, config.ros_source.src_id()),
+            clock=self._clock,
+            **_values(config.ros_source),
+        )
+        self._stack.callback(self.source.close)
+        self.sink = RosSink(
+            self.registry,
+            middleware=graphs[1],
+            observer=None if observer is None else lambda event: observer.receiver_event(event, self._clock()),
+            packet_observer=None if observer is None else lambda data: observer.packet_received(data, self._clock()),
+            clock=self._clock,
+            **_values(self._sink_config()),
+        )
+        self._stack.callback(self.sink.close)
+        self._connect()
+        self._diagnostics: Diagnostics | None = None
+        if config.diagnostics.period_s:
+            queue_depth = config.ros_source.queue_depth
+            self._diagnostics = Diagnostics(
+                config.diagnostics, graphs[1], self.node_name, self.stats, queue_depth=queue_depth, clock=self._clock
+            )
+            self._stack.callback(self._diagnostics.stop)
+
+    @property
+    def node_name(self) -> str:
+        """As ``ros2 node list`` shows it."""
+        return f"gr_ros2_link_{self.config.ros_source.src_id()}"
+
+    def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
+        """The source's and the sink's participant: one for both where they are on the same graph."""
+        if middleware is not None:
+            return middleware, middleware
+        source, sink = self.config.ros_source, self.config.ros_sink
+        places = [(source.middleware, source.domain_id), (sink.middleware, sink.domain_id)]
+        opened = {place: self._graph(*place) for place in dict.fromkeys(places)}
+        return opened[places[0]], opened[places[1]]
+
+    def _graph(self, name: str, domain_id: int) -> Middleware:
+        node_name = self.node_name
+        settings: dict[str, Any] = {"domain_id": domain_id, "node_name": node_name}
+        if name == "bag":
+            raise ConfigError("middleware = 'bag': a link is between live graphs; play the bag on a graph beside it")
+        if name == "dds" and self.config.localhost_only is not None:
+            settings["localhost_only"] = self.config.localhost_only
+        graph: Middleware = MIDDLEWARE.load(name)(**settings)
+        self._stack.callback(graph.close)
+        return graph
+
+    def _sink_config(self) -> SinkConfig:
+        """The sink's settings; on a medium that others share it knows its own packets."""
+        sink = self.config.ros_sink
+        if sink.robot_id == -1 and not self.front_end.loops_back:
+            return replace(sink, robot_id=self.config.ros_source.src_id())
+        return sink
+
+    def _connect(self) -> None:
+        self._gate = AirtimeGate(self.front_end.airtime(), early=self.front_end.early())
+        self.source.use_credit()
+        self.msg_connect(self.source, "pdus", self._gate, "pdus")
+        self.msg_connect(self._gate, "credit", self.source, "credit")
+        self._transmitter: Any = None
+        self._receiver: Any = None
+        last: Any = self._gate
+        if self.phy.has_samples:
+            last = self._connect_samples()
+        self._loss = PacketLoss(self.config.channel) if self.config.channel.loses_packets else None
+        if last is not None and self._loss is not None:
+            self.msg_connect(last, "pdus", self._loss, "pdus")
+            last = self._loss
+        if last is not None:
+            self.msg_connect(last, "pdus", self.sink, "pdus")
+
+    def _connect_samples(self) -> Any:
+        """Transmitter to front end, front end to receiver; the receiver, None where nothing is received."""
+        front_end, channel = self.front_end, self.config.channel
+        front_end.wire(self)
+        if front_end.sink is not None:
+            self._transmitter = self.phy.transmitter()
+            # A hier block with message ports holds itself, and shared memory segments of which the system has few.
+            self._stack.callback(self._transmitter.disconnect_all)
+            self.msg_connect(self._gate, "pdus", self._transmitter, "pdus")
+            self.connect(self._transmitter, front_end.sink)
+        if front_end.source is None:
+            return None
+        self._receiver = self.phy.receiver()
+        self._stack.callback(self._receiver.disconnect_all)
+        last = front_end.source
+        # The channel stops tags too: the transmitter's would overrule what the receiver reads in a packet's header.
+        if front_end.loops_back or channel.on_samples():
+            faded = Channel(channel, self.phy)
+            self.connect(last, faded)
+            last = faded
+        self.connect(last, self._receiver)
+        if self.config.record:
+            recorder = SigmfRecorder(Path(self.config.record), self._recording())
+            self._stack.callback(recorder.close)
+            self.connect(last, recorder)
+        return self._receiver
+
+    def _recording(self) -> Recording:
+        frequency = getattr(self.front_end.options, "receive_frequency", None)
+        return Recording(self.phy.sample_rate, frequency, f"{self.config.name}: {self.phy.name}, {self.front_end.name}")
+
+    def start(self, max_noutput_items: int = 10_000_000) -> None:
+        """Begin sending and receiving.
+
+        :raises PhyError: when GNU Radio refuses the flowgraph
+        """
+        self._running = True
+        try:
+            begin(partial(super().start, max_noutput_items))
+        except (RuntimeError, MemoryError) as error:
+            self.stop()
+            raise PhyError(f"{self.config.name}: the flowgraph does not start ({error})") from error
+        self._started = self._clock()
+        self.phy.prefer_latency()
+        if self._diagnostics is not None:
+            self._diagnostics.start()
+
+    def stop(self) -> None:
+        """Stop, leave the ROS graph and close the front end. Idempotent; a stopped link does not start again."""
+        if self._running:
+            self._running = False
+            super().stop()
+            self.wait()
+        self._stack.close()
+
+    def check(self) -> None:
+        """To be called now and then while it runs, for instance with each look at `stats`.
+
+        :raises RadioError: when the device has gone silent, which GNU Radio tells nobody
+        """
+        if self._running:
+            self.front_end.check(self._clock())
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing will be received any more, as at the end of a recording that is replayed."""
+        return self.front_end.finished
+
+    def stats(self) -> dict[str, Any]:
+        """A snapshot: both blocks, packets to and from the air, the PHY, and what the front end counts."""
+        phy = self.phy
+        return {
+            "name": self.config.name,
+            "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
+            "source": self.source.stats(),
+            "sink": self.sink.stats(),
+            "packets": {
+                "out": self._gate.passed,
+                "backlog": self._gate.backlog,
+                "refused": int(getattr(self._transmitter, "refused", 0)),
+                "in": self.sink.handled,
+                "damaged": int(getattr(self._receiver, "damaged", 0)),
+                "dropped": {} if self._loss is None else dict(self._loss.dropped),
+            },
+            "phy": {
+                "name": phy.name,
+                "sample_rate": phy.sample_rate if phy.has_samples else None,
+                "airtime_s": self.front_end.airtime(),
+            },
+            "front_end": {"name": self.front_end.name, **self.front_end.counters()},
+        }
+
+    def __enter__(self) -> RobotLink:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+def _values(config: SourceConfig | SinkConfig) -> dict[str, Any]:
+    """The settings of a block, without what is handed over as an object."""
+    names = {item.name for item in fields(config)} - {"registry", "middleware"}
+    return {name: getattr(config, name) for name in names}

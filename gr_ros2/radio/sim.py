@@ -1,0 +1,32 @@
+"""The `sim` front end: no radio; what a robot sends comes back through the channel model, as another hears it.
+
+For trying a configuration on one machine: publish on the robot's topics, and see them under the sink's namespace.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gnuradio import blocks, gr
+
+from gr_ros2.phy import Phy
+from gr_ros2.radio.front_end import FrontEnd
+
+
+class SimFrontEnd(FrontEnd):
+    """See the module; the channel itself is the link's, set under ``channel``."""
+
+    name = "sim"
+    loops_back = True
+
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        super().__init__(phy, **options)
+        self._through = blocks.copy(gr.sizeof_gr_complex)
+
+    @property
+    def sink(self) -> Any:
+        return self._through
+
+    @property
+    def source(self) -> Any:
+        return self._through

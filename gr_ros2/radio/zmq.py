@@ -1,0 +1,222 @@
+"""The `zmq` front end: bursts of samples over ZeroMQ, between processes or machines without radios.
+
+Every robot publishes what it sends at one address and subscribes to those of the others; each packet is one message: a
+header, then its samples. Laws: bursts only, so silence costs nothing, and a burst leaves whole or not at all; nobody
+waits for a peer: what is sent while it is away, or while the cable is unplugged, is lost as on the air; either end may
+be killed and started again, the other carries on; nothing of a message is believed before its header is checked.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import struct
+from collections import Counter
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import numpy as np
+import zmq
+from gnuradio import gr
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.errors import RadioError
+from gr_ros2.phy import Phy
+from gr_ros2.phy.threads import BlockThread
+from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
+
+HEADER = struct.Struct("<4sIQd")
+"""Magic, who sends (random at each start), number of the burst, samples/s; then complex64, little-endian."""
+MAGIC = b"GRI0"
+
+_SAMPLE = np.dtype("<c8")
+_HEARTBEAT_MS, _DEAD_MS = 250, 1000
+"""A peer silent for so long is given up, with what waits for it, and looked for again."""
+_RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
+_POLL_MS = 100
+_MAX_SENDERS = 256
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ZmqOptions(FrontEndOptions):
+    """Settings of this front end.
+
+    :param bind: address to publish at: ``tcp://*:5555`` (all interfaces), ``tcp://10.0.0.1:5555``, ``ipc:///tmp/a``.
+        Whoever can reach it can listen; there is no encryption
+    :param connect: addresses of the other robots, ``tcp://10.0.0.2:5555``
+    :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
+    """
+
+    bind: Annotated[str, Field(min_length=1)]
+    connect: Annotated[tuple[str, ...], Field(min_length=1)]
+    queue: Annotated[int, Field(ge=1, le=10_000)] = 300
+
+
+class ZmqFrontEnd(FrontEnd):
+    """See :class:`ZmqOptions`."""
+
+    name = "zmq"
+    Options = ZmqOptions
+
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        super().__init__(phy, **options)
+        self._context = zmq.Context()
+        self._counters: Counter[str] = Counter()
+        try:
+            publisher = self._socket(zmq.PUB)
+            _open(publisher.bind, "bind", self.options.bind)
+            subscriber = self._socket(zmq.SUB)
+            subscriber.subscribe(b"")
+            for address in self.options.connect:
+                _open(subscriber.connect, "connect", address)
+        except RadioError:
+            self.close()
+            raise
+        self._sink = _BurstPublisher(publisher, phy, self._counters)
+        self._source = _BurstSubscriber(subscriber, phy, self._counters)
+
+    @property
+    def sink(self) -> Any:
+        return self._sink
+
+    @property
+    def source(self) -> Any:
+        return self._source
+
+    def counters(self) -> dict[str, int]:
+        """What passed and what did not.
+
+        ``bursts_out``, ``bursts_in``; ``missed``: gaps in a sender's numbers; ``restarts``: senders beyond one for each
+        address; ``malformed`` and ``wrong_rate``: messages refused.
+        """
+        counted = {name: self._counters[name] for name in ("bursts_out", "bursts_in", "missed")}
+        counted["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
+        return counted | {name: self._counters[name] for name in ("malformed", "wrong_rate")}
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+    def _socket(self, kind: int) -> Any:
+        socket = self._context.socket(kind)
+        socket.linger = 0
+        socket.sndhwm = socket.rcvhwm = self.options.queue
+        socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
+        socket.setsockopt(zmq.CONNECT_TIMEOUT, _DEAD_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
+        socket.setsockopt(zmq.IPV6, any("[" in address for address in (self.options.bind, *self.options.connect)))
+        # One burst is one message; anything larger is none of ours.
+        socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + 2 * self.phy.airtime_samples() * _SAMPLE.itemsize)
+        return socket
+
+
+def _open(action: Callable[[str], object], key: str, address: str) -> None:
+    try:
+        action(address)
+    except zmq.ZMQError as error:
+        whose = "an address of this machine and a free port" if key == "bind" else "another robot's address"
+        raise RadioError(
+            f"front_end zmq: {key} = {address!r}: {error.strerror}; write {whose}, as tcp://HOST:PORT or ipc:///PATH"
+        ) from error
+
+
+class _BurstPublisher(gr.sync_block):  # type: ignore[misc]
+    """Samples in, each packet's as one message."""
+
+    def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
+        super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
+        self._socket = socket
+        self._sample_rate = phy.sample_rate
+        self._burst = phy.airtime_samples()
+        self._sender = int.from_bytes(os.urandom(4), "little")
+        self._counters = counters
+        self._block_thread = BlockThread()
+        self.set_output_multiple(self._burst)
+
+    def start(self) -> bool:
+        self._block_thread.keep()
+        return True
+
+    def stop(self) -> bool:
+        self._block_thread.release()
+        return True
+
+    def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
+        samples = input_items[0]
+        bursts = len(samples) // self._burst
+        for burst in samples[: bursts * self._burst].reshape(bursts, self._burst):
+            number = self._counters["bursts_out"]
+            header = HEADER.pack(MAGIC, self._sender, number, self._sample_rate)
+            self._socket.send(header + burst.astype(_SAMPLE, copy=False).tobytes(), zmq.NOBLOCK)
+            self._counters["bursts_out"] = number + 1
+        return bursts * self._burst
+
+
+class _BurstSubscriber(gr.sync_block):  # type: ignore[misc]
+    """Messages in, their samples out."""
+
+    def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
+        super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
+        self._socket = socket
+        self._sample_rate = phy.sample_rate
+        self._senders: dict[int, int] = {}
+        self._counters = counters
+        self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
+        self.set_blkd_input_timer_value(AGAIN_MS)
+        self._block_thread = BlockThread()
+
+    def start(self) -> bool:
+        self._block_thread.keep()
+        return True
+
+    def stop(self) -> bool:
+        self._block_thread.release()
+        return True
+
+    def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
+        if not len(self._rest):
+            # Waits outside Python's lock, and not for ever: GNU Radio can end this thread only between two calls.
+            if not self._socket.poll(_POLL_MS):
+                return 0
+            self._rest = self._take(self._socket.recv(zmq.NOBLOCK))
+        count = min(len(self._rest), len(output_items[0]))
+        output_items[0][:count] = self._rest[:count]
+        self._rest = self._rest[count:]
+        return count
+
+    def _take(self, message: bytes) -> NDArray[np.complex64]:
+        """The samples of a message, none where it is not one of ours."""
+        nothing: NDArray[np.complex64] = np.empty(0, np.complex64)
+        size = len(message) - HEADER.size
+        if size < 0 or size % _SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
+            self._refuse("malformed", f"a message of {len(message)} bytes is no burst of samples")
+            return nothing
+        _, sender, number, sample_rate = HEADER.unpack_from(message)
+        if sample_rate != self._sample_rate:
+            self._refuse(
+                "wrong_rate",
+                f"a peer sends {sample_rate:g} samples/s, not {self._sample_rate:g}; set the same phy at both ends",
+            )
+            return nothing
+        self._follow(sender, number)
+        self._counters["bursts_in"] += 1
+        return np.frombuffer(message, _SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
+
+    def _follow(self, sender: int, number: int) -> None:
+        if sender not in self._senders:
+            if len(self._senders) == _MAX_SENDERS:
+                del self._senders[next(iter(self._senders))]
+            self._counters["senders"] += 1
+        else:
+            self._counters["missed"] += max(0, number - self._senders[sender] - 1)
+        self._senders[sender] = number
+
+    def _refuse(self, name: str, problem: str) -> None:
+        self._counters[name] += 1
+        if self._counters[name] == 1:
+            _log.warning("front_end zmq: %s", problem)

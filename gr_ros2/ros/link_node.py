@@ -1,0 +1,141 @@
+"""`ros2 run gr_ros2 link`: one robot's end of a link as a node whose parameters are the link's settings.
+
+Laws: the configuration file names what the link is, parameters given at the start replace single settings of it, and
+both are checked as one; what the running blocks can change may be set while they run, everything else is read-only; an
+error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from gr_ros2.errors import ConfigError, GrRos2Error
+from gr_ros2.radio.config import load_link
+from gr_ros2.radio.link import RobotLink
+from gr_ros2.ros.parameters import Parameter, overrides, parameters
+
+CONFIG = "config"
+_OF_ROS = ("use_sim_time", "start_type_description_service")
+_LARGEST_INT, _LARGEST_FLOAT = 2**63 - 1, sys.float_info.max
+_LOOK_S = 0.5
+
+
+class LinkNode(Node):  # type: ignore[misc]
+    """A link with its parameters.
+
+    :raises ConfigError: for a missing file, an unknown parameter or a wrong value
+    :raises MiddlewareError: when the ROS graph cannot be joined
+    :raises RadioError: when the front end cannot be opened
+    """
+
+    def __init__(self) -> None:
+        super().__init__("gr_ros2_link", automatically_declare_parameters_from_overrides=True)
+        given = {name: item.value for name, item in self.get_parameters_by_prefix("").items()}
+        path = given.pop(CONFIG, None)
+        if not path:
+            raise ConfigError(
+                f"parameter {CONFIG} is missing; give the YAML file: --ros-args -p {CONFIG}:=my_link.yaml"
+            )
+        chosen = {name: value for name, value in given.items() if not name.startswith((*_OF_ROS, "qos_overrides."))}
+        if given.get("use_sim_time"):
+            chosen.setdefault("ros_sink.use_sim_time", True)
+        self.link = RobotLink(load_link(path, overrides(chosen)))
+        self._setters = dict(_setters(self.link))
+        for parameter in _settings(self.link):
+            self._show(parameter)
+        self.add_on_set_parameters_callback(self._set)
+        self.create_timer(_LOOK_S, self._end_with_link)
+
+    def _show(self, parameter: Parameter) -> None:
+        """Declare a parameter with the value the link has, also one that was given at the start as some other type."""
+        if self.has_parameter(parameter.name):
+            self.undeclare_parameter(parameter.name)
+        descriptor = _descriptor(parameter, read_only=parameter.name not in self._setters)
+        self.declare_parameter(parameter.name, parameter.value, descriptor, ignore_override=True)
+
+    def _set(self, changed: Sequence[Any]) -> SetParametersResult:
+        for parameter in changed:
+            setter = self._setters.get(parameter.name)
+            try:
+                if setter is not None:
+                    setter(parameter.value)
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _end_with_link(self) -> None:
+        if self.link.finished:
+            raise ExternalShutdownException
+
+
+def _settings(link: RobotLink) -> list[Parameter]:
+    """Those of the configuration, with all that PHY and front end have settings for, each once."""
+    found = list(parameters(link.config))
+    for prefix, part in (("phy.options.", link.phy), ("front_end.", link.front_end)):
+        options = getattr(part, "options", None)
+        found += [] if options is None else parameters(options, prefix)
+    return list({parameter.name: parameter for parameter in found}.values())
+
+
+def _setters(link: RobotLink) -> list[tuple[str, Callable[[Any], None]]]:
+    """What the blocks can change while they run."""
+    return [
+        (f"{end}.{name.removeprefix('set_')}", getattr(block, name))
+        for end, block in (("ros_source", link.source), ("ros_sink", link.sink))
+        for name in vars(type(block))
+        if name.startswith("set_")
+    ]
+
+
+def _descriptor(parameter: Parameter, *, read_only: bool) -> ParameterDescriptor:
+    made = ParameterDescriptor(
+        name=parameter.name,
+        description=parameter.meaning,
+        additional_constraints=parameter.rule,
+        read_only=read_only,
+        dynamic_typing=not parameter.strict,
+    )
+    least, most = parameter.minimum, parameter.maximum
+    if (least, most) == (None, None):
+        return made
+    if isinstance(parameter.value, float):
+        least, most = -_LARGEST_FLOAT if least is None else least, _LARGEST_FLOAT if most is None else most
+        made.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
+    elif isinstance(parameter.value, int):
+        bounds = -_LARGEST_INT if least is None else int(least), _LARGEST_INT if most is None else int(most)
+        made.integer_range = [IntegerRange(from_value=bounds[0], to_value=bounds[1])]
+    return made
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node until it is interrupted or its link is over."""
+    # Handlers of our own: rclpy's would end every context at once, also one that the link still publishes through.
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    node = None
+    status: int | str = 0
+    try:
+        node = LinkNode()
+        node.link.start()
+        node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {node.link.phy.name}")
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except GrRos2Error as error:
+        print(f"gr_ros2 link: {error}", file=sys.stderr)
+        status = 2 if isinstance(error, ConfigError) else 1
+    finally:
+        if node is not None:
+            node.link.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(status)

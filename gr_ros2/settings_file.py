@@ -1,0 +1,107 @@
+"""YAML files of settings: one file, registries found, and single settings replaced on the command line.
+
+Laws: a relative registry in a file is looked for beside the file, one on the command line in the current directory;
+overrides apply in their order; nothing is checked here but the form, since the settings know their own ranges.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gr_ros2.config import read_yaml
+from gr_ros2.errors import ConfigError
+
+BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
+"""Where the built-in scenarios and registries lie."""
+
+SHARED_KEYS = ("registry", "packet_len")
+"""Settings both ends of a link must agree on."""
+
+ENDS = ("ros_source", "ros_sink")
+"""The blocks at the ends of a link."""
+
+_NUMBER = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
+
+
+def read_settings(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """The settings of a YAML file, named after it unless it says otherwise.
+
+    :param overrides: `key=value` with dotted keys and YAML values (`phy.sample_rate=2e5`), in this order
+    :raises ConfigError: when the file cannot be read, has no such registry, or an override is malformed
+    """
+    values = {"name": path.stem, **read_yaml(path)}
+    if isinstance(values.get("registry"), str):
+        values["registry"] = find_registry(values["registry"], path.parent)
+    for override in overrides:
+        keys, value = parse_override(override)
+        if keys == ("registry",):
+            value = find_registry(str(value), Path())
+        _replace(values, keys, value, override)
+    return values
+
+
+def with_shared(values: Mapping[str, Any], shared: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The two blocks of a direction with the settings that all ends share.
+
+    :param shared: values of ``SHARED_KEYS``, as far as they are set
+    :param prefix: what errors begin with
+    :raises ConfigError: for a block that sets one of them otherwise
+    """
+    blocks: dict[str, Any] = {}
+    for end in ENDS:
+        block = values.get(end, {})
+        if not isinstance(block, Mapping):
+            continue  # build() says what is wrong with it
+        for key in SHARED_KEYS:
+            if key in block and block[key] != shared.get(key):
+                raise ConfigError(f"{prefix}{end}.{key} = {block[key]!r}: both ends share it; set {key} instead")
+        blocks[end] = {**block, **shared}
+    return blocks
+
+
+def find_registry(name: str, directory: Path) -> str:
+    """The absolute path of a registry: a file seen from a directory, or else a built-in one, with or without `.csv`.
+
+    :raises ConfigError: when there is neither
+    """
+    path = Path(name).expanduser()
+    for candidate in (directory / path, BUILTIN_DIR / path, BUILTIN_DIR / f"{name}.csv"):
+        if candidate.is_file():
+            return str(candidate.resolve())
+    known = ", ".join(sorted(path.stem for path in BUILTIN_DIR.glob("*.csv")))
+    raise ConfigError(f"registry = {name!r}: no such file; built in are {known}")
+
+
+def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
+    """`phy.sample_rate=2e5` as (("phy", "sample_rate"), 200000.0).
+
+    :raises ConfigError: when it has no `=`, an empty key, or a value that is no YAML
+    """
+    key, equals, value = text.partition("=")
+    keys = tuple(part.strip() for part in key.split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {text}: write key=value, with dots between nested keys")
+    value = value.strip()
+    if _NUMBER.fullmatch(value):  # YAML 1.1 takes 2e5 for a string
+        return keys, float(value)
+    try:
+        parsed = yaml.safe_load(value) if value else ""
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {text}: the value is no YAML ({' '.join(str(error).split())})") from error
+    # Without braces a mapping was not meant: the colon belongs to a text such as bag:PATH.
+    return keys, value if isinstance(parsed, dict) and not value.startswith("{") else parsed
+
+
+def _replace(values: dict[str, Any], keys: tuple[str, ...], value: Any, override: str) -> None:
+    for depth, key in enumerate(keys[:-1], start=1):
+        inner = values.get(key, {})
+        if not isinstance(inner, Mapping):
+            raise ConfigError(f"--set {override}: {'.'.join(keys[:depth])} has no settings below it")
+        values[key] = dict(inner)
+        values = values[key]
+    values[keys[-1]] = value

@@ -1,0 +1,33 @@
+"""`gr-ros2 run`: repetitions, and what is told of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.cli import main as command
+
+LOSSY = ["--duration", "1", "--set", "channel.packet_loss=0.02", "--set", "time=packets"]
+
+
+def test_repetitions_end_in_means_and_one_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "paper-direct", "--repetitions", "2", "--seed", "4", *LOSSY, "--out", str(tmp_path)]
+    assert command.run(words) == 0
+    out = capsys.readouterr().out
+    assert "paper-direct: 2 runs" in out
+    mean = json.loads((tmp_path / "repetitions.json").read_text())["topics"][0]["pdr"]["mean"]
+    assert next(line for line in out.splitlines() if " PDR " in line).split()[2] == f"{mean:.3f}"
+    assert f"Written to {tmp_path}: report.html, repetitions.json, the runs in rep-0 to rep-1" in out
+    assert (tmp_path / "report.html").is_file()
+    assert [json.loads((tmp_path / f"rep-{k}" / "result.json").read_text())["seed"] for k in (0, 1)] == [4, 5]
+
+
+def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(["run", "paper-direct", "--repetitions", "1", *LOSSY, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "result.json").is_file()
+    assert not (tmp_path / "repetitions.json").exists()
+    assert "Where every sent message went" in capsys.readouterr().out

@@ -1,0 +1,161 @@
+"""Two robots in two network namespaces that share nothing but samples over a cable: both ways, kills, a pulled plug."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("zmq", reason="needs pyzmq")
+
+from gr_ros2.errors import RunError
+from gr_ros2.race.namespaces import Namespace, check_means, inside
+from tests.e2e import link_peer
+from tests.e2e.support import COMMAND
+from tests.middleware.support import CUSTOM, wait_for
+
+ROOT = Path(__file__).resolve().parents[2]
+CABLE = "air"
+SOME = 10
+"""Messages that show that a direction works, or would have come if it did."""
+
+
+class Process:
+    """One in a namespace; the numbers it says are kept by their word."""
+
+    def __init__(self, namespace: Namespace, command: Sequence[str]) -> None:
+        self.said: dict[str, list[int]] = {"sent": [], "got": []}
+        self.output = ""
+        self.process = inside(
+            namespace.path,
+            lambda: subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
+            ),
+        )
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            word, _, number = line.strip().partition(" ")
+            if word in self.said and number.isdigit():
+                self.said[word].append(int(number))
+            else:
+                self.output += line
+
+    def newest(self, word: str) -> int:
+        return self.said[word][-1] if self.said[word] else -1
+
+    def end(self, number: signal.Signals) -> int:
+        """Send a signal; the exit status."""
+        self.process.send_signal(number)
+        status = self.process.wait(30)
+        self._reader.join(10)
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+        return status
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.end(signal.SIGKILL)
+
+
+def ip(namespace: Namespace, *words: str) -> None:
+    inside(namespace.path, lambda: subprocess.run(["ip", *words], check=True, capture_output=True))
+
+
+class Robot:
+    """A namespace with one end of the cable, a robot's programs, and its end of the link."""
+
+    def __init__(self, number: int, namespace: Namespace, folder: Path) -> None:
+        self.number, self.other = number, 3 - number
+        self.namespace = namespace
+        self.config = folder / f"robot_{number}.yaml"
+        self.config.write_text(
+            f"""
+            registry: topics.csv
+            packet_len: 64
+            ros_source: {{namespace: /robot_{number}, domain_id: {link_peer.DOMAIN}}}
+            ros_sink: {{domain_id: {link_peer.DOMAIN}}}
+            phy: {{name: psk, sample_rate: 1e6}}
+            front_end: {{name: zmq, bind: "tcp://10.0.0.{number}:5555", connect: ["tcp://10.0.0.{self.other}:5555"]}}
+            localhost_only: true
+            """
+        )
+        ip(namespace, "address", "add", f"10.0.0.{number}/24", "dev", CABLE)
+        for interface in ("lo", CABLE):
+            ip(namespace, "link", "set", interface, "up")
+        self.programs = Process(namespace, [sys.executable, "-m", "tests.e2e.link_peer", str(number), str(self.other)])
+        self.link = self.begin()
+
+    def begin(self) -> Process:
+        self.link = Process(self.namespace, [*COMMAND, "link", str(self.config)])
+        return self.link
+
+    def close(self) -> None:
+        self.link.close()
+        self.programs.close()
+
+
+@pytest.fixture
+def robots(tmp_path: Path) -> Iterator[list[Robot]]:
+    try:
+        check_means()
+    except RunError as error:
+        pytest.skip(str(error))
+    (tmp_path / "topics.csv").write_text(f"chat,{CUSTOM}\n")
+    with ExitStack() as stack:
+        one, two = (stack.enter_context(Namespace()) for _ in range(2))
+        ip(one, "link", "add", CABLE, "type", "veth", "peer", "name", CABLE, "netns", two.path)
+        made = []
+        for number, namespace in enumerate((one, two), start=1):
+            made.append(Robot(number, namespace, tmp_path))
+            stack.callback(made[-1].close)
+        yield made
+
+
+def both_hear_news(robots: Sequence[Robot], after: str) -> None:
+    """Wait until each hears several messages that the other sends from now on."""
+    sent_before = robots[1].programs.newest("sent"), robots[0].programs.newest("sent")
+
+    def heard() -> bool:
+        news = [
+            sum(number > before for number in robot.programs.said["got"])
+            for robot, before in zip(robots, sent_before, strict=True)
+        ]
+        return min(news) >= SOME
+
+    wait_for(heard, f"both to hear each other after {after}: {[robot.link.output for robot in robots]}")
+
+
+def test_both_ways_at_once_through_kills_and_a_pulled_plug(robots: list[Robot]) -> None:
+    both_hear_news(robots, "the start")
+
+    for robot in robots:
+        robot.link.end(signal.SIGKILL)
+        robot.begin()
+        both_hear_news(robots, f"robot {robot.number} was killed")
+
+    ip(robots[0].namespace, "link", "set", CABLE, "down")
+    one, two = (robot.programs for robot in robots)
+    before = one.newest("sent"), two.newest("sent")
+    wait_for(lambda: one.newest("sent") - before[0] >= 5 * SOME <= two.newest("sent") - before[1], "time to pass")
+    assert two.newest("got") <= before[0] + SOME
+    assert one.newest("got") <= before[1] + SOME
+    ip(robots[0].namespace, "link", "set", CABLE, "up")
+    both_hear_news(robots, "the plug was in again")
+
+    for robot in robots:
+        heard = robot.programs.said["got"]
+        assert len(heard) == len(set(heard)), "a message came twice"
+        assert robot.link.end(signal.SIGINT) == 0, robot.link.output
+        assert "received" in robot.link.output.splitlines()[-1]

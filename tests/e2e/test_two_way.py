@@ -1,0 +1,70 @@
+"""Both robots talk at once, on real DDS and real GNU Radio; and a link that is unplugged for a while."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.experiment.report import read_runs, write_report
+from gr_ros2.experiment.runner import run_scenario
+from tests.e2e.support import check_books, check_complete, delivered_bag, scenario
+
+
+def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -> None:
+    clean = [
+        "ros_source.topic_options={}",
+        "back.channel.burst_loss=null",
+        "phy.sample_rate=1e6",
+        "ros_source.topics=[odom, imu]",
+    ]
+    outcome = run_scenario(scenario("two-way", *clean, "back.ros_source.topics=[odom]", duration_s=2.0), tmp_path)
+    result = outcome.result
+    check_complete(result)
+    names = {topic.topic: topic.src_id for topic in result.topics}
+    assert names == {"/robot_1/odom": 1, "/robot_1/imu": 1, "/robot_2/odom": 2}
+    for topic in result.topics:
+        other = topic.topic.replace("/robot", "/rx_robot")
+        assert len(delivered_bag(tmp_path, other)) == topic.delivered == result.counters["listener"][other]
+    assert result.phy["channels"] == 2
+    assert result.counters["source"]["packets"] + result.counters["back"]["source"]["packets"] == result.packets["sent"]
+    write_report(read_runs([tmp_path]), tmp_path)
+    assert "packets/s on its 2 channels" in (tmp_path / "report.html").read_text()
+
+
+def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path) -> None:
+    lossy = [
+        "ros_source.topic_options={}",
+        "phy.name=direct",
+        "phy.options={}",
+        "ros_source.topics=[odom]",
+        "back.channel.packet_loss=0.3",
+    ]
+    result = run_scenario(scenario("two-way", *lossy, duration_s=2.0), tmp_path).result
+    check_books(result)
+    there, back = result.topics
+    assert there.delivered == there.sent
+    assert back.delivered < back.sent
+    lost = result.counters["back"]["channel"]
+    assert set(lost) <= {"burst_loss", "packet_loss"}
+    assert result.packets["sent"] - result.packets["received"] == sum(lost.values())
+    assert result.counters["channel"] == {}
+
+
+def test_a_sink_that_would_feed_the_source_beside_it_is_refused(tmp_path: Path) -> None:
+    loop = scenario("two-way", "back.ros_sink.namespace_format=/robot_1", duration_s=1.0)
+    with pytest.raises(ConfigError, match=r"loop: the sink publishes /robot_1/scan"):
+        run_scenario(loop, tmp_path)
+
+
+def test_nothing_passes_while_the_link_is_unplugged(tmp_path: Path) -> None:
+    begin, end, slack = 0.5, 1.2, 0.1
+    unplugged = scenario("paper-direct", f"channel.outages=[[{begin}, {end}]]", duration_s=2.0)
+    outcome = run_scenario(unplugged, tmp_path)
+    check_books(outcome.result)
+    (messages,) = outcome.trace.messages()
+    arrived = messages.t_delivered[messages.delivered]
+    assert not ((arrived > begin + slack) & (arrived < end)).any()
+    assert (messages.delivered[(messages.t_sent > end) & (messages.t_sent < 1.8)]).all()
+    assert outcome.result.counters["channel"]["outages"] > 0

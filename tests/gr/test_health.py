@@ -1,0 +1,117 @@
+"""The judgement of a live link, from counters handed to it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from gr_ros2.config import DiagnosticsConfig
+from gr_ros2.gr.health import Level, LinkHealth, Status
+
+
+def stats(**changes: Any) -> dict[str, Any]:
+    """What a link would say after a quiet start."""
+    values: dict[str, Any] = {
+        "out": 0, "packets": 0, "missing": 0, "rejected": 0, "delivered": 0, "lost": 0, "latency": None, "age": None,
+        "queued": 0, "snr_db": None, **changes,
+    }  # fmt: skip
+    latency = None if values["latency"] is None else {"p50": values["latency"], "p95": 2 * values["latency"]}
+    return {
+        "source": {"topics": {"/odom": {"queued": values["queued"], "refused": {"stale": 3}}}},
+        "sink": {
+            "packets": values["packets"],
+            "packet_loss_est": values["missing"],
+            "rejected": {"crc": values["rejected"]},
+            "held_bytes": 0,
+            "topics": {
+                "/rx_robot_2/odom": {
+                    "delivered": values["delivered"],
+                    "lost": {"expired": values["lost"]},
+                    "recent_latency_s": latency,
+                    "age_s": values["age"],
+                }
+            },
+        },
+        "packets": {"out": values["out"], "backlog": 0, "damaged": 0},
+        "phy": {"airtime_s": 0.01, "snr_db": values["snr_db"]},
+    }
+
+
+def parts(health: LinkHealth, now: float, **changes: Any) -> tuple[Status, Status, Status]:
+    receiver, transmitter, topic = health.judge(stats(**changes), now)
+    return receiver, transmitter, topic
+
+
+def make(queue_depth: int = 100, **limits: float) -> LinkHealth:
+    return LinkHealth(DiagnosticsConfig(**limits), "link", queue_depth)
+
+
+def test_a_quiet_start_is_ok() -> None:
+    for status in make().judge(stats(), 0.0):
+        assert (status.level, status.message) == (Level.OK, "OK")
+
+
+@pytest.mark.parametrize(
+    ("missing", "level"), [(0, Level.OK), (10, Level.OK), (40, Level.WARN), (200, Level.ERROR), (-5, Level.OK)]
+)
+def test_packet_loss_is_a_share_of_the_last_seconds(missing: int, level: Level) -> None:
+    health = make()
+    parts(health, 0.0, packets=1000, missing=900)
+    receiver, _, _ = parts(health, 1.0, packets=1100, missing=900 + missing)
+    assert receiver.level is level
+    lost = max(missing, 0)
+    assert float(receiver.values["packet loss"]) == pytest.approx(lost / (100 + lost), abs=1e-2)
+    assert receiver.values["packets received (1/s)"] == "100"
+
+
+def test_what_is_long_past_does_not_count() -> None:
+    health = make(window_s=5)
+    parts(health, 0.0)
+    assert parts(health, 1.0, packets=10, missing=90)[0].level is Level.ERROR
+    for second in range(2, 8):
+        receiver, _, _ = parts(health, float(second), packets=10 + 10 * second, missing=90)
+    assert (receiver.level, receiver.values["packet loss"]) == (Level.OK, "0")
+
+
+def test_silence_counts_from_the_last_packet() -> None:
+    health = make(silence_warn_s=3, silence_error_s=10)
+    assert parts(health, 0.0)[0].values["silence (s)"] == "nothing received yet"
+    levels = [parts(health, now, packets=1)[0].level for now in (1.0, 4.0, 4.1, 11.1)]
+    assert levels == [Level.OK, Level.OK, Level.WARN, Level.ERROR]
+
+
+def test_topics_are_judged_each() -> None:
+    health = make(latency_warn_s=0.5, latency_error_s=2, age_warn_s=1)
+    parts(health, 0.0)
+    *_, topic = parts(health, 1.0, delivered=60, lost=40, latency=0.7, age=0.2)
+    assert topic.level is Level.WARN
+    assert topic.message == "messages lost 0.4; latency 0.7 s"
+    assert topic.values["latency, 95 % (s)"] == "1.4"
+    *_, topic = parts(health, 2.0, delivered=120, lost=40, latency=2.5, age=1.5)
+    assert topic.level is Level.ERROR
+    assert "age 1.5 s" in topic.message
+
+
+def test_the_transmitter_tells_airtime_queues_and_drops() -> None:
+    health = make(queue_depth=10)
+    parts(health, 0.0)
+    _, transmitter, _ = parts(health, 2.0, out=100, queued=9)
+    assert transmitter.level is Level.WARN
+    assert transmitter.message == "fullest queue 0.9"
+    assert transmitter.values["airtime used"] == "0.5"
+    assert transmitter.values["messages dropped: stale"] == "3"
+    _, transmitter, _ = parts(make(queue_depth=0), 0.0, queued=9)
+    assert "fullest queue" not in transmitter.values
+
+
+def test_the_snr_is_told_where_it_is_known() -> None:
+    assert parts(make(), 0.0, snr_db=17.25)[0].values["SNR (dB)"] == "17.2"
+    assert "SNR (dB)" not in parts(make(), 0.0)[0].values
+
+
+def test_a_limit_of_zero_is_none() -> None:
+    health = make(packet_loss_warn=0, packet_loss_error=0, silence_warn_s=0, silence_error_s=0)
+    parts(health, 0.0)
+    parts(health, 1.0, packets=1, missing=99)
+    assert parts(health, 99.0, packets=1, missing=99)[0].level is Level.OK

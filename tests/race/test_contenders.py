@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import json
+import re
+from xml.etree import ElementTree
+
+import pytest
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.race.contenders import ADDRESSES, CONTENDERS, MTU, chosen, cyclone_uri, zenoh_config
+
+
+def test_contenders_are_chosen_by_name_in_the_order_of_the_table() -> None:
+    assert list(chosen(["zenoh-tcp", "gr-ros2"])) == ["gr-ros2", "zenoh-tcp"]
+    assert chosen([]) == CONTENDERS
+
+
+def test_an_unknown_contender_is_named_with_those_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"peers = 'fastdds': no such contender; known are gr-ros2, .*zenoh-tcp"):
+        chosen(["gr-ros2", "fastdds"])
+
+
+def test_each_peer_races_best_effort_and_reliable() -> None:
+    for stack in ("dds", "zenoh"):
+        assert {one.reliable for one in CONTENDERS.values() if one.stack == stack} == {False, True}
+
+
+def test_cyclone_talks_to_its_peer_only_in_messages_that_fit_an_ip_packet() -> None:
+    root = ElementTree.fromstring(cyclone_uri(ADDRESSES[1], "air0"))
+    assert [peer.get("address") for peer in root.iter("Peer")] == [ADDRESSES[1]]
+    assert [item.get("name") for item in root.iter("NetworkInterface")] == ["air0"]
+    for name in ("MaxMessageSize", "MaxRexmitMessageSize", "FragmentSize"):
+        (size,) = (re.sub("B$", "", item.text or "") for item in root.iter(name))
+        assert 1024 < int(size) <= MTU - 28
+
+
+@pytest.mark.parametrize("transport", ["udp", "tcp"])
+def test_zenoh_takes_its_configuration(transport: str) -> None:
+    zenoh = pytest.importorskip("zenoh")
+    for listens in (False, True):
+        config = zenoh.Config.from_json5(json.dumps(zenoh_config(transport, listens)))
+        assert json.loads(config.get_json("transport/unicast/compression/enabled")) is True
+        assert json.loads(config.get_json("transport/link/tx/batch_size")) <= MTU
+        assert json.loads(config.get_json("scouting/multicast/enabled")) is False

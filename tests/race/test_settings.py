@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.config import build
+from gr_ros2.errors import ConfigError
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.race.settings import SIM_TOPIC, RaceSettings, check, conditions, read_recording
+
+
+def write_bag(path: Path, topics: dict[str, list[bytes]], step_s: float = 0.1) -> str:
+    with BagMiddleware(path=path, mode="write") as bag:
+        for topic, payloads in topics.items():
+            publisher = bag.advertise(topic, "std_msgs/msg/String", Qos())
+            for number, payload in enumerate(payloads):
+                publisher.publish_at(payload, 1_000_000_000 + round(number * step_s * 1e9))
+    return f"bag:{path}"
+
+
+def text(number: int, size: int = 40) -> bytes:
+    body = f"{number:>{size}}".encode()
+    return b"\0\1\0\0" + (size + 1).to_bytes(4, "little") + body + b"\0"
+
+
+def test_the_simulated_recording_is_odometry_at_35_hz_and_the_same_each_time(tmp_path: Path) -> None:
+    settings = RaceSettings(duration_s=2)
+    recording = read_recording(settings, tmp_path / "a")
+    assert recording.topic == SIM_TOPIC
+    assert recording.type_name == "nav_msgs/msg/Odometry"
+    assert len(recording.payloads) == 70
+    assert recording.hz == pytest.approx(35, rel=1e-3)
+    assert {len(payload) for payload in recording.payloads} == {recording.largest} == {724}
+    assert read_recording(settings, tmp_path / "b").payloads == recording.payloads
+
+
+def test_the_sample_rate_follows_from_the_load_and_the_load_from_the_sample_rate(tmp_path: Path) -> None:
+    recording = read_recording(RaceSettings(duration_s=1), tmp_path)
+    heavy, light = 2.0, 0.5
+    found = conditions(RaceSettings(load=(heavy, light), loss=(0.2, 0.0)), recording)
+    assert [(each.load, each.loss) for each in found] == [(light, 0.0), (light, 0.2), (heavy, 0.0), (heavy, 0.2)]
+    # 741 bytes with CRC-32 in 48 BPSK carriers are 124 symbols; 3 more, of 80 samples each, and a gap of 112.
+    assert found[0].sample_rate * light == pytest.approx(35 * (127 * 80 + 112), rel=1e-3)
+    assert found[2].sample_rate * heavy == pytest.approx(found[0].sample_rate * light)
+    (fixed,) = conditions(RaceSettings(sample_rate=found[2].sample_rate, loss=(0.0,)), recording)
+    assert fixed.load == pytest.approx(heavy)
+
+
+def test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked(tmp_path: Path) -> None:
+    source = write_bag(tmp_path / "bag", {"/a": [text(n) for n in range(50)], "/b": [text(n) for n in range(9)]})
+    recording = read_recording(RaceSettings(source=source, topic="/a", duration_s=2), tmp_path)
+    assert (recording.topic, recording.type_name) == ("/a", "std_msgs/msg/String")
+    assert recording.payloads == tuple(text(n) for n in range(20))
+    assert recording.hz == pytest.approx(10)
+
+
+@pytest.mark.parametrize(
+    ("topics", "topic", "problem"),
+    [
+        ({"/a": [text(1), text(2)], "/b": [text(1)]}, "", r"topic = '': name one that .* has: /a, /b"),
+        ({"/a": [text(1), text(2)]}, "/c", r"topic = '/c': name one that .* has: /a"),
+        ({"/a": [text(1)]}, "/a", "/a has 1 messages in 15 s; 2 are needed"),
+        ({"/a": [text(1, 2000), text(2, 2000)]}, "/a", "messages of 2009 B; the race takes up to 1300 B"),
+    ],
+)
+def test_a_bag_that_cannot_race_is_refused(
+    tmp_path: Path, topics: dict[str, list[bytes]], topic: str, problem: str
+) -> None:
+    source = write_bag(tmp_path / "bag", topics)
+    with pytest.raises(ConfigError, match=problem):
+        read_recording(RaceSettings(source=source, topic=topic), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"peers": ("nobody",)}, "peers = 'nobody': no such contender"),
+        ({"source": "bag:"}, "the path of the bag is missing"),
+        ({"source": "x.mcap"}, "source = 'x.mcap': write sim or bag:PATH"),
+        ({"loss": (1.5,)}, "loss.0 = 1.5: input should be less than or equal to 1"),
+        ({"load": ()}, "load"),
+        ({"packet_len": 3}, "packet_len = 3"),
+        ({"laps": 3}, "unknown key laps"),
+    ],
+)
+def test_wrong_settings_are_named(values: dict[str, object], problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        check(build(RaceSettings, values, "race"))

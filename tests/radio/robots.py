@@ -1,0 +1,87 @@
+"""What the radio tests share: a robot whose ROS graph is in memory, with its link, and what its programs hear."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.config import LinkConfig, link_from
+from gr_ros2.radio.link import LinkObserver, RobotLink
+from tests.middleware.support import CUSTOM, domain, message, wait_for
+
+TOPICS = Path(__file__).with_name("topics.csv")
+RATE = 2e6
+QOS = Qos("reliable", "volatile", 0)
+
+
+def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
+    """Of robot ``number``: one topic, packets of 64 B, its graph in memory."""
+    graph = {"middleware": "memory", "domain_id": domain(number)}
+    defaults = {
+        "registry": str(TOPICS),
+        "packet_len": 64,
+        "phy": {"name": "psk", "sample_rate": RATE},
+        "front_end": front_end,
+        "ros_source": {
+            "namespace": f"/robot_{number}",
+            "queue_depth": 0,
+            "subscriber_depth": 0,
+            **graph,
+            **values.pop("ros_source", {}),
+        },
+        "ros_sink": {"publisher_depth": 0, **graph, **values.pop("ros_sink", {})},
+    }
+    return link_from({**defaults, **values})
+
+
+class Robot:
+    """A robot's programs and its link, which is started and stopped with it.
+
+    :param hears: robots whose messages its programs take
+    """
+
+    def __init__(
+        self,
+        number: int,
+        front_end: dict[str, Any],
+        hears: tuple[int, ...] = (),
+        observer: LinkObserver | None = None,
+        **values: Any,
+    ) -> None:
+        self.link = RobotLink(config(number, front_end, **values), observer=observer)
+        self.heard: list[bytes] = []
+        self._graph = MemoryMiddleware(domain_id=domain(number))
+        self._chat = self._graph.advertise(f"/robot_{number}/chat", CUSTOM, QOS)
+        for other in hears:
+            self._graph.subscribe(f"/rx_robot_{other}/chat", CUSTOM, QOS, self.heard.append)
+
+    def say(self, *numbers: int) -> list[bytes]:
+        """Publish numbered messages of several packets each, which the link has then taken; returns them."""
+        said = [message(number, 200) for number in numbers]
+        before = self._taken()
+        for payload in said:
+            self._chat.publish(payload)
+        wait_for(lambda: self._taken() == before + len(said), "the link to take what was said")
+        return said
+
+    @property
+    def silent(self) -> bool:
+        """Whether everything said is on the air or over."""
+        packets = self.link.stats()["packets"]
+        return self.link.source.idle and packets["out"] == self.link.source.stats()["packets"]
+
+    def _taken(self) -> int:
+        return int(self.link.source.stats()["topics"][f"/robot_{self.link.source.src_id}/chat"]["submitted"])
+
+    def __enter__(self) -> Robot:
+        self.link.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.link.stop()
+        self._graph.close()

@@ -1,0 +1,227 @@
+"""Radios without hardware: a SoapySDR device of our own that loops back, and what is said where there is no device."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.phy.psk import PskPhy
+from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.soapy import SoapyFrontEnd
+from tests.radio.robots import RATE, TOPICS, config
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = ROOT / "tests" / "peers" / "soapy_loopback.cpp"
+HEADER = Path("/usr/include/SoapySDR/Device.hpp")
+MESSAGES = 20
+TALK = """
+import json, sys
+from tests.middleware.support import wait_for
+from tests.radio.robots import Robot
+
+front_end, values, count, wanted = map(json.loads, sys.argv[1:])
+with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, **values) as robot:
+    said = robot.say(*range(count))
+    wait_for(lambda: robot.silent and len(robot.heard) >= wanted, "every message")
+    print(json.dumps({"altered": [m for m in robot.heard if m not in said], "heard": len(robot.heard),
+                      "packets": robot.link.stats()["packets"], **robot.link.stats()["front_end"],
+                      "layout": robot.link.front_end.layout.total}, default=str))
+"""
+"""A robot that takes its own packets, as if they were another's, in a process where the driver can be found."""
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the driver `loopback`."""
+    if not HEADER.exists() or not shutil.which("g++"):
+        pytest.skip("needs g++ and SoapySDR's headers: apt install g++ libsoapysdr-dev")
+    folder = tmp_path_factory.mktemp("soapy")
+    command = ["g++", "-std=c++17", "-O1", "-shared", "-fPIC", "-o", str(folder / "libloopback.so"), str(SOURCE)]
+    built = subprocess.run([*command, "-lSoapySDR"], capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+def with_driver(driver: Path) -> dict[str, str]:
+    """The environment of a process that finds it."""
+    return {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(driver)}
+
+
+def talk(
+    driver: Path, front_end: dict[str, Any], values: dict[str, Any], count: int = MESSAGES, wanted: int = MESSAGES
+) -> dict[str, Any]:
+    """What became of messages over the loopback device, once so many of them have come back."""
+    done = subprocess.run(
+        [sys.executable, "-c", TALK, *map(json.dumps, (front_end, values, count, wanted))],
+        env=with_driver(driver),
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+@pytest.mark.parametrize("phy", ["psk", "gfsk", "ofdm"])
+def test_every_packet_goes_out_as_one_ended_burst_and_comes_back(driver: Path, tmp_path: Path, phy: str) -> None:
+    log = tmp_path / "log"
+    front_end = {
+        "name": "soapy",
+        "args": f"driver=loopback,log={log}",
+        "frequency": 433e6,
+        "frequency_rx": 434e6,
+        "gain_tx": 10,
+        "gain_rx": 20,
+        "antenna_tx": "RIGHT",
+        "bandwidth": 5e5,
+        "multiple": 500,
+    }
+    result = talk(driver, front_end, {"phy": {"name": phy, "sample_rate": 1e6}})
+    assert (result["heard"], result["altered"], result["clipped"]) == (MESSAGES, [], 0)
+    assert result["packets"]["in"] == result["packets"]["out"] >= 4 * MESSAGES
+
+    said = Counter(tuple(line.split()[:3]) for line in log.read_text().splitlines())
+    for setting in ("tx frequency 433000000.000000", "rx frequency 434000000.000000", "tx gain 10.000000",
+                    "rx gain 20.000000", "tx antenna RIGHT", "tx rate 1000000.000000", "rx rate 1000000.000000",
+                    "tx bandwidth 500000.000000", "rx bandwidth 500000.000000"):  # fmt: skip
+        assert said[tuple(setting.split())] == 1, setting
+    assert ("rx", "antenna", "LEFT") not in said
+    writes = [line.split() for line in log.read_text().splitlines() if line.startswith("tx write")]
+    # Each call brings one whole burst and ends it.
+    assert {(int(size), end) for _, _, size, end, _ in writes} == {(result["layout"], "end")}
+    loud = [float(peak) for *_, peak in writes]
+    assert len(loud) == result["packets"]["out"]
+    assert min(loud) > 0 == result["unsent"]
+    assert result["layout"] % 500 == 0
+    assert max(loud) <= 1
+
+
+def test_a_half_duplex_robot_hardly_hears_itself(driver: Path) -> None:
+    front_end = {
+        "name": "soapy",
+        "args": "driver=loopback",
+        "frequency": 433e6,
+        "half_duplex": True,
+        "turnaround": 0.2,
+    }
+    result = talk(driver, front_end, {"phy": {"name": "psk", "sample_rate": 1e6}}, count=4, wanted=0)
+    assert result["packets"]["out"] >= 16
+    # Exact times are tested with the blanker alone; here a busy machine may hold samples up beyond the turnaround.
+    assert result["packets"]["in"] < result["packets"]["out"] / 2
+    assert result["blanked"] > result["packets"]["out"] * result["layout"] / 2
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"args": "driver=loopback,rate=7e5"}, r"the device runs at 700,000 samples/s, not at 2,000,000; set phy"),
+        ({"args": "driver=loopback", "antenna_tx": "UP"}, r"antenna_tx = 'UP': the device has LEFT, RIGHT"),
+        ({"args": "driver=loopback", "antenna_rx": "UP"}, r"antenna_rx = 'UP': the device has LEFT, RIGHT"),
+    ],
+)
+def test_what_a_device_cannot_do_is_said_in_a_line(driver: Path, change: dict[str, Any], said: str) -> None:
+    code = (
+        f"from tests.radio.robots import *; RobotLink(config(1, { ({'name': 'soapy', 'frequency': 1e8} | change)!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=with_driver(driver),
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.stderr.splitlines()[-1].startswith("gr_ros2.errors.RadioError: front_end soapy: ")
+    assert re.search(said, done.stderr.splitlines()[-1])
+
+
+def test_a_device_that_falls_silent_ends_the_link(driver: Path, tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        f"""
+        registry: {TOPICS}
+        ros_source: {{robot_id: 1, middleware: memory}}
+        ros_sink: {{middleware: memory}}
+        phy: {{name: psk, sample_rate: 1e6}}
+        front_end: {{name: soapy, args: "driver=loopback,dies=0.2", frequency: 1e8}}
+        """
+    )
+    command = [sys.executable, "-m", "gr_ros2.cli.main", "link", str(path), "--duration", "60"]
+    done = subprocess.run(command, env=with_driver(driver), capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 1
+    assert "front_end soapy: args = 'driver=loopback,dies=0.2': no samples for 3 s" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "hint"),
+    [
+        ("soapy", "driver=nothing", "SoapySDRUtil --find"),
+        ("soapy", "driver=null", "SoapySDRUtil --find"),
+        ("uhd", "type=b200,serial=none", "uhd_find_devices"),
+        ("pluto", "ip:127.0.0.1", "iio_info -S"),
+    ],
+)
+def test_a_device_that_is_not_there_is_named_with_a_remedy(name: str, args: str, hint: str) -> None:
+    with pytest.raises(RadioError) as caught:
+        RobotLink(config(1, {"name": name, "args": args, "frequency": 433e6}, phy={"name": "psk", "sample_rate": 1e6}))
+    told = str(caught.value)
+    assert told.startswith(f"front_end {name}: args = {args!r}: ")
+    assert hint in told
+    assert "\n" not in told
+
+
+@pytest.mark.parametrize("name", ["soapy", "uhd", "pluto"])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"frequency": 0}, "frequency = 0"),
+        ({"frequency": None}, "frequency"),
+        ({"gain": 3}, "unknown key gain; known are .*gain_tx"),
+        ({"level": 2}, "level = 2"),
+        ({"multiple": 0}, "multiple = 0"),
+    ],
+)
+def test_wrong_settings_are_found_before_the_device(name: str, change: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=f"front_end {name}: .*{said}"):
+        RobotLink(config(1, {"name": name, "frequency": 433e6, **change}))
+
+
+def test_a_pluto_refuses_what_it_cannot_do() -> None:
+    for change, said in (({"gain_tx": 10}, "gain_tx = 10"), ({"antenna_tx": "A"}, "one port")):
+        with pytest.raises((ConfigError, RadioError), match=said):
+            RobotLink(config(1, {"name": "pluto", "frequency": 433e6, **change}))
+    with pytest.raises(RadioError, match="100,000: a Pluto has 521,000 to 61,440,000"):
+        RobotLink(config(1, {"name": "pluto", "frequency": 433e6}, phy={"name": "psk", "sample_rate": 1e5}))
+
+
+def test_a_radio_has_a_channel_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Only the device itself stands in the way of this check, and there is none here.
+    for half in ("_open_transmitter", "_open_receiver"):
+        monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
+    with pytest.raises(ConfigError, match="channel: front_end soapy has a real one"):
+        RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, channel={"snr_db": 3}))
+
+
+def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyPatch) -> None:
+    for half in ("_open_transmitter", "_open_receiver"):
+        monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
+    phy = PskPhy(64, RATE)
+    common = {"frequency": 433e6, "lead": 10, "tail": 20, "multiple": 1000, "guard": 0.003}
+    full = SoapyFrontEnd(phy, **common)
+    padded = -(-(phy.airtime_samples() + 30) // 1000) * 1000
+    assert full.airtime() == pytest.approx(padded / RATE + 0.003)
+    assert full.early() > full.airtime()
+    half_duplex = SoapyFrontEnd(phy, half_duplex=True, turnaround=0.01, **common)
+    assert half_duplex.airtime() == pytest.approx(full.airtime() + 0.01)

@@ -1,0 +1,108 @@
+"""What a link says of itself, heard by another participant of a real DDS."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.middleware.type_definitions import typestore
+from gr_ros2.radio.config import link_from
+from gr_ros2.radio.diagnostics import DIAGNOSTICS_TYPE, STATISTICS_TYPE, Diagnostics
+from gr_ros2.radio.link import RobotLink
+from tests.e2e.support import free_domains
+from tests.middleware.support import domain, wait_for
+
+
+def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages stamped 2 s ago come with a warning, as the limit says."""
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    (number,) = free_domains(1)
+    registry = tmp_path / "topics.csv"
+    registry.write_text("point,geometry_msgs/PointStamped\n")
+    config = link_from(
+        {
+            "registry": str(registry),
+            "phy": {"name": "direct"},
+            "front_end": {"name": "sim"},
+            "ros_source": {"namespace": "/robot_1", "domain_id": number},
+            "ros_sink": {"domain_id": number},
+            "diagnostics": {"period_s": 0.1, "latency_warn_s": 1.0},
+        }
+    )
+    arrays: list[Any] = []
+    counters: list[Any] = []
+
+    def warned() -> bool:
+        topic = "gr_ros2_link_1: /rx_robot_1/point"
+        return any(status.name == topic and status.level == 1 for array in arrays for status in array.status)
+
+    with RobotLink(config), DdsMiddleware(domain_id=number) as listener:
+        store = typestore()
+        listener.subscribe(
+            "/diagnostics", DIAGNOSTICS_TYPE, Qos(), lambda p: arrays.append(store.deserialize_cdr(p, DIAGNOSTICS_TYPE))
+        )
+        listener.subscribe(
+            "/gr_ros2_link_1/statistics",
+            STATISTICS_TYPE,
+            Qos(),
+            lambda p: counters.append(json.loads(store.deserialize_cdr(p, STATISTICS_TYPE).data)),
+        )
+        publisher = listener.advertise("/robot_1/point", "geometry_msgs/PointStamped", Qos("reliable"))
+        wait_for(publisher.matched, "match")
+        payload = b"\0\1\0\0" + struct.pack("<iIIx7x3d", int(time.time()) - 2, 0, 1, 1.0, 2.0, 3.0)
+        wait_for(lambda: publisher.publish(payload) or warned(), "a warning")
+        wait_for(lambda: counters and counters[-1]["sink"]["topics"], "statistics")
+    receiver, transmitter, topic = arrays[-1].status
+    assert (receiver.name, transmitter.name) == ("gr_ros2_link_1: receiver", "gr_ros2_link_1: transmitter")
+    assert {status.hardware_id for status in arrays[-1].status} == {"gr_ros2_link_1"}
+    assert topic.message.startswith("latency 2")
+    values = {item.key: item.value for item in topic.values}
+    assert 2 <= float(values["latency (s)"]) <= float(values["age (s)"]) + 0.01
+    assert abs(arrays[-1].header.stamp.sec - time.time()) < 60
+    assert counters[-1]["sink"]["topics"]["/rx_robot_1/point"]["delivered"] > 0
+    assert counters[-1]["phy"]["name"] == "direct"
+
+
+def test_no_period_no_diagnostics(tmp_path: Path) -> None:
+    registry = tmp_path / "topics.csv"
+    registry.write_text("point,geometry_msgs/PointStamped\n")
+    graph = {"middleware": "memory", "domain_id": domain()}
+    config = link_from(
+        {
+            "registry": str(registry),
+            "phy": {"name": "direct"},
+            "ros_source": {"robot_id": 1, **graph},
+            "ros_sink": graph,
+            "diagnostics": {"period_s": 0},
+        }
+    )
+    with RobotLink(config), MemoryMiddleware(domain_id=domain()) as listener:
+        assert "/diagnostics" not in {info.topic for info in listener.discover()}
+
+
+def test_a_closed_graph_is_counted_and_survived() -> None:
+    graph = MemoryMiddleware(domain_id=domain())
+    stats = {
+        "source": {"topics": {}},
+        "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "topics": {}},
+        "packets": {"out": 0, "backlog": 0, "damaged": 0},
+        "phy": {"airtime_s": 0.0},
+    }
+    config = link_from({"registry": "x", "phy": {"name": "direct"}, "ros_source": {"robot_id": 1},
+                        "diagnostics": {"period_s": 0.01}}).diagnostics  # fmt: skip
+    diagnostics = Diagnostics(config, graph, "link", lambda: stats, queue_depth=0)
+    graph.close()
+    diagnostics.start()
+    wait_for(lambda: diagnostics.failed >= 2, "two failures")
+    diagnostics.stop()
+    diagnostics.stop()

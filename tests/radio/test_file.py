@@ -1,0 +1,131 @@
+"""SigMF recordings: what is sent is written, what is written is received again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
+from tests.middleware.support import wait_for
+from tests.radio.robots import RATE, Robot, config
+
+
+def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]:
+    """Make a recording of so many messages; returns them."""
+    with Robot(1, {"name": "file", "write": str(path)}, phy={"name": phy, "sample_rate": RATE}) as robot:
+        said = robot.say(*range(count))
+        wait_for(lambda: robot.silent, "all to be sent")
+        samples = robot.link.source.stats()["packets"] * robot.link.phy.airtime_samples()
+        wait_for(lambda: robot.link.front_end.sink.nitems_read(0) == samples, "all to be written")
+    assert Path(f"{path}.sigmf-data").stat().st_size == 8 * samples
+    return said
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads(Path(f"{path}.sigmf-meta").read_text())
+    return values
+
+
+@pytest.mark.parametrize("phy", ["psk", "gfsk", "ofdm"])
+def test_what_was_sent_is_received_again(tmp_path: Path, phy: str) -> None:
+    said = sent_recording(tmp_path / "sent", phy)
+    replay = {"name": "file", "read": str(tmp_path / "sent.sigmf-meta")}
+    with Robot(2, replay, hears=(1,), phy={"name": phy, "sample_rate": RATE}) as robot:
+        wait_for(lambda: robot.link.finished and len(robot.heard) == len(said), "the end of the recording")
+        assert robot.heard == said
+        assert (
+            robot.link.stats()["uptime_s"] > metadata(tmp_path / "sent")["annotations"][-1]["core:sample_start"] / RATE
+        )
+
+
+def test_a_recording_is_sigmf(tmp_path: Path) -> None:
+    sigmf = pytest.importorskip("sigmf", reason="needs sigmf, see requirements-dev.txt")
+    sent_recording(tmp_path / "sent")
+    whole = sigmf.sigmffile.fromfile(str(tmp_path / "sent"))
+    whole.validate()
+    _, samples = read_recording(tmp_path / "sent")
+    assert np.array_equal(whole.read_samples(), samples)
+    assert whole.get_global_field("core:sample_rate") == RATE
+    annotations = whole.get_annotations()
+    burst = annotations[0]["core:sample_count"]
+    assert [entry["core:sample_start"] for entry in annotations] == list(range(0, len(samples), burst))
+
+
+def test_any_link_can_record_what_it_receives(tmp_path: Path) -> None:
+    with Robot(1, {"name": "sim"}, hears=(1,), record=str(tmp_path / "heard")) as robot:
+        said = robot.say(*range(5))
+        wait_for(lambda: len(robot.heard) == len(said), "every message")
+    about, samples = read_recording(tmp_path / "heard")
+    assert (about.sample_rate, about.frequency) == (RATE, None)
+    assert "psk" in about.description
+    assert len(samples) > 25 * 1000
+    with Robot(2, {"name": "file", "read": str(tmp_path / "heard"), "speed": 0}, hears=(1,)) as robot:
+        wait_for(lambda: len(robot.heard) == len(said), "the recording")
+        assert robot.heard == said
+
+
+def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
+    # More than the 64 packets among which a receiver knows one that comes twice.
+    said = sent_recording(tmp_path / "sent", count=20)
+    replay = {"name": "file", "read": str(tmp_path / "sent"), "repeat": True, "speed": 0}
+    with Robot(2, replay, hears=(1,)) as robot:
+        wait_for(lambda: len(robot.heard) > 2 * len(said), "more than two rounds")
+        assert not robot.link.finished
+
+
+def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
+    recorder = SigmfRecorder(tmp_path / "cut", Recording(RATE, 433e6), 4)
+    recorder.work([np.arange(8, dtype=np.complex64)], [])
+    recorder._file.flush()
+    with Path(tmp_path / "cut.sigmf-data").open("ab") as data:
+        data.write(b"torn")
+    about, samples = read_recording(tmp_path / "cut")
+    assert (about.frequency, samples.tolist()) == (433e6, list(range(8)))
+    recorder.close()
+    recorder.close()
+    assert len(metadata(tmp_path / "cut")["annotations"]) == 2
+
+
+def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
+    SigmfRecorder(tmp_path / "empty", Recording(RATE)).close()
+    with Robot(2, {"name": "file", "read": str(tmp_path / "empty")}) as robot:
+        wait_for(lambda: robot.link.finished, "the end")
+
+
+def test_what_cannot_be_written_is_counted(tmp_path: Path) -> None:
+    recorder = SigmfRecorder(tmp_path / "full", Recording(RATE))
+    recorder.close()
+    recorder.work([np.zeros(5, np.complex64)], [])
+    assert recorder.failed == 5
+
+
+def test_wrong_recordings_are_named(tmp_path: Path) -> None:
+    sent_recording(tmp_path / "sent")
+
+    def refused(options: dict[str, Any], said: str, **values: Any) -> None:
+        with pytest.raises((ConfigError, RadioError), match=said):
+            RobotLink(config(2, {"name": "file", **options}, **values))
+
+    refused({}, "write and read are both empty")
+    refused({"read": str(tmp_path / "none")}, "none.sigmf-meta: No such file")
+    refused({"write": str(tmp_path / "sent")}, "there is one already")
+    refused({"write": str(tmp_path / "no" / "where")}, "cannot be written")
+    refused({"read": str(tmp_path / "sent")}, "set phy.sample_rate", phy={"name": "psk", "sample_rate": 1e6})
+    meta = tmp_path / "sent.sigmf-meta"
+    about = metadata(tmp_path / "sent")
+    for content, said in (
+        ("nonsense", "no SigMF metadata"),
+        ("{}", "no SigMF metadata"),
+        ("[]", "no SigMF metadata"),
+        (json.dumps({**about, "global": {**about["global"], "core:datatype": "ci16_le"}}), "only cf32_le"),
+    ):
+        meta.write_text(content)
+        refused({"read": str(meta)}, said)

@@ -1,0 +1,139 @@
+"""A robot's link without a radio: what goes out comes back, events are told, nothing stays open."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError, RegistryError
+from gr_ros2.link import Delivered
+from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.phy import PHY
+from gr_ros2.radio.link import RobotLink
+from tests.middleware.support import domain, wait_for
+from tests.radio.robots import RATE, Robot, config
+
+SIM = {"name": "sim"}
+
+
+@pytest.mark.parametrize("phy", list(PHY))
+def test_on_every_phy_what_goes_out_comes_back(phy: str) -> None:
+    with Robot(1, SIM, hears=(1,), phy={"name": phy, "sample_rate": 10e6 if phy == "lora" else RATE}) as robot:
+        said = robot.say(*range(10))
+        wait_for(lambda: len(robot.heard) == len(said), "every message")
+        assert robot.heard == said
+        stats = robot.link.stats()
+    assert stats["packets"]["out"] == stats["packets"]["in"] == stats["source"]["packets"]
+    assert stats["packets"]["backlog"] == stats["packets"]["refused"] == 0
+    assert stats["phy"]["name"] == phy
+    assert stats["front_end"] == {"name": "sim"}
+    assert stats["uptime_s"] > 0
+
+
+def test_the_channel_is_what_the_configuration_says() -> None:
+    with Robot(1, SIM, hears=(1,), channel={"packet_loss": 1.0}) as robot:
+        robot.say(0)
+        wait_for(lambda: robot.link.stats()["packets"]["dropped"].get("packet_loss", 0) >= 4, "packets to be lost")
+        assert robot.heard == []
+    with Robot(1, SIM, hears=(1,), channel={"snr_db": -30}) as robot:
+        robot.say(0)
+        wait_for(lambda: robot.link.stats()["packets"]["out"] >= 4, "packets to be sent")
+        assert robot.heard == []
+
+
+def test_packets_leave_at_the_pace_of_the_air() -> None:
+    with Robot(1, {"name": "sim", "guard": 0.01}) as robot:
+        airtime = robot.link.stats()["phy"]["airtime_s"]
+        assert airtime == pytest.approx(robot.link.phy.airtime() + 0.01)
+        robot.say(*range(4))
+        wait_for(lambda: robot.silent, "all to be sent")
+        stats = robot.link.stats()
+    assert stats["uptime_s"] > stats["packets"]["out"] * airtime
+
+
+class Ears:
+    """Notes all it is told."""
+
+    def __init__(self) -> None:
+        self.sent: list[SenderEvent] = []
+        self.packets: list[bytes] = []
+        self.received: list[ReceiverEvent] = []
+        self.times: list[float] = []
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        assert src_id == 1
+        self.sent.append(event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        self.packets.append(data)
+        self.times.append(now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        self.received.append(event)
+        self.times.append(now)
+
+
+def test_an_observer_is_told_everything() -> None:
+    ears = Ears()
+    with Robot(1, SIM, hears=(1,), observer=ears) as robot:
+        said = robot.say(5, 6)
+        wait_for(lambda: len(ears.received) == 2, "two messages")
+    assert [event.payload for event in ears.sent if isinstance(event, Accepted)] == said
+    assert [event.data for event in ears.sent if isinstance(event, SentPacket)] == ears.packets
+    assert [event.payload for event in ears.received if isinstance(event, Delivered)] == said
+    assert ears.times == sorted(ears.times)
+
+
+def test_both_blocks_take_a_middleware_that_is_handed_over() -> None:
+    graph = MemoryMiddleware(domain_id=domain(1))
+    link = RobotLink(config(1, SIM), middleware=graph)
+    assert link.source.middleware is link.sink.middleware is graph
+    link.stop()
+    graph.discover()  # still open: it is not the link's
+    graph.close()
+
+
+def test_one_participant_serves_both_blocks_of_one_graph() -> None:
+    with Robot(1, SIM) as robot:
+        assert robot.link.source.middleware is robot.link.sink.middleware
+    with Robot(1, SIM, ros_sink={"domain_id": domain(5)}) as robot:
+        assert robot.link.source.middleware is not robot.link.sink.middleware
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"phy": {"name": "direct"}, "channel": {"snr_db": 3}}, "channel.snr_db"),
+        ({"phy": {"name": "psk", "sample_rate": 1e6, "options": {"sp": 3}}}, "unknown key sp"),
+        ({"front_end": {"name": "sim", "gain": 3}}, "front_end sim: unknown key gain; known are guard"),
+        ({"front_end": {"name": "sim", "guard": -1}}, "guard = -1"),
+        ({"ros_sink": {"middleware": "bag"}}, "middleware = 'bag'"),
+        ({"ros_sink": {"namespace_format": "/robot_{src_id}"}}, "loop"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused_and_nothing_stays_open(values: dict[str, Any], said: str) -> None:
+    front_end = values.pop("front_end", SIM)
+    with pytest.raises(ConfigError, match=said):
+        RobotLink(config(1, front_end, **values))
+    # A source left behind would still be in the way of a sink that publishes its topic.
+    RobotLink(config(1, SIM)).stop()
+
+
+def test_a_registry_that_is_not_there_is_named() -> None:
+    with pytest.raises(RegistryError, match=r"nothing\.csv"):
+        RobotLink(config(1, SIM, registry="nothing.csv"))
+
+
+def test_it_stops_at_any_moment_and_leaves_no_thread() -> None:
+    link = RobotLink(config(1, SIM))
+    link.stop()
+    for _ in range(3):
+        with Robot(1, SIM, hears=(1,)) as robot:
+            robot.say(*range(20))
+        robot.link.stop()
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("gr-ros2")]

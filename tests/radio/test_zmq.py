@@ -1,0 +1,127 @@
+"""Samples over ZeroMQ: two robots, one that is killed, and messages that are none of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("zmq", reason="needs pyzmq")
+
+import zmq
+
+from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.zmq import HEADER, MAGIC
+from tests.middleware.support import wait_for
+from tests.radio.robots import RATE, Robot, config
+
+
+@pytest.fixture
+def ends(tmp_path: Path) -> list[dict[str, Any]]:
+    """Front end settings of robots 1 and 2."""
+    addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
+    return [{"name": "zmq", "bind": own, "connect": [other]} for own, other in (addresses, reversed(addresses))]
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Iterator[Any]:
+    """A socket at the address of robot 2."""
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.linger = 0
+        socket.bind(f"ipc://{tmp_path}/2")
+        yield socket
+
+
+def counters(robot: Robot) -> dict[str, int]:
+    found: dict[str, int] = robot.link.stats()["front_end"]
+    return found
+
+
+def hear_each_other(robots: list[Robot]) -> None:
+    """Wait until each hears what the other says from now on: a subscriber needs a moment to find its publisher."""
+    for robot, other in (robots, reversed(robots)):
+        before = len(other.heard)
+
+        def heard(robot: Robot = robot, other: Robot = other, before: int = before) -> bool:
+            robot.say(1000)
+            return len(other.heard) > before
+
+        wait_for(heard, f"robot {other.link.config.name} to hear")
+
+
+def test_both_ways_at_once_and_nobody_takes_its_own(ends: list[dict[str, Any]]) -> None:
+    with Robot(1, ends[0], hears=(1, 2)) as one, Robot(2, ends[1], hears=(1, 2)) as two:
+        hear_each_other([one, two])
+        for robot, other in ((one, two), (two, one)):
+            wait_for(lambda: one.silent and two.silent, "silence")
+            said = robot.say(*range(20))
+            wait_for(lambda: other.heard[-20:] == said, "every message")  # noqa: B023 - called at once
+        assert one.link.sink.config.robot_id == 1
+        for robot in (one, two):
+            assert counters(robot)["missed"] == counters(robot)["malformed"] == counters(robot)["restarts"] == 0
+            assert counters(robot)["bursts_out"] == robot.link.stats()["packets"]["out"]
+
+
+def test_a_robot_that_comes_again_is_heard_again(ends: list[dict[str, Any]]) -> None:
+    with Robot(1, ends[0], hears=(2,)) as one:
+        for times in range(3):
+            with Robot(2, ends[1], hears=(1,)) as two:
+                hear_each_other([one, two])
+                wait_for(lambda: counters(one)["restarts"] == times, "the new sender")  # noqa: B023 - called at once
+
+
+def test_messages_that_are_none_of_ours_are_counted_and_dropped(
+    ends: list[dict[str, Any]], stranger: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    def header(number: int, rate: float = RATE, magic: bytes = MAGIC) -> bytes:
+        return HEADER.pack(magic, 77, number, rate)
+
+    with Robot(1, ends[0]) as robot:
+
+        def arrives(message: bytes, name: str, count: int) -> None:
+            def seen() -> bool:
+                stranger.send(message)
+                return counters(robot)[name] >= count
+
+            wait_for(seen, name)
+
+        for number, junk in enumerate((b"", b"hello", header(0, magic=b"GRI9"), header(0) + b"odd")):
+            arrives(junk, "malformed", counters(robot)["malformed"] + 1)
+            assert counters(robot)["bursts_in"] == 0, number
+        arrives(header(0, 3e6), "wrong_rate", 1)
+        noise = np.random.default_rng(1).normal(size=100).astype("<f4").tobytes()
+        arrives(header(0) + noise, "bursts_in", 1)
+        missed = counters(robot)["missed"]
+        arrives(header(10**6) + noise, "missed", missed + 1)
+        assert counters(robot)["restarts"] == 0
+        assert robot.link.stats()["packets"]["in"] == 0
+    assert "a peer sends 3e+06 samples/s, not 2e+06; set the same phy at both ends" in caplog.text
+
+
+def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str, Any]]) -> None:
+    with Robot(1, {**ends[0], "bind": "tcp://127.0.0.1:*"}):
+        pass
+    for change, said in (
+        ({"bind": "tcp://192.0.2.1:5555"}, "bind = 'tcp://192.0.2.1:5555': Cannot assign.*free port"),
+        ({"bind": "5555"}, "bind = '5555'.*tcp://HOST:PORT"),
+        ({"connect": ["udp://1.2.3.4"]}, "connect = 'udp://1.2.3.4'.*another robot's address"),
+    ):
+        with pytest.raises(RadioError, match=said):
+            RobotLink(config(1, {**ends[0], **change}))
+    with (
+        Robot(1, {**ends[0], "bind": "tcp://127.0.0.1:45671"}),
+        pytest.raises(RadioError, match="Address already in use"),
+    ):
+        RobotLink(config(2, {**ends[0], "bind": "tcp://127.0.0.1:45671"}))
+
+
+def test_it_needs_samples_and_addresses(ends: list[dict[str, Any]]) -> None:
+    with pytest.raises(ConfigError, match="phy direct has no samples"):
+        RobotLink(config(1, ends[0], phy={"name": "direct"}))
+    with pytest.raises(ConfigError, match="bind is missing; front_end zmq: connect is missing"):
+        RobotLink(config(1, {"name": "zmq"}))

@@ -1,0 +1,82 @@
+"""A wheel of the tree, in an environment of its own: everything that is no Python came along and is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAM = """
+import json, sys
+from pathlib import Path
+import gr_ros2
+from gr_ros2.cli.wireshark import DISSECTOR
+from gr_ros2.compression.dictionary import shipped
+from gr_ros2.settings_file import BUILTIN_DIR
+from gr_ros2.grc_path import example, grc_path
+print(json.dumps({
+    "package": str(Path(gr_ros2.__file__).parent),
+    "blocks": sorted(path.name for path in grc_path().iterdir()),
+    "examples": sorted(path.name for path in example("topics.csv").parent.iterdir()),
+    "scenarios": sorted(path.name for path in BUILTIN_DIR.iterdir()),
+    "dissector": DISSECTOR.read_text(),
+    "dictionary": shipped().number,
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of an environment with the wheel in it; what it depends on comes from this environment."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "build", "results", "__pycache__", "*.egg-info"))
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(folder)]
+    subprocess.run([*build, str(source)], check=True, capture_output=True)
+    (wheel,) = folder.glob("gr_ros2-*.whl")
+    environment = folder / "environment"
+    venv.create(environment, with_pip=False, system_site_packages=True)
+    python = environment / "bin" / "python"
+    site = subprocess.run(
+        [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps"]
+    subprocess.run([*install, str(wheel)], check=True, capture_output=True)
+    # After its own packages, so that ours is the wheel's and not the tree's.
+    (Path(site) / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return environment
+
+
+def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
+    python = installed / "bin" / "python"
+    # Isolated and elsewhere: the tree is not on its path.
+    done = subprocess.run([python, "-I", "-c", PROGRAM], cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout)
+    assert found["package"].startswith(str(installed))
+    package = ROOT / "gr_ros2"
+
+    def tracked(folder: str) -> list[str]:
+        return sorted(path.name for path in (package / folder).iterdir() if path.name != "__pycache__")
+
+    for name, folder in {"blocks": "grc", "examples": "examples", "scenarios": "scenarios"}.items():
+        assert found[name] == tracked(folder), folder
+    assert found["dissector"] == (package / "wireshark" / "gr_ros2.lua").read_text()
+    assert found["dictionary"] > 0
+
+
+def test_its_command_runs(installed: Path, tmp_path: Path) -> None:
+    command = [installed / "bin" / "gr-ros2"]
+    listed = subprocess.run([*command, "scenarios"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert "paper-ofdm-paced" in listed
+    path = subprocess.run([*command, "grc-path"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert path.strip().startswith(str(installed))
