@@ -15,10 +15,10 @@ from rich.console import Console
 
 from gr_ros2.cli.doorbell import Doorbell, neighbours, ring
 from gr_ros2.errors import BackendMissingError, ConfigError, RunError
-from gr_ros2.experiment.watch import Audience
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard
+    from gr_ros2.experiment.watch import Audience
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
@@ -43,6 +43,8 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
     :raises ConfigError: for a place where nothing can be served
     :raises BackendMissingError: when the package that draws it is not installed
     """
+    from gr_ros2.experiment.watch import Audience
+
     seen = Audience(instruments or where is not None)
     urls: list[str] = []
     with ExitStack() as dashboards:

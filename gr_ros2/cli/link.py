@@ -7,15 +7,20 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
 from rich.status import Status
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.pcap import PacketCapture
+from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.radio.config import load_link
+
+if TYPE_CHECKING:
+    from gr_ros2.experiment.watch import LiveRun
+    from gr_ros2.radio.link import RobotLink
 
 _SHOW_S = 0.5
 _LOG_S = 10.0
@@ -26,26 +31,49 @@ _LOG_S = 10.0
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
-@click.option("--pcap", type=click.Path(path_type=Path), help="Write every packet to this file, for Wireshark.")
-def link(config: Path, duration: float | None, overrides: tuple[str, ...], pcap: Path | None) -> None:
+@dashboard_option
+@pcap_option
+def link(
+    config: Path, duration: float | None, overrides: tuple[str, ...], dashboard: str | None, pcap: Path | None
+) -> None:
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
     settings = load_link(config, overrides)
-    from gr_ros2.radio.link import RobotLink  # needs GNU Radio, which a wrong setting must not wait for
+    # These need GNU Radio, which a wrong setting must not wait for.
+    from gr_ros2.experiment.watch import Fanout
+    from gr_ros2.radio.link import RobotLink
 
     console = make_console()
     # A service manager's SIGTERM ends a link as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with ExitStack() as stack:
-        capture = None if pcap is None else stack.enter_context(PacketCapture(pcap))
-        running = RobotLink(settings, observer=capture)
+    with audience(dashboard, console, settings.name) as onlookers, capture(pcap) as captures, ExitStack() as stack:
+        running = RobotLink(settings, observer=Fanout([onlookers, *captures]), instrumented=True)
         stack.callback(running.stop)
         try:
             running.start()
+            onlookers.run_started(_live(running))
             console.print(_opening(running), soft_wrap=True)
             _show(console, running, duration)
         except KeyboardInterrupt:
             pass  # how a link ends
+        onlookers.run_ended(None)
         console.print(status_line(running.stats()), soft_wrap=True)
+
+
+def _live(running: RobotLink) -> LiveRun:
+    """What onlookers see: this end alone, so no ledger."""
+    from gr_ros2.experiment.watch import LiveRun
+
+    source = running.source
+    return LiveRun(
+        name=running.config.name,
+        duration_s=0.0,
+        packet_len=running.config.packet_len,
+        registry=running.registry,
+        topics={(source.src_id, topic.topic_id): name for name, topic in source.subscribed.items()},
+        sources={source.src_id: source},
+        links=(running.radio,),
+        ledger=None,
+    )
 
 
 def _opening(running: Any) -> str:

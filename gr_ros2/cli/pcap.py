@@ -14,13 +14,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import click
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.watch import LiveRun
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+
+if TYPE_CHECKING:
+    from gr_ros2.experiment.result import Result
+    from gr_ros2.experiment.watch import LiveRun
 
 LINK_TYPE = 147
 """DLT_USER0: ours to give a meaning; the dissector does."""

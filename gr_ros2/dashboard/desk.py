@@ -20,9 +20,8 @@ from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import Floats
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.watch import LiveRun
+from gr_ros2.experiment.watch import LiveLink, LiveRun
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
-from gr_ros2.phy.loopback import LoopbackLink
 
 TICK_S = 0.5
 """s between two snapshots."""
@@ -73,7 +72,7 @@ class Desk:
             run.packet_len,
             name=run.name,
             duration_s=run.duration_s,
-            ledger=run.ledger.rows,
+            ledger=None if run.ledger is None else run.ledger.rows,
             tick_s=TICK_S,
         )
         self._run = run
@@ -152,7 +151,7 @@ class Desk:
         """Loss of whole packets on every link, 0..1."""
         self._change(lambda link: link.set_packet_loss(probability))
 
-    def _change(self, change: Callable[[LoopbackLink], None]) -> None:
+    def _change(self, change: Callable[[LiveLink], None]) -> None:
         self.refused = ""
         try:
             run = self._run

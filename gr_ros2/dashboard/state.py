@@ -158,10 +158,10 @@ class DashboardState:
                 self._packets["rejected"] += 1
 
     def finish(self, result: Result | None) -> None:
-        """The run is over; None where it failed."""
+        """It is over; None where a run failed, or where there is nothing but one end of a link."""
         with self._lock:
             self._result = result
-            self._phase = "ended" if result is not None else "failed"
+            self._phase = "failed" if result is None and self._ledger is not None else "ended"
 
     # -- asking -------------------------------------------------------------------------------------------------
 

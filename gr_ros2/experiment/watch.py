@@ -11,24 +11,45 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from gr_ros2.config import ChannelConfig
 from gr_ros2.experiment.ledger import Ledger
 from gr_ros2.experiment.result import Result
 from gr_ros2.gr import RosSource
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
-from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy import Phy
+from gr_ros2.phy.loopback import LinkCounts
+from gr_ros2.phy.tap import Samples
 from gr_ros2.registry import Registry
+
+
+class LiveLink(Protocol):
+    """What can be seen of a flowgraph, and changed in it: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
+
+    The setters raise a GrRos2Error where that cannot be changed.
+    """
+
+    @property
+    def phy(self) -> Phy: ...
+    @property
+    def channel(self) -> ChannelConfig: ...
+    def counts(self) -> LinkCounts: ...
+    def samples(self) -> Samples | None: ...
+    def symbols(self) -> Samples | None: ...
+    def set_snr_db(self, snr_db: float | None) -> None: ...
+    def set_frequency_offset(self, frequency_offset: float) -> None: ...
+    def set_packet_loss(self, probability: float) -> None: ...
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """A run whose link has been built.
+    """A run, or one robot's end of a link, whose flowgraph has been built.
 
     :param name: of the scenario
     :param duration_s: s during which messages will be submitted; 0 = until a bag ends
     :param topics: absolute name at the source, by source id and topic id
     :param sources: sending block by source id
     :param links: every direction's flowgraph
-    :param ledger: where every message sent so far stands
+    :param ledger: where every message sent so far stands; None where only one end of the link is here
     :param clock: s, the clock of the run's events
     """
 
@@ -38,8 +59,8 @@ class LiveRun:
     registry: Registry
     topics: Mapping[tuple[int, int], str]
     sources: Mapping[int, RosSource]
-    links: Sequence[LoopbackLink]
-    ledger: Ledger
+    links: Sequence[LiveLink]
+    ledger: Ledger | None
     clock: Callable[[], float] = time.monotonic
 
 

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -21,17 +20,16 @@ from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError, PhyError
-from gr_ros2.gr import AirtimeGate, RosSink, RosSource
+from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.channel import Channel, PacketLoss
 from gr_ros2.phy.threads import begin
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.front_end import FrontEnd
-from gr_ros2.radio.sigmf import Recording, SigmfRecorder
+from gr_ros2.radio.radio import Radio
 
 _log = logging.getLogger(__name__)
 
@@ -56,6 +54,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
     :param middleware: an open one for both blocks, closed by who opened it; None opens what the configuration says
     :param observer: told of everything that is sent and received
     :param clock: s, monotonic, of events and blocks
+    :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
     :raises ConfigError: when the parts do not fit each other
     :raises MiddlewareError: when the ROS graph cannot be joined
     :raises RadioError: when the front end cannot be opened
@@ -68,6 +67,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         middleware: Middleware | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
+        instrumented: bool = False,
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", catch_exceptions=True)
         self.config = config
@@ -75,6 +75,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         self._clock = clock
         self._started: float | None = None
         self._running = False
+        self._instrumented = instrumented
         self._stack = ExitStack()
         try:
             self._open(middleware, observer)
@@ -87,9 +88,10 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         self.phy: Phy = PHY.load(config.phy.name)(config.packet_len, config.phy.sample_rate, **config.phy.options)
         self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
         self._stack.callback(self.front_end.close)
-        self.phy.check_channel(config.channel)
-        if self.front_end.has_radio and config.channel != type(config.channel)():
-            raise ConfigError(f"channel: front_end {self.front_end.name} has a real one; leave channel out")
+        self.radio = Radio(
+            self.phy, self.front_end, channel=config.channel, record=config.record, instrumented=self._instrumented
+        )
+        self._stack.callback(self.radio.close)
         graphs = self._graphs(middleware)
         self.source = RosSource(
             self.registry,
@@ -108,7 +110,10 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
             **_values(self._sink_config()),
         )
         self._stack.callback(self.sink.close)
-        self._connect()
+        self.source.use_credit()
+        self.msg_connect(self.source, "pdus", self.radio, "pdus")
+        self.msg_connect(self.radio, "credit", self.source, "credit")
+        self.msg_connect(self.radio, "pdus", self.sink, "pdus")
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
             queue_depth = config.ros_source.queue_depth
@@ -149,54 +154,6 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
             return replace(sink, robot_id=self.config.ros_source.src_id())
         return sink
 
-    def _connect(self) -> None:
-        self._gate = AirtimeGate(self.front_end.airtime(), early=self.front_end.early())
-        self.source.use_credit()
-        self.msg_connect(self.source, "pdus", self._gate, "pdus")
-        self.msg_connect(self._gate, "credit", self.source, "credit")
-        self._transmitter: Any = None
-        self._receiver: Any = None
-        last: Any = self._gate
-        if self.phy.has_samples:
-            last = self._connect_samples()
-        self._loss = PacketLoss(self.config.channel) if self.config.channel.loses_packets else None
-        if last is not None and self._loss is not None:
-            self.msg_connect(last, "pdus", self._loss, "pdus")
-            last = self._loss
-        if last is not None:
-            self.msg_connect(last, "pdus", self.sink, "pdus")
-
-    def _connect_samples(self) -> Any:
-        """Transmitter to front end, front end to receiver; the receiver, None where nothing is received."""
-        front_end, channel = self.front_end, self.config.channel
-        front_end.wire(self)
-        if front_end.sink is not None:
-            self._transmitter = self.phy.transmitter()
-            # A hier block with message ports holds itself, and shared memory segments of which the system has few.
-            self._stack.callback(self._transmitter.disconnect_all)
-            self.msg_connect(self._gate, "pdus", self._transmitter, "pdus")
-            self.connect(self._transmitter, front_end.sink)
-        if front_end.source is None:
-            return None
-        self._receiver = self.phy.receiver()
-        self._stack.callback(self._receiver.disconnect_all)
-        last = front_end.source
-        # The channel stops tags too: the transmitter's would overrule what the receiver reads in a packet's header.
-        if front_end.loops_back or channel.on_samples():
-            faded = Channel(channel, self.phy)
-            self.connect(last, faded)
-            last = faded
-        self.connect(last, self._receiver)
-        if self.config.record:
-            recorder = SigmfRecorder(Path(self.config.record), self._recording())
-            self._stack.callback(recorder.close)
-            self.connect(last, recorder)
-        return self._receiver
-
-    def _recording(self) -> Recording:
-        frequency = getattr(self.front_end.options, "receive_frequency", None)
-        return Recording(self.phy.sample_rate, frequency, f"{self.config.name}: {self.phy.name}, {self.front_end.name}")
-
     def start(self, max_noutput_items: int = 10_000_000) -> None:
         """Begin sending and receiving.
 
@@ -219,6 +176,8 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
             self._running = False
             super().stop()
             self.wait()
+            # A device is let go with its blocks, which the flowgraph would hold for as long as it is held itself.
+            self.disconnect_all()
         self._stack.close()
 
     def check(self) -> None:
@@ -236,19 +195,19 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
 
     def stats(self) -> dict[str, Any]:
         """A snapshot: both blocks, packets to and from the air, the PHY, and what the front end counts."""
-        phy = self.phy
+        phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             "source": self.source.stats(),
             "sink": self.sink.stats(),
             "packets": {
-                "out": self._gate.passed,
-                "backlog": self._gate.backlog,
-                "refused": int(getattr(self._transmitter, "refused", 0)),
+                "out": counts.passed,
+                "backlog": counts.backlog,
+                "refused": self.radio.refused,
                 "in": self.sink.handled,
-                "damaged": int(getattr(self._receiver, "damaged", 0)),
-                "dropped": {} if self._loss is None else dict(self._loss.dropped),
+                "damaged": self.radio.damaged,
+                "dropped": dict(counts.losses),
             },
             "phy": {
                 "name": phy.name,

@@ -160,7 +160,7 @@ def test_a_device_that_falls_silent_ends_the_link(driver: Path, tmp_path: Path) 
     )
     command = [sys.executable, "-m", "gr_ros2.cli.main", "link", str(path), "--duration", "60"]
     done = subprocess.run(command, env=with_driver(driver), capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 1
+    assert done.returncode == 1, done.stderr
     assert "front_end soapy: args = 'driver=loopback,dies=0.2': no samples for 3 s" in done.stderr.splitlines()[-1]
 
 
