@@ -1,4 +1,7 @@
-"""`python -m bench [NAME …]`: measure, print a table, exit with 1 if a target was missed."""
+"""`python -m bench [NAME …]`: measure, print a table, exit with 1 if a target was missed.
+
+Without names everything but what takes very long.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,8 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
+LONG = ("drive", "sweep")
+"""Many minutes: only when named."""
 
 
 def main(names: list[str]) -> int:
@@ -36,7 +41,7 @@ def main(names: list[str]) -> int:
     if not console.is_terminal:
         console = Console(highlight=False, width=160)
     rows: list[Row] = []
-    for name in names or BENCHMARKS:
+    for name in names or [name for name in BENCHMARKS if name not in LONG]:
         begin = time.monotonic()
         with console.status(f"{name} …"):
             rows += getattr(import_module(BENCHMARKS[name]), name)()

@@ -43,7 +43,7 @@ COMMANDS: Commands = {
     "compare": ("gr_ros2.cli.compare:compare", "Runs side by side: a table, and their curves in one figure."),
     "race": ("gr_ros2.cli.race:race", "gr-ros2, DDS and Zenoh over the same radio, side by side (root)."),
     "ablate": ("gr_ros2.cli.ablate:ablate", "What each part is worth: a scenario with one part off at a time."),
-    "dashboard": ("gr_ros2.cli.dashboard:dashboard", "Open the live page of a run started with --dashboard."),
+    "dashboard": ("gr_ros2.cli.dashboard:dashboard", "Open the live page of a run or link that goes on now."),
     "scenarios": ("gr_ros2.cli.scenarios:scenarios", "List the built-in scenarios."),
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),

@@ -80,7 +80,8 @@ class Desk:
 
     def run_ended(self, result: Result | None) -> None:
         if self._state is not None:
-            self._state.finish(result)
+            whole = self._run is not None and self._run.ledger is not None
+            self._state.finish(result, failed=result is None and whole)
             self.tick()
         with self._ticking:
             self._run = None  # its flowgraph may go

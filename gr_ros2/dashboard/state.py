@@ -157,11 +157,11 @@ class DashboardState:
                 self._packets[f"rejected_{event.error.kind}"] += 1
                 self._packets["rejected"] += 1
 
-    def finish(self, result: Result | None) -> None:
-        """It is over; None where a run failed, or where there is nothing but one end of a link."""
+    def finish(self, result: Result | None, *, failed: bool = False) -> None:
+        """It is over; without a result where a run failed, and where there was one end of a link only."""
         with self._lock:
             self._result = result
-            self._phase = "failed" if result is None and self._ledger is not None else "ended"
+            self._phase = "failed" if failed else "ended"
 
     # -- asking -------------------------------------------------------------------------------------------------
 

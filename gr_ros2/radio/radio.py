@@ -109,7 +109,8 @@ class Radio(gr.hier_block2):  # type: ignore[misc]
     def close(self) -> None:
         """Give back device, sockets, files and memory. The flowgraph has stopped, or never ran. Idempotent."""
         # A hier block with message ports holds itself, and shared memory segments of which the system has few.
-        for hier_block in (self._transmitter, self._receiver):
+        # And a device is let go with its blocks only.
+        for hier_block in (self._transmitter, self._receiver, self):
             if hier_block is not None:
                 hier_block.disconnect_all()
         if self._recorder is not None:

@@ -86,13 +86,19 @@ def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     assert "choose another port" in line
 
 
+MEMORY = ("--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory")
+
+
 @pytest.mark.usefixtures("alone")
-def test_beside_a_run_that_was_started_without(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("what", ["run", "link"])
+def test_beside_what_was_started_without(what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    memory = ["--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory"]
-    command = [sys.executable, "-m", "gr_ros2.cli.main", "run", "paper-direct", "--duration", "600", *memory]
-    with subprocess.Popen([*command, "--out", str(tmp_path / "out")], stdout=subprocess.DEVNULL) as running:
+    config = tmp_path / "link.yaml"
+    config.write_text("registry: odom\nros_source: {namespace: /robot_1}\nphy: {name: direct}\n")
+    started = {"run": ["run", "paper-direct", "--out", str(tmp_path / "out")], "link": ["link", str(config)]}[what]
+    command = [sys.executable, "-m", "gr_ros2.cli.main", *started, "--duration", "600", *MEMORY]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
         try:
             assert run(["dashboard", "0", "--wait", "60", "--no-browser"]) == 0
             url = capsys.readouterr().out.strip()

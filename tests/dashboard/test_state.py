@@ -94,7 +94,7 @@ def test_a_run_that_failed_keeps_what_was_seen() -> None:
     state = make()
     lossy_run(1, state)
     before = state.tick(60.0)
-    state.finish(None)
+    state.finish(None, failed=True)
     after = state.tick(60.0)
     assert after.phase == "failed"
     assert after.topics == before.topics
