@@ -75,6 +75,23 @@ def test_a_sweep_survives_the_loss_of_a_worker(tmp_path: Path, cluster: Any) -> 
     assert outcome.results[place].topics == run_scenario(robbed).result.topics
 
 
+def test_a_worker_that_has_run_many_flowgraphs_makes_room_for_another(tmp_path: Path, cluster: Any) -> None:
+    def patience(runs: int) -> int:
+        from gr_ros2.experiment.sweep import cluster as there
+
+        there.RUNS_PER_PROCESS = runs
+        return os.getpid()
+
+    with distributed.Client(cluster) as client:
+        before = set(client.run(patience, 2).values())
+        radio = {"duration_s": 0.2, "phy": {"name": "psk", "sample_rate": 1e6}}
+        made = plan(tmp_path, time="samples", set=radio, grid={"seed": list(range(6))}, repetitions=1)
+        outcome = run_sweep(made, tmp_path / "out", scheduler=cluster.scheduler_address)
+        assert (len(outcome.results), outcome.failures) == (6, ())
+        wait_for(lambda: len(client.nthreads()) == 2, "the successor")
+        assert set(client.run(os.getpid).values()) != before
+
+
 def test_a_run_that_takes_its_process_down_fails_alone_and_is_tried_again(tmp_path: Path) -> None:
     made = plan(tmp_path, repetitions=3)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}), local_cluster(2) as cluster:

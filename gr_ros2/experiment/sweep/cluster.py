@@ -12,13 +12,14 @@ import os
 import signal
 import tempfile
 from collections.abc import Generator, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import count
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, LocalCluster, as_completed, get_worker
 from distributed.scheduler import KilledWorker
 
 from gr_ros2 import __version__
@@ -28,6 +29,9 @@ from gr_ros2.experiment.runner import run_scenario
 from gr_ros2.experiment.scenario import Scenario, dump, scenario_from
 from gr_ros2.experiment.sweep.store import without_registry
 from gr_ros2.settings_file import BUILTIN_DIR, find_registry
+
+RUNS_PER_PROCESS = 200
+"""Each flowgraph leaves about 4 segments of shared memory with its process, of which a system has 4096."""
 
 _CONNECT_S = 15.0
 _WORKERS_S = 60.0
@@ -41,14 +45,14 @@ class Failed:
 
 
 @contextmanager
-def local_cluster(count: int) -> Iterator[LocalCluster]:
+def local_cluster(processes: int) -> Iterator[LocalCluster]:
     """Worker processes of one thread each, on this machine, reachable from this machine only.
 
     A worker that is lost is replaced.
     """
     with _deaf_to_ctrl_c():
         cluster = LocalCluster(
-            n_workers=count,
+            n_workers=processes,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
@@ -64,9 +68,9 @@ def local_cluster(count: int) -> Iterator[LocalCluster]:
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Client]:
+def local_workers(processes: int) -> Iterator[Client]:
     """As many processes of this machine."""
-    with local_cluster(count) as cluster, Client(cluster) as client:
+    with local_cluster(processes) as cluster, Client(cluster) as client:
         yield client
 
 
@@ -115,10 +119,23 @@ def run_one(values: Mapping[str, Any], version: str) -> Result | Failed:
         if version != __version__:
             raise ConfigError(f"a worker has gr-ros2 {__version__}, the sweep {version}; install the same")
         scenario = scenario_from({**values, "registry": find_registry(values["registry"], Path())})
+        _make_room(scenario)
         with alone_on_this_machine(scenario):
             return run_scenario(scenario).result
     except GrRos2Error as error:
         return Failed(str(error))
+
+
+_flowgraphs = count(1)
+
+
+def _make_room(scenario: Scenario) -> None:
+    """End a worker that has run many flowgraphs: Dask starts another in its place, and gives that the run."""
+    if scenario.time == "packets" or next(_flowgraphs) <= RUNS_PER_PROCESS:
+        return
+    with suppress(ValueError):  # not in a worker
+        get_worker()
+        os._exit(0)
 
 
 def _portable(scenario: Scenario) -> dict[str, Any]:
@@ -147,7 +164,7 @@ def _check_workers(client: Client, address: str) -> None:
             f"--scheduler {address}: has no workers; start one with: dask worker {address} --nthreads 1"
         ) from error
     threads = client.nthreads()
-    crowded = next((worker for worker, count in threads.items() if count > 1), None)
+    crowded = next((worker for worker, number in threads.items() if number > 1), None)
     if crowded is not None:
         raise ConfigError(
             f"--scheduler {address}: worker {crowded} has {threads[crowded]} threads, and a flowgraph wants a process "
