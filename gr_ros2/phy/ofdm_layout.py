@@ -17,6 +17,8 @@ from gnuradio import digital
 from gnuradio.digital import ofdm_txrx
 from numpy.typing import NDArray
 
+from gr_ros2.errors import ConfigError
+
 BITS = {"bpsk": 1, "qpsk": 2, "8psk": 3, "16qam": 4, "64qam": 6}
 """Payload bits on one carrier of one symbol, by modulation."""
 _SCRAMBLER = {"mask": 0x8A, "seed": 0x7F, "len": 7}
@@ -28,6 +30,8 @@ CRC_LEN = 4
 _MAX_FRAME_LEN = 4095
 """The stock header counts the bytes of its frame, CRC-32 included, in 12 bits."""
 _HEADER_SEED = 0x6F
+_HEADER_BITS = 32
+"""Bits of the header, one on a carrier."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,32 @@ class Layout:
     :param cp_len: samples of the cyclic prefix
     :param modulation: of the payload, a name of ``BITS``
     :param scramble: header and payload bits
+    :param edge: outermost carrier used, either side of the middle one, which is not; None = 26 of 64
+    :param pilot_places: carriers of the pilots; None = 7 and 21 either side of 64, spread over more as far
+    :raises ConfigError: for carriers that cannot be, or too few of them for data
     """
 
     fft_len: int
     cp_len: int
     modulation: str
     scramble: bool
+    edge: int | None = None
+    pilot_places: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        outermost, places = max(self.data[0]), self.pilots[0]
+        if outermost >= self.fft_len // 2:
+            raise ConfigError(f"phy ofdm: carriers = {outermost}: at most {self.fft_len // 2 - 1} with this fft_len")
+        for place in places:
+            if not 0 < abs(place) <= outermost:
+                raise ConfigError(f"phy ofdm: pilots: {place} is not one of the carriers 1 to {outermost} either side")
+        if len(set(places)) < max(len(places), 2):
+            raise ConfigError(f"phy ofdm: pilots = {places}: at least two are needed, each once")
+        if len(self.data[0]) < _HEADER_BITS:
+            raise ConfigError(
+                f"phy ofdm: {len(self.data[0])} carriers are left for data, the header needs {_HEADER_BITS}; "
+                "use more carriers, or fewer pilots"
+            )
 
     @property
     def symbol_samples(self) -> int:
@@ -77,25 +101,27 @@ class Layout:
         size = len(self.data[0])
         fields = (length % (_MAX_FRAME_LEN + 1)).to_bytes(2, "little") + bytes(2)
         value = int.from_bytes(fields[:2], "little") | _crc8(fields) << 24
-        bits = np.array([value >> place & 1 if place < 32 else 0 for place in range(size)], np.uint8)
+        bits = np.array([value >> place & 1 if place < _HEADER_BITS else 0 for place in range(size)], np.uint8)
         return bits ^ _register(_HEADER_SEED if self.scramble else 0, size)
 
     @property
     def pilots(self) -> tuple[tuple[int, ...], ...]:
-        """Pilot carriers: 7 and 21 either side of 64, spread over more as far."""
+        """Pilot carriers."""
+        if self.pilot_places is not None:
+            return (tuple(sorted(self.pilot_places)),)
         scale = self.fft_len // 64
         return (tuple(place * scale for place in (-21, -7, 7, 21)),)
 
     @property
     def data(self) -> tuple[tuple[int, ...], ...]:
-        """Data carriers: 26 either side of 64 without pilots and the middle one."""
-        edge = 26 * self.fft_len // 64
+        """Data carriers: all up to the edge without pilots and the middle one."""
+        edge = 26 * self.fft_len // 64 if self.edge is None else self.edge
         return (tuple(place for place in range(-edge, edge + 1) if place and place not in self.pilots[0]),)
 
     @property
     def pilot_symbols(self) -> tuple[tuple[int, ...], ...]:
         """What the pilots carry."""
-        return ((1, 1, 1, -1),)
+        return (tuple((1, 1, 1, -1)[place % 4] for place in range(len(self.pilots[0]))),)
 
     def sync_words(self) -> list[list[complex]]:
         """Those of the stock blocks."""

@@ -27,6 +27,8 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("ofdm", {"fft_len": 256, "scramble": True}),
     ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "64qam"}),
     ("ofdm", {"gap": 16, "fec": "cc"}),
+    ("ofdm", {"carriers": 30, "pilots": (-25, -9, 9, 25)}),
+    ("ofdm", {"carriers": 20, "pilots": (-10, 10), "detection_threshold": "stock"}),
     ("ofdm", {"detection_threshold": "stock", "gap": 112}),
     ("gfsk", {"sps": 2, "bt": 0.3, "gap": 16}),
     ("gfsk", {"sps": 8, "bt": 1.0, "fec": "polar"}),

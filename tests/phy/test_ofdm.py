@@ -121,6 +121,18 @@ def test_ours_and_the_stock_blocks_understand_each_other_and_send_the_same(
     assert deliver(stock, ours, ChannelConfig()) == ours.packets
 
 
+def test_other_carriers_and_pilots_are_those_of_the_stock_blocks_too() -> None:
+    settings = {"carriers": 29, "pilots": (-20, -5, 12, 28), "payload_modulation": "qpsk", "gap": 2000}
+    own, stock = OfdmPhy(65, 1e6, **settings), OfdmPhy(65, 1e6, **settings, **STOCK)
+    ours, theirs = record(own, 3), record(stock, 3)
+    assert own.frame_bits() == OfdmPhy(65, 1e6, payload_modulation="qpsk").frame_bits()
+    assert own.airtime_samples() <= OfdmPhy(65, 1e6, payload_modulation="qpsk", gap=2000).airtime_samples()
+    first = own.airtime_samples()
+    assert np.allclose(ours.samples[:first], theirs.samples[:first], atol=1e-4)
+    assert deliver(own, theirs, ChannelConfig()) == ours.packets
+    assert deliver(stock, ours, ChannelConfig()) == ours.packets
+
+
 @pytest.mark.parametrize("carriers", [-4.7, -3.0, -0.9, 0.5, 1.0, 2.3, 4.7])
 def test_a_carrier_offset_of_up_to_four_carriers(carriers: float) -> None:
     phy = OfdmPhy(64, 1e6, payload_modulation="qpsk")
@@ -165,6 +177,11 @@ def test_nothing_is_lost_without_noise_wherever_a_packet_begins() -> None:
         ({**STOCK, "gap": 111}, "gap = 111"),
         ({**STOCK, "fec": "cc"}, "fec = 'cc'"),
         ({"fec": "turbo"}, "fec = 'turbo'"),
+        ({"carriers": 32}, "carriers = 32: at most 31"),
+        ({"carriers": 17, "pilots": (-9, -3, 3, 9)}, "30 carriers are left for data"),
+        ({"pilots": (0, 7)}, "pilots: 0 is not"),
+        ({"pilots": (-27, 7)}, "pilots: -27 is not"),
+        ({"pilots": (7, 7)}, r"pilots = \(7, 7\)"),
     ],
 )
 def test_a_wrong_option_is_named(options: dict[str, Any], named: str) -> None:
