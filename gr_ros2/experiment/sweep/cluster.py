@@ -19,7 +19,8 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, LocalCluster, as_completed, get_worker
+from distributed import Client, LocalCluster, as_completed, get_worker, wait
+from distributed.client import FuturesCancelledError
 from distributed.scheduler import KilledWorker
 
 from gr_ros2 import __version__
@@ -106,6 +107,10 @@ def run_all(client: Client, scenarios: Mapping[str, Scenario]) -> Generator[tupl
     }
     try:
         for future in as_completed(list(futures)):
+            if future.status == "lost" and client.status == "running":
+                # The worker that had the result has gone, and another runs it again.
+                with suppress(FuturesCancelledError):
+                    wait(future)
             yield futures[future], _outcome(future)
             future.release()
     finally:
@@ -135,7 +140,7 @@ def _make_room(scenario: Scenario) -> None:
         return
     with suppress(ValueError):  # not in a worker
         get_worker()
-        os._exit(0)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _portable(scenario: Scenario) -> dict[str, Any]:
