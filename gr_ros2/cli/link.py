@@ -39,14 +39,14 @@ def link(
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
     settings = load_link(config, overrides)
     # These need GNU Radio, which a wrong setting must not wait for.
-    from gr_ros2.experiment.watch import Fanout
+    from gr_ros2.experiment.watch import EventSink, Fanout
     from gr_ros2.radio.link import RobotLink
 
     console = make_console()
     # A service manager's SIGTERM ends a link as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with audience(dashboard, console, settings.name) as onlookers, capture(pcap) as captures, ExitStack() as stack:
-        running = RobotLink(settings, observer=Fanout([onlookers, *captures]), instrumented=True)
+        running = RobotLink(settings, observer=Fanout[EventSink]([onlookers, *captures]), instrumented=True)
         stack.callback(running.stop)
         try:
             running.start()

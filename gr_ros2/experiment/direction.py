@@ -18,6 +18,7 @@ from gr_ros2.experiment.load import source_names
 from gr_ros2.experiment.scenario import Scenario
 from gr_ros2.experiment.watch import EventSink
 from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.ends import own_settings
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_topics
@@ -76,7 +77,7 @@ class Direction:
             middleware=self.input,
             observer=partial(ears.sender_event, self.src_id),
             seed=scenario.seed,
-            **_values(replace(scenario.ros_source, backpressure=backpressure)),
+            **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
         stack.callback(self.source.close)
         self.sink = RosSink(
@@ -84,7 +85,7 @@ class Direction:
             middleware=self.output,
             observer=lambda event: ears.receiver_event(event, time.monotonic()),
             packet_observer=lambda data: ears.packet_received(data, time.monotonic()),
-            **_values(scenario.ros_sink),
+            **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)
         self.sink.announce(self.src_id, self.topics.values())
@@ -132,10 +133,3 @@ class Direction:
         if not set(found) & set(self.topics):
             raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)
-
-
-def _values(config: SourceConfig | SinkConfig) -> dict[str, Any]:
-    """The settings of a block, without what is handed over as an object."""
-    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
-    del values["registry"], values["middleware"]
-    return values

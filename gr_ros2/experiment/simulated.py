@@ -24,7 +24,7 @@ from gr_ros2.experiment.recorder import Recorder
 from gr_ros2.experiment.result import Result
 from gr_ros2.experiment.scenario import Scenario, dump
 from gr_ros2.experiment.simulate import Landed, Reception, Step, Transmission, drop_packets, offered
-from gr_ros2.experiment.watch import Fanout, LiveRun, Watcher
+from gr_ros2.experiment.watch import EventSink, Fanout, LiveRun, Watcher
 from gr_ros2.link import Refused
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy import Phy
@@ -114,7 +114,7 @@ class _Clock:
 class _Direction:
     """Sender, air and receiver of one direction."""
 
-    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ears: Fanout) -> None:
+    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ears: EventSink) -> None:
         self.transmission = Transmission(scenario, registry, phy.airtime())
         self.reception = Reception(scenario, registry, ears)
         self._scenario, self._registry = scenario, registry

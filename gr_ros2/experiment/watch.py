@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.experiment.ledger import Ledger
@@ -93,56 +93,13 @@ class Watcher(EventSink, Protocol):
         """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
 
 
-class Audience:
-    """A watcher that passes everything on to whoever looks on at the moment: they may come while the run goes on.
-
-    Who comes late is told of the run, and from then on of every event.
-
-    :param instruments: see :class:`Watcher`; for everybody who may come
-    """
-
-    def __init__(self, instruments: bool = True) -> None:
-        self.instruments = instruments
-        self._lock = threading.Lock()
-        self._watchers: tuple[Watcher, ...] = ()
-        self._run: LiveRun | None = None
-
-    def add(self, watcher: Watcher) -> None:
-        """Let one more look on, from now."""
-        with self._lock:
-            if self._run is not None:
-                watcher.run_started(self._run)
-            self._watchers += (watcher,)
-
-    def run_started(self, run: LiveRun) -> None:
-        with self._lock:
-            self._run = run
-            for watcher in self._watchers:
-                watcher.run_started(run)
-
-    def run_ended(self, result: Result | None) -> None:
-        with self._lock:
-            self._run = None
-            for watcher in self._watchers:
-                watcher.run_ended(result)
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        for watcher in self._watchers:
-            watcher.sender_event(src_id, event)
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        for watcher in self._watchers:
-            watcher.packet_received(data, now)
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        for watcher in self._watchers:
-            watcher.receiver_event(event, now)
+_Sink = TypeVar("_Sink", bound=EventSink)
 
 
-class Fanout:
+class Fanout(Generic[_Sink]):
     """Hands every event to several, in their order."""
 
-    def __init__(self, sinks: Sequence[EventSink]) -> None:
+    def __init__(self, sinks: Sequence[_Sink]) -> None:
         self._sinks = tuple(sinks)
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
@@ -156,3 +113,37 @@ class Fanout:
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         for sink in self._sinks:
             sink.receiver_event(event, now)
+
+
+class Audience(Fanout[Watcher]):
+    """A watcher that passes everything on to whoever looks on at the moment: they may come while the run goes on.
+
+    Who comes late is told of the run, and from then on of every event.
+
+    :param instruments: see :class:`Watcher`; for everybody who may come
+    """
+
+    def __init__(self, instruments: bool = True) -> None:
+        super().__init__(())
+        self.instruments = instruments
+        self._lock = threading.Lock()
+        self._run: LiveRun | None = None
+
+    def add(self, watcher: Watcher) -> None:
+        """Let one more look on, from now."""
+        with self._lock:
+            if self._run is not None:
+                watcher.run_started(self._run)
+            self._sinks += (watcher,)
+
+    def run_started(self, run: LiveRun) -> None:
+        with self._lock:
+            self._run = run
+            for watcher in self._sinks:
+                watcher.run_started(run)
+
+    def run_ended(self, result: Result | None) -> None:
+        with self._lock:
+            self._run = None
+            for watcher in self._sinks:
+                watcher.run_ended(result)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from typing import Any, TypeVar
 
 from gr_ros2.config import SinkConfig, SourceConfig, build
@@ -35,6 +36,12 @@ def settings(
     if middleware is not None:
         named["middleware"] = middleware if isinstance(middleware, str) else middleware.name
     return build(cls, named)
+
+
+def own_settings(config: SourceConfig | SinkConfig) -> dict[str, Any]:
+    """A block's settings as its keyword arguments, without what is handed over as an object."""
+    names = {item.name for item in fields(config)} - {"registry", "middleware"}
+    return {name: getattr(config, name) for name in names}
 
 
 def read_registry(registry: str | Registry) -> Registry:

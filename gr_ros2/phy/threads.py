@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 
 from gnuradio import gr
 
@@ -93,3 +94,19 @@ class BlockThread:
         if self._ident == threading.get_ident():
             self._ident = None
             ctypes.pythonapi.PyGILState_Release(self._state)
+
+
+class KeepsThread:
+    """Start and stop of a Python block that has nothing else to do there; stands before GNU Radio's class."""
+
+    @cached_property
+    def _block_thread(self) -> BlockThread:
+        return BlockThread()
+
+    def start(self) -> bool:
+        self._block_thread.keep()
+        return True
+
+    def stop(self) -> bool:
+        self._block_thread.release()
+        return True

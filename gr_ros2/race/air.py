@@ -25,7 +25,7 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import KeepsThread, quicken_threads
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
 from gr_ros2.race.tun import Tun, loopback_up
@@ -269,27 +269,18 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
             self.message_port_pub(PDUS, pmt.cons(pmt.make_dict(), pmt.init_u8vector(len(packet), list(packet))))
 
 
-class TunSink(gr.basic_block):  # type: ignore[misc]
+class TunSink(KeepsThread, gr.basic_block):  # type: ignore[misc]
     """Message port `pdus` to a TUN device."""
 
     def __init__(self, tun: Tun) -> None:
         super().__init__("gr_ros2_tun_sink", None, None)
         self._tun = tun
-        self._block_thread = BlockThread()
         self.handled = 0
         """PDUs this block is done with."""
         self.refused = 0
         """Those of them that were no IP packet, or that the kernel did not take."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._write)
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def _write(self, pdu: Any) -> None:
         packet, reason = packet_of(pdu)

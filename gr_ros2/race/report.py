@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from gr_ros2 import __version__
 from gr_ros2.experiment.figures import COLOURS, save_figure
 from gr_ros2.experiment.table import Grid
-from gr_ros2.experiment.trace import write_csv, write_whole
+from gr_ros2.experiment.trace import write_csv, write_text, write_whole
 from gr_ros2.race.contenders import CONTENDERS
 from gr_ros2.race.measure import COLUMNS, Cell, by_condition, shown, winners
 from gr_ros2.race.runner import Race
@@ -85,7 +85,7 @@ def write_race(race: Race, out: Path) -> list[Path]:
     text = json.dumps(_values(race), indent=2, allow_nan=False) + "\n"
     table = _table(race.cells)
     return [
-        write_whole(out / RACE_FILE, text, _write_text),
+        write_whole(out / RACE_FILE, text, write_text),
         write_whole(out / "race.csv", table, write_csv),
         write_whole(out / "race.parquet", table, pa_parquet.write_table),
         *save_figure(race_figure(race.cells), out, "race"),
@@ -123,10 +123,6 @@ def race_figure(cells: Sequence[Cell]) -> Figure:
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     return figure
-
-
-def _write_text(text: str, path: Path) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def _values(race: Race) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import pmt
 from gnuradio import gr
 from numpy.typing import NDArray
 
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import KeepsThread
 
 SOB, EOB = pmt.intern("tx_sob"), pmt.intern("tx_eob")
 """What `uhd.usrp_sink` begins and ends a burst at."""
@@ -50,7 +50,7 @@ class BurstLayout:
         return -(-(self.lead + self.samples + self.tail) // self.multiple) * self.multiple
 
 
-class BurstShaper(gr.basic_block):  # type: ignore[misc]
+class BurstShaper(KeepsThread, gr.basic_block):  # type: ignore[misc]
     """A transmitter's samples in, whole bursts out: tags ``tx_sob`` and ``tx_eob``, no others.
 
     A sample beyond full scale, which a converter would turn into its opposite, is brought back to it and counted.
@@ -77,7 +77,6 @@ class BurstShaper(gr.basic_block):  # type: ignore[misc]
         """Samples that were beyond full scale."""
         self._sending: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
         self._lock = threading.Lock()
-        self._block_thread = BlockThread()
         self.set_tag_propagation_policy(gr.TPP_DONT)
         self.set_output_multiple(layout.total)
 
@@ -85,14 +84,6 @@ class BurstShaper(gr.basic_block):  # type: ignore[misc]
         """From when to when bursts were on the air, s of the clock, as far as they touch an interval."""
         with self._lock:
             return [times for times in self._sending if times[0] <= end and begin <= times[1]]
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def forecast(self, noutput_items: int, ninputs: int) -> list[int]:
         # Whole bursts only: a device that has begun one must not wait for the rest.
@@ -132,7 +123,7 @@ class BurstShaper(gr.basic_block):  # type: ignore[misc]
         return bursts * total
 
 
-class Blanker(gr.sync_block):  # type: ignore[misc]
+class Blanker(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Samples in and out; zeros for those that came while we sent, and for ``after`` s beyond.
 
     A sample's time is when it gets here, so ``after`` has to cover what it takes from the antenna to this place.
@@ -156,16 +147,7 @@ class Blanker(gr.sync_block):  # type: ignore[misc]
         self._clock = clock
         self.blanked = 0
         """Samples made zero."""
-        self._block_thread = BlockThread()
         self.set_tag_propagation_policy(gr.TPP_DONT)
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
         out = output_items[0]

@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import KeepsThread
 from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
 from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
 
@@ -93,7 +93,7 @@ class FileFrontEnd(FrontEnd):
             self._recorder.close()
 
 
-class _Replay(gr.sync_block):  # type: ignore[misc]
+class _Replay(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Samples of a recording out, by the clock."""
 
     def __init__(self, samples: NDArray[np.complex64], phy: Phy, options: FileOptions) -> None:
@@ -108,15 +108,6 @@ class _Replay(gr.sync_block):  # type: ignore[misc]
         self.finished = False
         """Whether the last sample, and the zeros behind it, are out."""
         self.set_blkd_input_timer_value(AGAIN_MS)
-        self._block_thread = BlockThread()
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         out = output_items[0]

@@ -11,16 +11,17 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from types import TracebackType
 from typing import Any, Protocol
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import SinkConfig
 from gr_ros2.errors import ConfigError, PhyError
 from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.phy import PHY, Phy
@@ -98,7 +99,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
             middleware=graphs[0],
             observer=None if observer is None else partial(observer.sender_event, config.ros_source.src_id()),
             clock=self._clock,
-            **_values(config.ros_source),
+            **own_settings(config.ros_source),
         )
         self._stack.callback(self.source.close)
         self.sink = RosSink(
@@ -107,7 +108,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
             observer=None if observer is None else lambda event: observer.receiver_event(event, self._clock()),
             packet_observer=None if observer is None else lambda data: observer.packet_received(data, self._clock()),
             clock=self._clock,
-            **_values(self._sink_config()),
+            **own_settings(self._sink_config()),
         )
         self._stack.callback(self.sink.close)
         self.source.use_credit()
@@ -225,9 +226,3 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-
-
-def _values(config: SourceConfig | SinkConfig) -> dict[str, Any]:
-    """The settings of a block, without what is handed over as an object."""
-    names = {item.name for item in fields(config)} - {"registry", "middleware"}
-    return {name: getattr(config, name) for name in names}

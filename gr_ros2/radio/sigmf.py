@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gr_ros2 import __version__
 from gr_ros2.errors import ConfigError, RadioError
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import KeepsThread
 
 VERSION = "1.0.0"
 META, DATA = ".sigmf-meta", ".sigmf-data"
@@ -95,7 +95,7 @@ def read_recording(path: Path) -> tuple[Recording, NDArray[np.complex64]]:
     return Recording(sample_rate, frequency, str(about.get("core:description", ""))), samples
 
 
-class SigmfRecorder(gr.sync_block):  # type: ignore[misc]
+class SigmfRecorder(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Samples in, a recording out.
 
     :param path: of the recording, with or without suffix
@@ -110,7 +110,6 @@ class SigmfRecorder(gr.sync_block):  # type: ignore[misc]
         self._about = about
         self._burst = burst
         self._began = datetime.now(timezone.utc)
-        self._block_thread = BlockThread()
         self._lock = threading.Lock()
         self.failed = 0
         """Samples that could not be written, as on a full disk."""
@@ -122,14 +121,6 @@ class SigmfRecorder(gr.sync_block):  # type: ignore[misc]
         except OSError as error:
             raise RadioError(f"recording {data}: cannot be written ({error.strerror})") from error
         self.set_output_multiple(burst or 1)
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         samples = input_items[0]

@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import KeepsThread
 from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
@@ -125,7 +125,7 @@ def _open(action: Callable[[str], object], key: str, address: str) -> None:
         ) from error
 
 
-class _BurstPublisher(gr.sync_block):  # type: ignore[misc]
+class _BurstPublisher(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Samples in, each packet's as one message."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
@@ -135,16 +135,7 @@ class _BurstPublisher(gr.sync_block):  # type: ignore[misc]
         self._burst = phy.airtime_samples()
         self._sender = int.from_bytes(os.urandom(4), "little")
         self._counters = counters
-        self._block_thread = BlockThread()
         self.set_output_multiple(self._burst)
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         samples = input_items[0]
@@ -157,7 +148,7 @@ class _BurstPublisher(gr.sync_block):  # type: ignore[misc]
         return bursts * self._burst
 
 
-class _BurstSubscriber(gr.sync_block):  # type: ignore[misc]
+class _BurstSubscriber(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Messages in, their samples out."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
@@ -168,15 +159,6 @@ class _BurstSubscriber(gr.sync_block):  # type: ignore[misc]
         self._counters = counters
         self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
         self.set_blkd_input_timer_value(AGAIN_MS)
-        self._block_thread = BlockThread()
-
-    def start(self) -> bool:
-        self._block_thread.keep()
-        return True
-
-    def stop(self) -> bool:
-        self._block_thread.release()
-        return True
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):
