@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import gc
 import mmap
 import random
-import resource
+import subprocess
+import sys
 import threading
-from contextlib import ExitStack
-from functools import partial
-from pathlib import Path
 
 from gnuradio import gr
 
 from gr_ros2.config import SourceConfig
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr import RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -23,58 +20,17 @@ from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.registry import Registry
 from tests.e2e.support import free_domains
 from tests.gr.probe import Probe
-from tests.middleware.support import STRING, message, wait_for
+from tests.middleware.support import STRING, wait_for
 
-MESSAGES, WARM_UP, BATCH = 200_000, 50_000, 1_000
 GROWTH_BYTES = 3_000_000
 """Less than 20 bytes a message: anything kept of each would show."""
 
 
-def resident_bytes() -> int:
-    gc.collect()
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-
-
 def test_memory_is_flat_over_200_000_messages() -> None:
-    sending, receiving = free_domains()
-    registry = Registry.from_rows({"a": STRING, "b": STRING})
-    heard = [0, 0]
-
-    def hear(which: int, _payload: bytes) -> None:
-        heard[which] += 1
-
-    def wait_until_heard(messages: int) -> None:
-        wait_for(lambda: sum(heard) == messages, f"message {messages}")
-
-    with ExitStack() as stack:
-        robot, listener = (stack.enter_context(MemoryMiddleware(domain_id=domain)) for domain in (sending, receiving))
-        source = RosSource(
-            registry, middleware=robot, robot_id=1, packet_len=64, subscriber_depth=0, queue_depth=0, repeat_s=0.0
-        )
-        stack.callback(source.close)
-        sink = RosSink(registry, middleware=listener, packet_len=64, publisher_depth=0)
-        stack.callback(sink.close)
-        for which, name in enumerate("ab"):
-            listener.subscribe(f"/rx_robot_1/{name}", STRING, Qos(depth=0), partial(hear, which))
-        publishers = [robot.advertise(f"/{name}", STRING, Qos(depth=0)) for name in "ab"]
-        flowgraph = gr.top_block()
-        flowgraph.msg_connect(source, "pdus", sink, "pdus")
-        flowgraph.start()
-        stack.callback(flowgraph.wait)
-        stack.callback(flowgraph.stop)
-        before = 0
-        for done in range(0, MESSAGES, BATCH):
-            if done == WARM_UP:
-                before = resident_bytes()
-            for number in range(done, done + BATCH):
-                # One in ten takes several packets, so that reassembly is in it.
-                publishers[number % 2].publish(message(number, 120 if number % 10 == 0 else 24))
-            wait_until_heard(done + BATCH)
-        grown = resident_bytes() - before
-        stats = sink.stats()
-    assert stats["held_bytes"] == 0
-    assert sum(topic["delivered"] for topic in stats["topics"].values()) == MESSAGES
-    assert grown < GROWTH_BYTES, f"{grown} bytes more after {MESSAGES - WARM_UP} messages"
+    done = subprocess.run([sys.executable, "-m", "tests.e2e.endurance"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    grown = int(done.stdout)
+    assert grown < GROWTH_BYTES, f"{grown} bytes more after the first messages"
 
 
 def submissions(seed: int) -> list[tuple[int, bytes, float]]:
