@@ -1,14 +1,20 @@
 """How a subscription adapts to the publishers found (DESIGN, QoS): what DDS matches, and when to join anew.
 
-Law: pure bookkeeping over what discovery reports; nothing here knows a DDS, a thread or a clock.
+Law: pure bookkeeping over what discovery reports and what is received; nothing here knows a DDS, a thread or a clock.
 """
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from gr_ros2.middleware.base import Qos
+
+REPLAY_S = 2.0
+"""s after joining anew in which publishers may send once more what they keep for those who come late."""
+
+_REMEMBERED = 256
 
 
 def settle(asked: Qos, offered: Iterable[Qos]) -> Qos:
@@ -97,3 +103,30 @@ class Adaptation:
             return None
         self.settled = qos
         return qos
+
+
+class Replays:
+    """Tells messages that publishers send once more, since they keep them for those who come late and we joined anew.
+
+    By content, for where nothing tells when a message was published, as in Humble's rclpy. Without this an old message
+    would come after newer ones.
+    """
+
+    def __init__(self) -> None:
+        self._had: deque[int] = deque(maxlen=_REMEMBERED)
+        self._expected: Counter[int] = Counter()
+        self._until = 0.0
+
+    def join(self, qos: Qos, now: float) -> None:
+        """What was received so far may come again, if we ask for the past."""
+        self._expected = Counter(self._had if qos.durability == "transient_local" else ())
+        self._until = now + REPLAY_S
+
+    def has(self, payload: bytes, now: float) -> bool:
+        """Whether this is one; each message received is expected once more."""
+        key = hash(payload)
+        if now < self._until and self._expected[key] > 0:
+            self._expected[key] -= 1
+            return True
+        self._had.append(key)
+        return False

@@ -138,13 +138,13 @@ class Middleware(ABC):
     @abstractmethod
     def close(self) -> None: ...
 
-    def count(self, key: str, text: str, n: int = 1) -> None:
+    def count(self, key: str, text: str, n: int = 1, level: int = logging.WARNING) -> None:
         """Add to a counter, from any thread; log the text at its first occurrence."""
         with self._counting:
             first = key not in self.counters
             self.counters[key] += n
         if first:
-            _log.warning("%s (counted as %s, not logged again)", text, key)
+            _log.log(level, "%s (counted as %s, not logged again)", text, key)
 
     def deliver(self, topic: str, callback: MessageCallback, payload: bytes) -> None:
         """Call back with one message; a callback that raises is counted and logged, and the thread lives on."""

@@ -352,6 +352,7 @@ class RawReader(_Endpoint):
         finally:
             _delete_qos(pointer)
         self.latched = qos.durability == "transient_local"
+        self.brings_past = self.latched and qos.reliability == "reliable"
         _checked(_set_status_mask(self.entity, _REQUESTED_INCOMPATIBLE | _SAMPLE_LOST), "set a status mask")
         self.condition: Entity = _checked(_create_readcondition(self.entity, _ANY_STATE), "create a condition")
         self._samples = (c.c_void_p * BATCH)()

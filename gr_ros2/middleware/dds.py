@@ -215,7 +215,7 @@ class DdsMiddleware(Middleware):
                 if not self._closed:
                     _log.error("domain %d: no message will be received any more: %s", self.domain_id, error)
                 return
-            for number in triggered:
+            for number in sorted(triggered):  # the watches first: what publishers offer is known before what they say
                 self._guarded(partial(self._service, number))
             with self._lock:
                 outdated = [subscription for subscription in self._subscriptions if subscription.outdated]

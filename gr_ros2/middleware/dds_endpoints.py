@@ -1,8 +1,9 @@
 """Publishers and subscriptions of the embedded DDS.
 
 Laws: a subscription whose reliability or durability is left open asks only for what all publishers found offer, and
-changes readers when that changes: the old reader stays for ``OVERLAP_S`` while the new one is being found, and what
-both receive is delivered once. A subscription's lock is taken before its participant's, never after.
+changes readers when that changes: the old reader stays for ``OVERLAP_S`` while the new one is being found, what both
+receive is delivered once, and never a message after a later one of its publisher. A subscription's lock is taken before
+its participant's, never after.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.base import MessageCallback, OffersCallback, Publisher, Qos, Subscription
-from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter
+from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter, Sample
 
 if TYPE_CHECKING:
     from gr_ros2.middleware.dds import DdsMiddleware
@@ -96,7 +97,7 @@ class DdsSubscription(Subscription):
         self._qos: Qos | None = None
         self._reader: RawReader | None = None
         self._outdated: list[tuple[float, RawReader]] = []
-        self._seen: dict[int, dict[int, Entity]] = {}  # publisher -> stamp -> reader that had it
+        self._seen: dict[int, dict[int, Entity]] = {}  # publisher -> stamp -> reader that had it, newest last
 
     @property
     def qos(self) -> Qos | None:
@@ -143,54 +144,77 @@ class DdsSubscription(Subscription):
             if self._closed:
                 return
             over = [reader for until, reader in self._outdated if until <= now]
-            self._outdated = [(until, reader) for until, reader in self._outdated if until > now]
             for reader in over:
-                while self.service(reader) >= BATCH:
-                    pass
+                self._serve_all(reader)
                 self._middleware.drop_reader(reader)
+            self._outdated = [(until, reader) for until, reader in self._outdated if until > now]
             if over:
                 self._middleware.announce()
 
     def service(self, reader: RawReader) -> int:
         """Deliver what one reader holds (BATCH at a time where the depth is unbounded); returns how many there were."""
         with self._lock:
-            if self._closed:
-                return 0
-            lost = reader.lost()
-            if lost:
-                self._middleware.count(f"samples_lost:{self.topic}", f"{self.topic}: the DDS lost messages", lost)
-            self._middleware.count_incompatible(self.topic, reader.incompatible(), self._open_policies)
-            samples = batch = reader.take()
-            while self._wanted.depth and len(batch) == BATCH:
-                batch = reader.take()
-                samples = samples + batch
-            if self._open_policies:
-                fresh = [s for s in samples if not self._repeated(s.source, s.stamp, reader.entity)]
-            else:
-                fresh = samples
-            excess = len(fresh) - self._wanted.depth
-            if self._wanted.depth and excess > 0 and not reader.latched:
-                text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest go"
-                self._middleware.count(f"samples_lost:{self.topic}", text, excess)
-                fresh = fresh[excess:]
-            for sample in fresh:
-                if self._closed:
-                    break
-                self._middleware.deliver(self.topic, self._callback, sample.payload)
-            return len(samples)
+            if reader is self._reader:  # its predecessors may hold what came before
+                for _, older in self._outdated:
+                    self._serve_all(older)
+            return self._serve(reader)
 
-    def _repeated(self, source: int, stamp: int, reader: Entity) -> bool:
-        """Whether another reader of this subscription had that message."""
-        stamps = self._seen.get(source)
+    def _serve_all(self, reader: RawReader) -> None:
+        while self._serve(reader) >= BATCH:
+            pass
+
+    def _serve(self, reader: RawReader) -> int:
+        if self._closed:
+            return 0
+        lost = reader.lost()
+        if lost:
+            self._middleware.count(f"samples_lost:{self.topic}", f"{self.topic}: the DDS lost messages", lost)
+        self._middleware.count_incompatible(self.topic, reader.incompatible(), self._open_policies)
+        samples = batch = reader.take()
+        while self._wanted.depth and len(batch) == BATCH:
+            batch = reader.take()
+            samples = samples + batch
+        fresh = [sample for sample in samples if self._is_next(sample, reader)] if self._open_policies else samples
+        excess = len(fresh) - self._wanted.depth
+        if self._wanted.depth and excess > 0 and not reader.latched:
+            text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest go"
+            self._middleware.count(f"samples_lost:{self.topic}", text, excess)
+            fresh = fresh[excess:]
+        for sample in fresh:
+            if self._closed:
+                break
+            self._middleware.deliver(self.topic, self._callback, sample.payload)
+        return len(samples)
+
+    def _is_next(self, sample: Sample, reader: RawReader) -> bool:
+        """Whether a message is to be delivered: neither had by another reader nor overtaken by a later one.
+
+        Order is by the publisher's clock, which may be set back, hence only among readers that are there at once. What
+        is older than all that was heard of a publisher counts as published before our time.
+        """
+        stamps = self._seen.get(sample.source)
+        heard_by = None if stamps is None else next(iter(stamps.values()))
+        now = self._reader
+        if now is not None and now is not reader and now.brings_past and heard_by in (None, now.entity):
+            return False  # that one brings this message too, in its place
         if stamps is None:
             if len(self._seen) >= _SEEN_PUBLISHERS:
                 del self._seen[next(iter(self._seen))]
-            stamps = self._seen[source] = {}
-        if stamps.setdefault(stamp, reader) != reader:
+            self._seen[sample.source] = {sample.stamp: reader.entity}
             return True
+        if stamps.get(sample.stamp, reader.entity) != reader.entity:
+            return False
+        last = next(reversed(stamps))
+        if self._outdated and sample.stamp < last and stamps[last] != reader.entity:
+            if sample.stamp > next(iter(stamps)):
+                # As if we had joined a moment later.
+                text = f"{self.topic}: a message came after a later one while the QoS changed; not delivered"
+                self._middleware.count(f"overtaken:{self.topic}", text, level=logging.INFO)
+            return False
+        stamps[sample.stamp] = reader.entity
         if len(stamps) > _SEEN_PER_PUBLISHER:
             del stamps[next(iter(stamps))]
-        return False
+        return True
 
     def matched(self) -> int:
         reader = self._reader

@@ -5,7 +5,8 @@ application keeps its own node, arguments and signal handlers; endpoints are des
 executor's thread only, hence a subscription is silent once ``close`` has returned; no exception of a callback or of
 rclpy ends that thread, each is counted and its first logged.
 
-Adaptive subscriptions follow adapt.Adaptation; samples under way while one joins anew may be missed.
+Adaptive subscriptions follow adapt.Adaptation; while one joins anew, messages under way may be missed, and what latched
+publishers then send once more is left out.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import atexit
 import contextlib
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from importlib import import_module
@@ -29,7 +31,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 
 from gr_ros2.errors import ConfigError, MiddlewareError
-from gr_ros2.middleware.adapt import Adaptation, compatible
+from gr_ros2.middleware.adapt import Adaptation, Replays, compatible
 from gr_ros2.middleware.base import (
     MessageCallback,
     Middleware,
@@ -348,6 +350,7 @@ class _RclpySubscription(Subscription):
         self._class = message_class(type_name)
         self._callback = callback
         self._adaptation = Adaptation(qos)
+        self._replays = Replays()
         self._endpoint: Any = None
         self._offers: list[Qos] = []
         self._on_offers: OffersCallback | None = None
@@ -385,6 +388,7 @@ class _RclpySubscription(Subscription):
     def _join(self) -> None:
         self._leave()
         assert self._adaptation.settled is not None
+        self._replays.join(self._adaptation.settled, time.monotonic())
         self._endpoint = self._middleware.create(
             "subscription",
             SubscriptionEventCallbacks,
@@ -418,8 +422,10 @@ class _RclpySubscription(Subscription):
             self._middleware.in_executor(self._leave)
 
     def _deliver(self, payload: bytes) -> None:
-        if not self._closed and not self._middleware.closing:
-            self._middleware.deliver(self._topic, self._callback, payload)
+        latched = any(offer.durability == "transient_local" for offer in self._offers)
+        if self._closed or self._middleware.closing or (latched and self._replays.has(payload, time.monotonic())):
+            return
+        self._middleware.deliver(self._topic, self._callback, payload)
 
     def _on_incompatible(self, event: Any) -> None:
         policy = _policy_name(event)

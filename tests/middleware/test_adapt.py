@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.middleware.adapt import Adaptation, agreed, compatible, settle
+from gr_ros2.middleware.adapt import REPLAY_S, Adaptation, Replays, agreed, compatible, settle
 from gr_ros2.middleware.base import Qos
 
 RELIABLE = Qos("reliable", "volatile")
@@ -62,3 +62,15 @@ def test_adaptive_joins_with_the_first_publisher_and_anew_only_for_one_that_appe
     assert adaptation.consider({}) is None
     assert adaptation.consider({b"d": RELIABLE}) == RELIABLE
     assert adaptation.settled == RELIABLE
+
+
+def test_what_was_had_before_joining_anew_is_a_replay_once() -> None:
+    replays = Replays()
+    replays.join(LATCHED, 0.0)
+    assert [replays.has(payload, 1.0) for payload in (b"a", b"a", b"b")] == [False] * 3
+    replays.join(LATCHED, 10.0)
+    assert [replays.has(payload, 10.5) for payload in (b"a", b"a", b"c", b"b")] == [True, True, False, True]
+    assert not replays.has(b"b", 10.6), "said again by its publisher"
+    assert not replays.has(b"a", 10.0 + REPLAY_S)
+    replays.join(RELIABLE, 20.0)
+    assert not replays.has(b"a", 20.5), "no past was asked for"

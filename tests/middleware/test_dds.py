@@ -9,12 +9,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, cdr_dds, ros_graph
+from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_domains import POOL
@@ -155,6 +157,38 @@ def test_nothing_is_lost_or_repeated_while_adapting(join: Callable[..., DdsMiddl
         thread.join()
     wait_for(lambda: len(received) >= len(sent), "all messages")
     assert received == sent
+
+
+@pytest.mark.parametrize("durability", ["volatile", "transient_local"])
+def test_no_message_comes_after_a_later_one_while_joining(
+    join: Callable[..., DdsMiddleware], peer: Callable[..., Peer], durability: Durability
+) -> None:
+    """A busy publisher with a long past, and subscriptions that find out what it offers only once it sends to them."""
+    source = peer("pub", "/odom", STRING, Qos("reliable", durability, 500))
+    stop = threading.Event()
+
+    def publish() -> None:
+        for number in count(1):
+            source.publish([message(number)])
+            if stop.wait(0.001):
+                break
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        for _ in range(6):
+            here, received = join(), list[bytes]()
+            here.subscribe("/odom", STRING, Qos(depth=0), received.append)
+            wait_for(lambda received=received: len(received) > 200, "messages")
+            here.close()
+            numbers = [int.from_bytes(payload[4:8], "little") for payload in received]
+            assert numbers == sorted(set(numbers))
+            if durability == "transient_local":
+                assert numbers == list(range(numbers[0], numbers[-1] + 1)), "the past is not whole"
+                assert here.counters == {}
+    finally:
+        stop.set()
+        thread.join()
 
 
 def test_a_fixed_part_of_the_qos_stays(join: Callable[..., DdsMiddleware]) -> None:

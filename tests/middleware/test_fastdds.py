@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import subprocess
 import tempfile
@@ -17,7 +18,17 @@ from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, 
 
 SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
+OLDEST = (2, 6, 2)
+"""Fast DDS before that throws the announcement of every Cyclone DDS 11 participant away: it holds binary properties."""
 RELIABLE = Qos("reliable", "volatile", 100)
+
+
+def installed() -> tuple[int, ...]:
+    """Version of Fast DDS's headers."""
+    command = ["g++", "-E", "-dM", "-include", "fastrtps/config.h", "-x", "c++", "/dev/null"]
+    macros = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    found = dict(re.findall(r"#define FASTRTPS_VERSION_(M\w+) (\d+)", macros))
+    return tuple(int(found[part]) for part in ("MAJOR", "MINOR", "MICRO"))
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +36,8 @@ def program() -> Path:
     """The peer, compiled once per version of its source."""
     if not HEADER.exists() or not shutil.which("g++"):
         pytest.skip("needs g++ and Fast DDS's headers: apt install g++ libfastrtps-dev")
+    if installed() < OLDEST:
+        pytest.skip(f"Fast DDS is {installed()}: from {OLDEST} on it hears Cyclone DDS 11")
     name = f"gr-ros2-fastdds-peer-{hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]}"
     built = Path(tempfile.gettempdir()) / name
     if not built.exists():

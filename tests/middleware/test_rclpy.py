@@ -120,14 +120,43 @@ def test_adaptive_subscription_yields_to_a_later_lesser_publisher(start: Start) 
     assert not [key for key in two.counters if key.startswith("incompatible")]
 
 
+def test_joining_anew_brings_the_past_of_new_publishers_only(start: Start) -> None:
+    """A volatile publisher makes the subscription volatile for a while; then one more latched publisher comes."""
+    one, two = start(node_name="one"), start(node_name="two")
+    received: list[bytes] = []
+    two.subscribe("/map", STRING, Qos(), received.append)
+    expected = [unpadded(text(word)) for word in ("first", "second", "passing", "another's", "third")]
+
+    def heard(number: int) -> bool:
+        return [unpadded(payload) for payload in received][: number + 1] == expected[:number]
+
+    map_1 = one.advertise("/map", STRING, LATCHED)
+    map_1.publish(text("first"))
+    map_1.publish(text("second"))
+    wait_for(lambda: heard(2), "for the past")
+    passing = one.advertise("/map", STRING, RELIABLE)
+    wait_for(passing.matched, "for the volatile publisher")
+    wait_for(map_1.matched, "for the latched publisher again")
+    passing.publish(text("passing"))
+    wait_for(lambda: heard(3), "for a volatile message")
+    passing.close()
+    wait_for(lambda: len(two.publishers_of("/map", STRING)) == 1, "for its departure")
+    map_2 = one.advertise("/map", STRING, LATCHED)
+    map_2.publish(text("another's"))
+    wait_for(lambda: heard(4), "for the past of the new publisher alone")
+    wait_for(map_1.matched, "for the first publisher once more")
+    map_1.publish(text("third"))
+    wait_for(lambda: heard(5), "for the newest")
+
+
 def test_adaptive_subscription_appears_with_its_publisher(start: Start, host: rclpy.node.Node) -> None:
     one = start(node_name="one")
     subscription = one.subscribe("/later", STRING, Qos(), print)
     assert subscription.matched() == 0
     host.create_publisher(String, "/later", 10)
     wait_for(lambda: subscription.matched() == 1)
+    wait_for(lambda: [info.node_name for info in host.get_subscriptions_info_by_topic("/later")] == ["one"])
     infos = host.get_subscriptions_info_by_topic("/later")
-    assert [info.node_name for info in infos] == ["one"]
     assert infos[0].qos_profile.reliability == rclpy.qos.ReliabilityPolicy.RELIABLE
 
 
