@@ -60,9 +60,8 @@ setup(
         "sweep": ["distributed>=2024.8"],
         "zenoh": ["eclipse-zenoh>=1.10,<2"],
     },
-    entry_points={"console_scripts": ["gr-ros2 = gr_ros2.cli.main:main"]},
+    entry_points={"console_scripts": ["gr-ros2 = gr_ros2.cli.__main__:main"]},
     classifiers=[
-        "License :: OSI Approved :: GNU General Public License v3 or later (GPLv3+)",
         "Programming Language :: Python :: 3",
         "Operating System :: POSIX :: Linux",
     ],

@@ -24,11 +24,11 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.airtime import WINDOW
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.loopback import LoopbackLink
-from gr_ros2.phy.measure import deliver, modulated, release
+from gr_ros2.phy.measure import deliver, modulated
 from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.phy.window import WINDOW
 from gr_ros2.registry import Registry
 
 SNR_DB = 20.0
@@ -38,7 +38,7 @@ BATCH_SAMPLES = 2_000_000
 REPEATS = 3
 _SMALL = b"\0\1\0\0" + bytes(44)
 """A message that is one packet."""
-_COUNTS = {"lora": (300, 20)}
+_COUNTS = {"lora": (1500, 20)}
 _COUNT = (4000, 200)
 """Packets for a rate, and for a latency."""
 
@@ -108,7 +108,7 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """Packets/s, and s for a single one, from Python block to Python block."""
     quicken_threads()
     poster, taker, graph = _Poster(), _Taker(), gr.top_block()
-    transmitter, receiver = phy.transmitter(), phy.receiver()
+    transmitter, receiver = phy.transmitter(), phy.receiver(aside=True)
     graph.msg_connect(poster, "out", transmitter, "pdus")
     graph.connect(transmitter, Channel(ChannelConfig(), phy), receiver)
     graph.msg_connect(receiver, "pdus", taker, "in")
@@ -126,7 +126,7 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     graph.stop()
     graph.wait()
     for part in (transmitter, receiver):
-        release(part)
+        part.release()
     return rate, single
 
 

@@ -38,7 +38,7 @@ def _stop_time(name: str) -> float:
         command = [
             sys.executable,
             "-m",
-            "gr_ros2.cli.main",
+            "gr_ros2.cli",
             "run",
             name,
             "--duration",

@@ -6,7 +6,10 @@ ROS 2 or a DDS.
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -50,8 +53,33 @@ class BackendTable(Mapping[str, Backend]):
             raise ConfigError(f"{self.family}: no {name!r}; known are {', '.join(self._rows)}")
         row = self._rows[name]
         try:
-            return getattr(import_module(row.module), row.attribute)
+            with uninterrupted():
+                return getattr(import_module(row.module), row.attribute)
         except ImportError as error:
             if not row.requires:
                 raise
             raise BackendMissingError(f"{self.family} {name!r} needs {row.requires} ({error})") from error
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait until what is inside is done, for instance an import.
+
+    KeyboardInterrupt inside a C extension that is being loaded comes out as ImportError or RuntimeError, or leaves it
+    half loaded. Where it is not the main thread that asks, nothing is to be done: signals are handled there alone.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: dict[int, None] = {}
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in found.items() if handler is not None}  # None: not Python's
+    try:
+        for number in handlers:
+            signal.signal(number, lambda number, _: came.setdefault(number))
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for waiting in came:
+            signal.raise_signal(waiting)

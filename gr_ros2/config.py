@@ -25,6 +25,18 @@ SINGLE_ENTRY_OVERHEAD = 13
 
 _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 _T = TypeVar("_T")
+_KINDS = {
+    "bool": "true or false",
+    "complex": "a number such as 0.5 or 0.5+0.2j",
+    "dataclass": "keys and values",
+    "dict": "keys and values",
+    "float": "a number",
+    "int": "a whole number",
+    "list": "a list",
+    "string": "a text",
+    "tuple": "a list",
+}
+"""What a value is asked to be, by what pydantic calls it."""
 
 PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
 RobotId = Annotated[int, Field(ge=-1, le=254)]
@@ -363,7 +375,11 @@ def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
     try:
         return TypeAdapter(cls).validate_python(dict(values))
     except ValidationError as error:
-        raise ConfigError("; ".join(_explain(cls, item, where) for item in error.errors())) from error
+        items = error.errors()
+        # What several parts take over from the top level is wrong once, and not in every part.
+        top = [(item["loc"], item["input"]) for item in items if len(item["loc"]) == 1]
+        told = [item for item in items if len(item["loc"]) == 1 or (item["loc"][-1:], item["input"]) not in top]
+        raise ConfigError("; ".join(_explain(cls, item, where) for item in told)) from error
 
 
 def replaced(config: _T, **changes: Any) -> _T:
@@ -376,35 +392,46 @@ def replaced(config: _T, **changes: Any) -> _T:
 
 
 def meanings(cls: type[Any]) -> dict[str, str]:
-    """What its docstring says of each setting of a configuration class, one line each."""
-    text = re.sub(r"\s*\n\s+(?!:param)", " ", cls.__doc__ or "")
-    return {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
+    """What the docstrings of a configuration class and its bases say of each setting, one line each."""
+    said: dict[str, str] = {}
+    for part in reversed(cls.__mro__):  # what a class says of a setting goes before what its base says
+        text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
+        said |= {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
+    return said
 
 
 def _explain(cls: type[Any], item: Any, where: str) -> str:
     prefix = f"{where}: " if where else ""
     key = ".".join(str(part) for part in item["loc"])
-    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        known = _keys_at(cls, item["loc"][:-1])
-        return f"{prefix}unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
     message = item["msg"].removeprefix("Value error, ")
     if not key:
         return f"{prefix}{message}"
+    owner = _class_at(cls, item["loc"][:-1])
+    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        known = [] if owner is None else [field.name for field in fields(owner)]
+        return f"{prefix}unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
+    meaning = {} if owner is None else meanings(owner)
+    said = re.split(r"[.;](?: |$)", meaning.get(item["loc"][-1], "").replace("``", ""))[0]  # its first sentence
+    said = f" ({said})" if said else ""
     if item["type"] in ("missing", "missing_argument"):
-        return f"{prefix}{key} is missing"
+        return f"{prefix}{key} is missing{said}"
     value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
-    return f"{prefix}{key}{value}: {message[0].lower()}{message[1:]}"
+    kind, _, problem = item["type"].partition("_")
+    if kind in _KINDS and problem in ("type", "parsing", "str_parsing", "from_float"):
+        return f"{prefix}{key}{value}: must be {_KINDS[kind]}{said}"
+    asked = re.fullmatch(r"\w+ should (.+?)(?: after validation.*)?", message)
+    return f"{prefix}{key}{value}: " + (f"must {asked[1]}" if asked else f"{message[0].lower()}{message[1:]}")
 
 
-def _keys_at(cls: Any, loc: tuple[Any, ...]) -> list[str]:
-    """Names of the settings at a place in the tree, [] where it is not one of our dataclasses."""
+def _class_at(cls: Any, loc: tuple[Any, ...]) -> Any:
+    """The dataclass at a place in the tree, None where it is not one of ours."""
     for part in loc:
         known = {field.name: field.type for field in fields(cls)} if hasattr(cls, "__dataclass_fields__") else {}
         annotation = known.get(part)
         cls = getattr(cls, "__pydantic_fields__", {}).get(part)
         cls = getattr(cls, "annotation", None) or annotation
         cls = next((kind for kind in get_args(cls) if kind is not type(None)), cls)  # X of X | None
-    return [field.name for field in fields(cls)] if hasattr(cls, "__dataclass_fields__") else []
+    return cls if hasattr(cls, "__dataclass_fields__") else None
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

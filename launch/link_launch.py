@@ -3,6 +3,7 @@
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
 
@@ -18,7 +19,7 @@ def generate_launch_description() -> LaunchDescription:
                 executable="link",
                 name=LaunchConfiguration("name"),
                 namespace=LaunchConfiguration("namespace"),
-                parameters=[{"config": LaunchConfiguration("config")}],
+                parameters=[{"config": ParameterValue(LaunchConfiguration("config"), value_type=str)}],
                 output="screen",
             ),
         ]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -29,8 +33,6 @@ def test_a_table_is_a_mapping_in_order() -> None:
 
 
 def test_load_gives_the_class() -> None:
-    from collections import OrderedDict
-
     assert TABLE.load("there") is OrderedDict
 
 
@@ -53,6 +55,31 @@ def test_a_bug_of_ours_does_not_look_like_a_missing_package() -> None:
     with pytest.raises(ModuleNotFoundError) as caught:
         TABLE.load("broken")
     assert not isinstance(caught.value, BackendMissingError)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("works", [True, False])
+def test_a_signal_waits_for_the_end_of_an_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, works: bool, number: signal.Signals
+) -> None:
+    name = f"signalled_{works}_{number.name}".lower()
+    lines = ["import signal", f"signal.raise_signal({int(number)})", "Bus = 1" if works else "import no_such_package"]
+    (tmp_path / f"{name}.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    table = BackendTable("bus", {"one": Backend(name, "Bus", "is interrupted", "pip install something else")})
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            table.load("one")
+        assert signal.getsignal(number) is signal.default_int_handler
+        assert (name in sys.modules) is works
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_thread_loads_too() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(TABLE.load, "there").result() is OrderedDict
 
 
 @pytest.mark.parametrize("table", [MIDDLEWARE, PHY, SCHEDULER], ids=lambda table: table.family)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.config import (
+    BurstLoss,
     ChannelConfig,
     PhyConfig,
     SinkConfig,
@@ -147,6 +148,24 @@ def test_a_configured_robot_id_wins_over_the_namespace() -> None:
 def test_several_errors_are_all_named() -> None:
     error = refused(SourceConfig, hop=99, dst_id=999, colour="red")
     assert all(part in error for part in ("hop = 99", "dst_id = 999", "unknown key colour"))
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "says"),
+    [
+        (SourceConfig, {"topics": "odom"}, "topics = 'odom': must be a list (subset of the registry, "),
+        (SourceConfig, {"greedy": "perhaps"}, "greedy = 'perhaps': must be true or false (several entries"),
+        (SourceConfig, {"hop": 1.5}, "hop = 1.5: must be a whole number (initial hop"),
+        (SourceConfig, {"hop": 16}, "hop = 16: must be less than or equal to 15"),
+        (SourceConfig, {"packet_rate": "fast"}, "packet_rate = 'fast': must be a number (packets/s"),
+        (SourceConfig, {"namespace": 3}, "namespace = 3: must be a text"),
+        (ChannelConfig, {"taps": []}, "taps = []: must have at least 1 item"),
+        (ChannelConfig, {"burst_loss": 1}, "burst_loss = 1: must be keys and values (losses in bursts)"),
+        (BurstLoss, {"p_good_to_bad": 0.1}, "p_bad_to_good is missing (the other way round, above 0..1)"),
+    ],
+)
+def test_what_a_setting_must_be_is_said_in_plain_words(cls: type[Any], values: dict[str, Any], says: str) -> None:
+    assert refused(cls, **values).startswith(says)
 
 
 @pytest.mark.parametrize("values", [None, 3, "text", ["hop"]])

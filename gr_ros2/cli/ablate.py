@@ -8,9 +8,10 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import SCENARIO
+from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.experiment.ablation import Variant, run_variants, worth_grid
 from gr_ros2.experiment.compare import write_comparison
+from gr_ros2.experiment.scenario import Scenario
 from gr_ros2.experiment.table import as_table
 
 
@@ -19,7 +20,7 @@ from gr_ros2.experiment.table import as_table
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/ablate-NAME-TIME.")
 @click.option("--seed", type=int, help="Seed of robots, channel and sender.")
 @click.option("--duration", type=float, help="Seconds of each run during which messages are sent.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@set_option(Scenario)
 def ablate(
     scenario: str, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]
 ) -> None:

@@ -6,6 +6,8 @@ from rich.console import Console
 
 PLAIN_WIDTH = 110
 """Columns of the tables where the output is no terminal."""
+LOG_S = 10.0
+"""Between two lines that say how far something is, where the output is no terminal and lines stay."""
 
 
 def console() -> Console:

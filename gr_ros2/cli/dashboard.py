@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
+from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.doorbell import Doorbell, neighbours, ring
 from gr_ros2.errors import BackendMissingError, ConfigError, RunError
 
@@ -65,7 +66,8 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
 
 def _make(address: str, port: int) -> Dashboard:
     try:
-        from gr_ros2.dashboard.server import Dashboard
+        with uninterrupted():
+            from gr_ros2.dashboard.server import Dashboard
     except ModuleNotFoundError as error:
         package = (error.name or "bokeh").split(".")[0]
         raise BackendMissingError(f"the dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -13,24 +12,25 @@ import click
 from rich.console import Console
 from rich.status import Status
 
+from gr_ros2.backends import uninterrupted
+from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.params import set_option
 from gr_ros2.cli.pcap import capture, pcap_option
-from gr_ros2.radio.config import load_link
+from gr_ros2.radio.config import LinkConfig, load_link
 
 if TYPE_CHECKING:
     from gr_ros2.experiment.watch import LiveRun
     from gr_ros2.radio.link import RobotLink
 
 _SHOW_S = 0.5
-_LOG_S = 10.0
-"""Between two status lines where the output is no terminal and lines stay."""
 
 
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@set_option(LinkConfig)
 @dashboard_option
 @pcap_option
 def link(
@@ -39,12 +39,11 @@ def link(
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
     settings = load_link(config, overrides)
     # These need GNU Radio, which a wrong setting must not wait for.
-    from gr_ros2.experiment.watch import EventSink, Fanout
-    from gr_ros2.radio.link import RobotLink
+    with uninterrupted():
+        from gr_ros2.experiment.watch import EventSink, Fanout
+        from gr_ros2.radio.link import RobotLink
 
     console = make_console()
-    # A service manager's SIGTERM ends a link as Ctrl-C does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with audience(dashboard, console, settings.name) as onlookers, capture(pcap) as captures, ExitStack() as stack:
         running = RobotLink(settings, observer=Fanout[EventSink]([onlookers, *captures]), instrumented=True)
         stack.callback(running.stop)
@@ -94,7 +93,7 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
             running.check()
             if isinstance(status, Status):
                 status.update(status_line(running.stats()))
-            elif time.monotonic() - shown >= _LOG_S:
+            elif time.monotonic() - shown >= LOG_S:
                 shown = time.monotonic()
                 console.print(status_line(running.stats()), soft_wrap=True)
 
@@ -111,6 +110,8 @@ def status_line(stats: Mapping[str, Any]) -> str:
     ]
     if sink["packet_loss_est"]:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
+    if stats["phy"]["snr_db"] is not None:
+        parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
     troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
     quiet = ("name", "bursts_in", "bursts_out")
     parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]

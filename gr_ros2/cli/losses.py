@@ -10,11 +10,11 @@ from rich import box
 from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import SCENARIO
+from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.load import make_phy
 from gr_ros2.experiment.losstable import PACKETS, STEP_DB, table_for
-from gr_ros2.experiment.scenario import load_scenario
+from gr_ros2.experiment.scenario import Scenario, load_scenario
 
 
 @click.command()
@@ -23,7 +23,7 @@ from gr_ros2.experiment.scenario import load_scenario
 @click.option("--to", "high", type=float, default=20.0, show_default=True, help="Highest SNR, dB.")
 @click.option("--packets", type=click.IntRange(min=1), default=PACKETS, show_default=True, help="Sent at each SNR.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to keep the table in; default the cache.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@set_option(Scenario)
 def losses(
     scenario: str, *, low: float, high: float, packets: int, out: Path | None, overrides: tuple[str, ...]
 ) -> None:

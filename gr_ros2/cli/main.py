@@ -2,12 +2,13 @@
 
 Laws: nothing but this package prints, exits or reads argv; a sub-command's module is imported only when it is
 chosen, so `--help` is quick and works without GNU Radio, DDS and ROS; exit status 2 means bad input, 1 a failed run,
-130 Ctrl-C.
+130 Ctrl-C or SIGTERM.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -15,9 +16,8 @@ from importlib import import_module
 import click
 
 from gr_ros2 import __version__
+from gr_ros2.cli.ending import BAD_INPUT, FAILED, INTERRUPTED, on_signals
 from gr_ros2.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
-
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
 
@@ -75,6 +75,16 @@ class LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name, command, rest = super().resolve_command(ctx, args)
+        if not isinstance(command, LazyGroup):
+            # Its modules are loaded. What it opens from now on is to be closed, and what it counts kept: after Ctrl-C,
+            # and after the SIGTERM of a service manager.
+            on_signals(signal.default_int_handler)
+        return name, command, rest
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         with formatter.section("Commands"):
             formatter.write_dl([(name, line) for name, (_, line) in self._lazy.items()])
@@ -87,16 +97,11 @@ cli = click.version_option(__version__, prog_name="gr-ros2")(
 )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command; always ends in SystemExit.
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit status; errors go to stderr as one line.
 
     :param arguments: the command line without the program's name, None for the process's own
     """
-    sys.exit(run(arguments))
-
-
-def run(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line and return its exit status; errors go to stderr as one line."""
     try:
         status = cli.main(args=arguments, prog_name="gr-ros2", standalone_mode=False)
         sys.stdout.flush()
@@ -119,7 +124,3 @@ def run(arguments: Sequence[str] | None = None) -> int:
 def _fail(message: str, status: int) -> int:
     print(f"gr-ros2: {' '.join(message.split())}", file=sys.stderr)
     return status
-
-
-if __name__ == "__main__":
-    main()

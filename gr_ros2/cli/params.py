@@ -1,6 +1,10 @@
-"""Types of command-line arguments that shells can complete."""
+"""Arguments and options of several commands, which shells can complete."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
 
 import click
 from click.shell_completion import CompletionItem
@@ -24,3 +28,48 @@ class ScenarioName(click.ParamType):
 
 
 SCENARIO = ScenarioName()
+
+
+class Setting(click.ParamType):
+    """`KEY=VALUE`; what is completed is the key.
+
+    :param settings: class of the configuration that has it
+    """
+
+    name = "setting"
+
+    def __init__(self, settings: type[Any]) -> None:
+        self._settings = settings
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002 - click's signature
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        return [CompletionItem(key) for key in setting_keys(self._settings) if key.startswith(incomplete)]
+
+
+def setting_keys(settings: type[Any], prefix: str = "") -> Iterator[str]:
+    """The keys of a configuration class, dots between those that are nested."""
+    kinds = get_type_hints(settings)
+    for field in fields(settings):
+        if is_dataclass(kinds[field.name]):
+            yield from setting_keys(kinds[field.name], f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name
+
+
+def set_option(settings: type[Any], what: str = "one setting") -> Callable[[Any], Any]:
+    """The option `--set` of a command.
+
+    :param settings: class of the configuration it changes
+    """
+    return click.option(
+        "--set",
+        "overrides",
+        type=Setting(settings),
+        multiple=True,
+        metavar="KEY=VALUE",
+        help=f"Change {what}, dots between keys.",
+    )

@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.experiment.plan import Advice, Forecast, Planner
-from gr_ros2.experiment.scenario import load_scenario
+from gr_ros2.experiment.scenario import Scenario, load_scenario
 
 _WIDTH = 110
 _ADVICE = 3
@@ -17,10 +18,10 @@ _HEADINGS = ("offered [1/s]", "message [B]", "on air [B]", "load", "rate [1/s]",
 
 
 @click.command()
-@click.argument("scenario")
+@click.argument("scenario", type=SCENARIO)
 @click.option("--seed", type=int, help="Seed of robots and sender.")
 @click.option("--duration", type=float, help="Seconds of traffic that are looked at; 0 = to the end of a bag.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@set_option(Scenario)
 @click.option("--no-advice", is_flag=True, help="Only the forecast.")
 def plan(scenario: str, seed: int | None, duration: float | None, overrides: tuple[str, ...], no_advice: bool) -> None:
     """Forecast SCENARIO, a built-in name or a YAML file, without running it, and propose changes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from pathlib import Path
 
@@ -46,7 +45,6 @@ def race(
     settings = build(RaceSettings, {**(_SHORT if short else {}), **chosen}, "race")
     out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
         task = bar.add_task("", total=None)

@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import SCENARIO
+from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.experiment.replay import replay as replay_bag
-from gr_ros2.experiment.scenario import load_scenario
+from gr_ros2.experiment.scenario import Scenario, load_scenario
 from gr_ros2.experiment.table import ledger_table, notes, summary_table
 
 
@@ -20,7 +20,7 @@ from gr_ros2.experiment.table import ledger_table, notes, summary_table
 @click.option("--topics", help="Absolute names with commas between; the registry is then made of the recording.")
 @click.option("--seed", type=int, help="Seed of channel and sender.")
 @click.option("--duration", type=float, default=0.0, help="Seconds of the recording; default 0 = all of it.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys.")
+@set_option(Scenario)
 def replay(
     recording: Path,
     target: Path,

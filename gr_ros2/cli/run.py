@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Sequence
 from itertools import count
@@ -14,9 +13,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
-from gr_ros2.cli.params import SCENARIO
+from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
 from gr_ros2.experiment import runner
@@ -34,9 +34,7 @@ _options = [
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
-    click.option(
-        "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting, dots between keys."
-    ),
+    set_option(Scenario),
     dashboard_option,
     pcap_option,
 ]
@@ -77,8 +75,6 @@ def _run(
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
-    # A service manager's SIGTERM ends a run as Ctrl-C does, with its result written.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     # With pace `flow` the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
     looked_at = audience(dashboard, console, scenario.name, instruments=scenario.pace == "airtime")
     with looked_at as onlookers, capture(pcap) as captures, _bar(console) as bar:
@@ -96,18 +92,29 @@ def _run(
 
 def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
     """Something that shows how far a run is."""
+    how_long = f"{scenario.duration_s:g} s" if scenario.duration_s else "its recording"
+    if scenario.time != "real":
+        bar.console.print(f"{title}: {how_long} of simulated time, as fast as it can be computed", soft_wrap=True)
     task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
+    shown = time.monotonic()
 
     def advance(progress: runner.Progress) -> None:
+        nonlocal shown
         done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
         bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
+        if not bar.console.is_terminal and time.monotonic() - shown >= LOG_S:
+            shown = time.monotonic()
+            bar.console.print(
+                f"{title}: {done:.1f} s of {how_long}, {progress.sent} sent, {progress.delivered} delivered",
+                soft_wrap=True,
+            )
 
     return advance
 
 
 def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path) -> None:
     _print(console, scenario, outcome)
-    kept = f"result.json, bag {runner.DELIVERED_BAG}/, the tables messages and packets"
+    kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
     if outcome.result.interrupted:
         # Who pressed Ctrl-C wants the prompt back, not a second of drawing.
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +9,12 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.main import INTERRUPTED
+from gr_ros2.cli.ending import INTERRUPTED
+from gr_ros2.cli.params import set_option
 from gr_ros2.errors import BackendMissingError, RunError
+from gr_ros2.experiment.scenario import Scenario
 from gr_ros2.experiment.sweep.definition import builtin_sweeps, load_sweep, read_sweep
 from gr_ros2.experiment.table import as_table
 
@@ -29,9 +31,7 @@ _ESTIMATE_S = 3600.0
 @click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, not on this machine.")
 @click.option("--workers", type=click.IntRange(1), help="Processes on this machine; default one per core.")
 @click.option("--fresh", is_flag=True, help="Run everything again, also what is finished.")
-@click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change one setting of all cells, dots between keys."
-)
+@set_option(Scenario, "one setting of all cells")
 def sweep(
     sweep: str | None,
     *,
@@ -50,7 +50,8 @@ def sweep(
         return 0
     plan = load_sweep(sweep, overrides)
     try:
-        from gr_ros2.experiment.sweep.run import run_sweep
+        with uninterrupted():
+            from gr_ros2.experiment.sweep.run import run_sweep
     except ModuleNotFoundError as error:
         package = (error.name or "distributed").split(".")[0]
         raise BackendMissingError(f"sweep needs {package}: pip install 'gr-ros2[sweep]'") from error
@@ -59,8 +60,6 @@ def sweep(
 
     console = make_console()
     out = out or Path("results") / f"sweep-{plan.name}"
-    # A service manager's SIGTERM ends a sweep as Ctrl-C does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _bar(console) as bar:
         task = bar.add_task(plan.name, total=None, note="")
 

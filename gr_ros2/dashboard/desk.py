@@ -34,6 +34,7 @@ class Radio:
     :param channel: as it was set then, None without a run
     :param has_samples: whether there is anything between the antennas to set
     :param backlog: packets between source and antenna
+    :param snr_db: of the newest packets received, dB over the sampled band; None where the PHY does not tell
     :param frequencies: Hz, of each power in ``spectrum_db``; None where there is no signal
     :param symbols: equalised payload symbols, None where the PHY shows none
     """
@@ -41,6 +42,7 @@ class Radio:
     channel: ChannelConfig | None = None
     has_samples: bool = False
     backlog: int | None = None
+    snr_db: float | None = None
     frequencies: Floats | None = None
     spectrum_db: Floats | None = None
     symbols: npt.NDArray[np.complex64] | None = None
@@ -129,6 +131,7 @@ class Desk:
             channel=run.links[0].channel,
             has_samples=run.links[0].phy.has_samples,
             backlog=sum(count.backlog + max(count.passed - count.transmitted, 0) for count in counts),
+            snr_db=run.links[0].snr_db,
             frequencies=None if spectrum is None else spectrum.frequencies,
             spectrum_db=None if spectrum is None else spectrum.decibels(),
             symbols=run.links[0].symbols(),

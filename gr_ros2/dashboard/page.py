@@ -113,7 +113,7 @@ class Page:
 
     def draw(self, snapshot: Snapshot, radio: Radio) -> None:
         """Show this. With the document's lock held."""
-        self._html["tiles"].text = tiles_html(snapshot, radio.backlog)
+        self._html["tiles"].text = tiles_html(snapshot, radio.backlog, radio.snr_db)
         self._html["topics"].text = topics_html(snapshot)
         self._html["paths"].text = paths_html(snapshot)
         self._html["packets"].text = packets_html(snapshot)

@@ -25,10 +25,11 @@ def colour(place: int) -> str:
     return _GREY if place == NO_COLOUR else COLOURS[place % len(COLOURS)]
 
 
-def tiles_html(snapshot: Snapshot, backlog: int | None) -> str:
+def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) -> str:
     """The line on top: where the run is, and the few numbers that sum it up.
 
     :param backlog: packets between source and antenna
+    :param snr_db: of what is received
     """
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
     sent_now, received_now = snapshot.packets_now
@@ -50,6 +51,7 @@ def tiles_html(snapshot: Snapshot, backlog: int | None) -> str:
         ),
         _tile("refused", f"{refused:,}", "packets refused", refused),
         _tile("backlog", "–" if backlog is None else f"{backlog:,}", "packets queued in the PHY", backlog),
+        _tile("snr", "–" if snr_db is None else f"{snr_db:.1f} dB", "SNR received", snr_db),
     ]
     return f'<div class="tiles">{"".join(tiles)}</div>'
 

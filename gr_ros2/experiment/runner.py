@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
@@ -23,7 +24,7 @@ from gr_ros2.experiment.repeat import repetition_folder, repetitions, write_repe
 from gr_ros2.experiment.result import RESULT_FILE, Result, write_result
 from gr_ros2.experiment.scenario import Scenario, dump
 from gr_ros2.experiment.simulated import run_simulated
-from gr_ros2.experiment.trace import write_trace
+from gr_ros2.experiment.trace import write_trace, write_whole
 from gr_ros2.experiment.watch import Fanout, LiveRun, Watcher
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
@@ -31,6 +32,9 @@ from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
 __all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
+
+REGISTRY_FILE = "registry.csv"
+"""The run's registry as it was, for who looks at its packets."""
 
 _MATCH_S = 20.0
 _POLL_S = 0.05
@@ -77,8 +81,8 @@ def run_scenario(
 ) -> Outcome:
     """Run a scenario to its end, or until KeyboardInterrupt.
 
-    :param out: folder for ``result.json``, the tables of the trace and the bag of delivered messages, made if missing;
-        None writes nothing
+    :param out: folder for ``result.json``, the tables of the trace, the registry and the bag of delivered messages,
+        made if missing; None writes nothing
     :param on_progress: called about 20 times a second
     :param watchers: onlookers; where one has ``instruments``, the link is built so that its channel can be changed and
         its signal seen
@@ -99,6 +103,7 @@ def run_scenario(
             watcher.run_ended(None if outcome is None else outcome.result)
     if out is not None:
         write_trace(outcome.trace, out)
+        write_whole(out / REGISTRY_FILE, scenario.registry, copyfile)
         write_result(outcome.result, out / RESULT_FILE)
     return outcome
 

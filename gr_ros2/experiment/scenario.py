@@ -43,14 +43,6 @@ _BACK_SEED = 100_003
 _BAG = "bag:"
 
 
-@dataclass(frozen=True)
-class _Common:
-    """What several parts take over from the top level, to be found wrong once and not in every part."""
-
-    packet_len: PacketLen = 220
-    seed: Count = 0
-
-
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Back:
     """The way back of a two-way scenario, at the same time on a second channel (full duplex).
@@ -181,7 +173,6 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
     :raises ConfigError: for an unknown key, a value out of range, or ends that disagree; names it
     """
     values = dict(values)
-    build(_Common, {key: values[key] for key in ("packet_len", "seed") if key in values}, where)
     prefix = f"{where}: " if where else ""
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
     values.update(with_shared(values, shared, prefix))

@@ -316,7 +316,7 @@ def write_text(text: str, path: Path) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def write_whole(path: Path, table: Any, write: Callable[[Any, Path], None]) -> Path:
+def write_whole(path: Path, table: Any, write: Callable[[Any, Path], object]) -> Path:
     """Write a table or text so that the file appears whole or not at all.
 
     :raises ConfigError: when it cannot be written

@@ -17,6 +17,9 @@ from gr_ros2.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
 
+_NO_LOSS = {"bursts_in", "bursts_out", "blanked"}
+"""Of what a front end counts: what passed, and what half duplex costs by design."""
+
 
 class Level(IntEnum):
     """How bad it is."""
@@ -61,24 +64,23 @@ class _Look(NamedTuple):
     missing: int
     rejected: int
     topics: dict[str, tuple[int, int]]
+    front_end: dict[str, int]
 
 
 class LinkHealth:
     """Judges the snapshots of one link, taken at regular times.
 
     :param name: before the name of every part
-    :param queue_depth: messages that may wait per topic, 0 unbounded
     """
 
-    def __init__(self, config: DiagnosticsConfig, name: str, queue_depth: int) -> None:
+    def __init__(self, config: DiagnosticsConfig, name: str) -> None:
         self._config = config
         self._name = name
-        self._queue_depth = queue_depth
         self._looks: deque[_Look] = deque()
         self._heard_at: float | None = None
 
     def judge(self, stats: Stats, now: float) -> list[Status]:
-        """Receiver, transmitter, and every topic received.
+        """Receiver, transmitter, front end where it counts anything, and every topic received.
 
         :param stats: of a ``RobotLink``
         :param now: s, monotonic
@@ -89,9 +91,10 @@ class LinkHealth:
         while len(self._looks) > 1 and self._looks[1].now <= now - self._config.window_s:
             self._looks.popleft()
         before = self._looks[0] if self._looks else look
+        front_end = self._front_end(look, self._looks[-1].front_end if self._looks else {})
         self._looks.append(look)
         topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
-        return [self._receiver(stats, before, look), self._transmitter(stats, before, look), *topics]
+        return [self._receiver(stats, before, look), self._transmitter(stats, before, look), *front_end, *topics]
 
     def _receiver(self, stats: Stats, before: _Look, look: _Look) -> Status:
         status, limits = Status(f"{self._name}: receiver"), self._config
@@ -121,16 +124,29 @@ class LinkHealth:
         status.values["airtime used"] = f"{min(1.0, rate * stats['phy']['airtime_s']):.3g}"
         status.values["packets waiting"] = str(stats["packets"]["backlog"])
         topics = stats["source"]["topics"].values()
-        waiting = max((topic["queued"] for topic in topics), default=0)
         status.values["messages waiting"] = str(sum(topic["queued"] for topic in topics))
-        if self._queue_depth:
-            status.judge("fullest queue", waiting / self._queue_depth, "", self._config.queue_warn)
+        # A queue of the newest message alone is full by design, and one without a bound never is.
+        bounded = [topic for topic in topics if topic["queue_depth"] and topic["queue"] != "latest"]
+        if bounded:
+            fullest = max(topic["queued"] / topic["queue_depth"] for topic in bounded)
+            status.judge("fullest queue", fullest, "", self._config.queue_warn)
         refused: dict[str, int] = {}
         for topic in topics:
             for reason, count in topic["refused"].items():
                 refused[reason] = refused.get(reason, 0) + count
         status.values |= {f"messages dropped: {reason}": str(count) for reason, count in sorted(refused.items())}
         return status
+
+    def _front_end(self, look: _Look, before: Mapping[str, int]) -> list[Status]:
+        """What the front end counts; a warning of what it lost since the last look. None where it counts nothing."""
+        status = Status(f"{self._name}: front end")
+        for name, count in look.front_end.items():
+            status.values[name.replace("_", " ")] = str(count)
+            new = count - before.get(name, 0)
+            if new > 0 and name not in _NO_LOSS:
+                status.level = Level.WARN
+                status.problems.append(f"{new} {name.replace('_', ' ')}")
+        return [status] if status.values else []
 
     def _topic(self, name: str, topic: Stats, before: _Look, look: _Look) -> Status:
         status, limits = Status(f"{self._name}: {name}"), self._config
@@ -154,7 +170,8 @@ def _look(stats: Stats, now: float) -> _Look:
     sink = stats["sink"]
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
-    return _Look(now, stats["packets"]["out"], sink["packets"], sink["packet_loss_est"], rejected, topics)
+    front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
+    return _Look(now, stats["packets"]["out"], sink["packets"], sink["packet_loss_est"], rejected, topics, front_end)
 
 
 def _rate(count: int, before: _Look, look: _Look) -> float:

@@ -63,6 +63,13 @@ class LatencyWindow:
         self._count += 1
         self._negative += seconds < 0
 
+    def copy(self) -> LatencyWindow:
+        """As it is now."""
+        copied = LatencyWindow()
+        copied._values = self._values.copy()
+        copied._count, copied._negative = self._count, self._negative
+        return copied
+
     @property
     def newest(self) -> float | None:
         """The latency measured last, s."""

@@ -1,8 +1,8 @@
 """ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
 
 Laws: a thin shell, all behaviour is in ``link.Receiver``, which one lock guards; only the bytes of a PDU are trusted;
-the message handler never raises, since that would end the block's thread while the flowgraph seems alive; messages
-are published in completion order; everything not published is counted by name.
+neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph seems
+alive; messages are published in completion order; everything not published is counted by name.
 """
 
 from __future__ import annotations
@@ -81,6 +81,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._counters: Counter[str] = Counter()
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
+        # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
+        # discovered anew. At most 256 senders (the id has 8 bits) of as many topics as the registry has, 16 at most.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._delivered_at: dict[tuple[int, int], float] = {}
@@ -154,7 +156,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             stats = self._receiver.stats
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
-            return {
+            topics = {key: self._topic_stats(key) for key in keys}
+            windows = {key: self._latency[key].copy() for key in keys if key in self._latency}
+            counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
                 "rejected": dict(stats.rejected),
@@ -162,12 +166,17 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 **{name: self._counters[name] for name in _COUNTED},
                 "repeats": stats.repeats,
                 "packet_loss_est": stats.packet_loss_est,
+                "unknown_gaps": stats.unknown_gaps,
                 "message_loss_est": stats.message_loss_est,
                 "held_bytes": self._receiver.held_bytes,
                 "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
-                "topics": {self._name(key): self._topic_stats(key) for key in keys},
                 "middleware": dict(self.middleware.counters),
             }
+        # Thousands of latencies are sorted without the lock, which the next packet waits for.
+        for key, window in windows.items():
+            summaries = {"latency_s": window.summary(), "recent_latency_s": window.summary(RECENT)}
+            topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
+        return {**counted, "topics": {self._name(key): topic for key, topic in topics.items()}}
 
     def set_reassembly_timeout(self, reassembly_timeout: float) -> None:
         """s an incomplete message is kept (raises ConfigError out of range)."""
@@ -194,8 +203,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             "topic_id": key[1],
             "delivered": stats.delivered[key],
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
-            "latency_s": None if window is None else window.summary()._asdict(),
-            "recent_latency_s": None if window is None else window.summary(RECENT)._asdict(),
+            "latency_s": None,
+            "recent_latency_s": None,
             "age_s": None if delivered_at is None else self._clock() - delivered_at + latency,
         }
 
@@ -203,12 +212,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         try:
             self._take(pdu)
         except Exception as error:  # noqa: BLE001 - raised here, it would end the block's thread and all reception
-            with self._lock:
-                self._counters["handler_failed"] += 1
-                first = self._counters["handler_failed"] == 1
-            if first:
-                self._log.exception("ros2_sink: %s", error)
+            self._failed(error)
         self.handled += 1
+
+    def _failed(self, error: Exception) -> None:
+        """Count what should not happen, and tell of the first."""
+        with self._lock:
+            self._counters["handler_failed"] += 1
+            first = self._counters["handler_failed"] == 1
+        if first:
+            self._log.error("ros2_sink: %s", error, exc_info=error)
 
     def _take(self, pdu: Any) -> None:
         data, problem = packet_of(pdu)
@@ -227,15 +240,17 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             events = self._receiver.receive(data, self._clock())
             if self._timer_idle and self._receiver.next_timeout() is not None:
                 self._timer_due.notify_all()
-        for event in events:
-            self._settle(event)
+        self._settle(events)
 
-    def _settle(self, event: ReceiverEvent) -> None:
-        """Do what an event asks for, then tell the observer."""
-        if isinstance(event, Delivered):
-            event = self._publish(event)
-        if self._observer is not None:
-            self._observer(event)
+    def _settle(self, events: Iterable[ReceiverEvent]) -> None:
+        """Do what each event asks for, then tell the observer."""
+        for event in events:
+            try:
+                result = self._publish(event) if isinstance(event, Delivered) else event
+                if self._observer is not None:
+                    self._observer(result)
+            except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
+                self._failed(error)
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
@@ -281,7 +296,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         stamp = leading_time(payload)
         if now is not None and stamp is not None:
             with self._lock:
-                self._latency.setdefault(key, LatencyWindow()).add(now - stamp)
+                if key not in self._latency:
+                    self._forget_the_gone()
+                    self._latency[key] = LatencyWindow()
+                self._latency[key].add(now - stamp)
+
+    def _forget_the_gone(self) -> None:
+        """Free the latencies, 0.3 MB a topic, of senders whose place the receiver has given to others."""
+        known = self._receiver.knows
+        self._latency = {key: window for key, window in self._latency.items() if known(key[0])}
 
     def _set_sim_time(self, payload: bytes) -> None:
         self._sim_time = leading_time(payload)
@@ -297,5 +320,4 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                     self._timer_idle = at is None
                     self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
                     self._timer_idle = False
-            for event in events:
-                self._settle(event)
+            self._settle(events)

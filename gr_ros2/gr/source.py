@@ -42,7 +42,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     """Subscribes topics of a ROS graph and emits them as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit`
-    in, optional: from its first message on, one packet leaves per message.
+    in, optional: from its first message on, as many packets leave as messages came; an integer counts for as many.
 
     Messages are taken from construction on; packets leave while the flowgraph runs. ``close`` leaves the graph; the
     end of the process does it too. A middleware handed over open is started and closed by who opened it.
@@ -85,6 +85,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._block_thread = BlockThread()
         self._unread = False
         self._counters: Counter[str] = Counter()
+        self.emitted = 0
+        """PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
@@ -177,6 +179,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
                     "queue": self._sender.queue(topic.topic_id)[0],
+                    "queue_depth": self._sender.depth(topic.topic_id),
                     "refused": {
                         reason: count for (number, reason), count in stats.refused.items() if number == topic.topic_id
                     },
@@ -271,11 +274,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             self._sender.submit(topic_id, whole or payload, self._clock())
-            self._work.notify()
+            if not self._sender.out_of_credit:  # waking the pump for nothing would cost as much as a packet
+                self._work.notify()
 
-    def _credit(self, _message: Any) -> None:
+    def _credit(self, message: Any) -> None:
+        packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
-            self._sender.credit()
+            self._sender.credit(max(0, packets))
             self._work.notify()
 
     def _pump(self) -> None:
@@ -311,6 +316,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self.config.debug:
                 self._log.debug("tx %s", describe_bytes(data, self.config.packet_len, self.registry))
             self._publish(PDUS, self._pdus.pdu(data, wall))
+        self.emitted += len(packets)
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)

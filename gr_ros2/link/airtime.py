@@ -24,16 +24,16 @@ OUTSTANDING = 2
 class AirtimeClock(Generic[T]):
     """A queue that lets packets through at the pace of the air.
 
-    :param airtime: s each packet occupies, gap included, above 0
+    :param airtime: s each packet occupies, gap included; 0 where packets cross at once
     :param lead: s ahead of the air being free at which the next packet is asked for
     :param early: s before its airtime is over at which a packet leaves: 0 where what follows takes no time, all of its
         airtime and a little more where a device takes it
-    :raises ConfigError: for an airtime that is not above 0, or a negative lead or early
+    :raises ConfigError: for a negative airtime, lead or early
     """
 
     def __init__(self, airtime: float, lead: float = LEAD_S, early: float = 0.0) -> None:
-        if not airtime > 0:
-            raise ConfigError(f"airtime = {airtime} s: must be above 0")
+        if not airtime >= 0:
+            raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
         if not lead >= 0:
             raise ConfigError(f"lead = {lead} s: must be 0 or more")
         if not early >= 0:

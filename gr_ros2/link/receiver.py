@@ -31,7 +31,8 @@ class ReceiverStats:
 
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic;
     ``delivered`` by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason); ``packet_loss_est`` from gaps in
-    sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given up are estimates.
+    sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given up are estimates;
+    ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known of what was lost.
     """
 
     packets: int = 0
@@ -41,6 +42,7 @@ class ReceiverStats:
     lost: Counter[tuple[int, int, str]] = field(default_factory=Counter)
     repeats: int = 0
     packet_loss_est: int = 0
+    unknown_gaps: int = 0
     message_loss_est: int = 0
 
 
@@ -109,6 +111,10 @@ class Receiver:
             return partial.last + self.config.reassembly_timeout
         return None
 
+    def knows(self, src_id: int) -> bool:
+        """Whether a sender has a place at present."""
+        return src_id in self._sources
+
     @property
     def held_bytes(self) -> int:
         """Memory in use for incomplete messages."""
@@ -145,7 +151,8 @@ class Receiver:
         steady = placed.arrival is Arrival.NEXT
         if not steady:
             source.epoch += 1
-            self.stats.packet_loss_est += placed.missing
+            self.stats.packet_loss_est += placed.missing or 0
+            self.stats.unknown_gaps += placed.missing is None
             if placed.arrival is Arrival.LATE:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:

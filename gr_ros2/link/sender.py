@@ -117,7 +117,7 @@ class Sender:
             return
         topic = self.registry[topic_id]
         message = Outgoing(serial, topic_id, payload, QOS_CODES[topic.options.qos], now, topic.options.weight)
-        if dropped := self._queues[topic_id].admit(message, self._depth(topic_id)):
+        if dropped := self._queues[topic_id].admit(message, self.depth(topic_id)):
             self._drop(dropped)
         self._changed(now)
         if topic.latched:
@@ -126,7 +126,7 @@ class Sender:
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
-        if self._credits == 0 or now < self._slot:
+        if self.out_of_credit or now < self._slot:
             return None
         if self._repeat_at:
             self._repeat(now)
@@ -146,7 +146,7 @@ class Sender:
 
     def next_timeout(self) -> float | None:
         """Earliest time at which ``next_packet`` may give something without a further submit or credit."""
-        if self._credits == 0:
+        if self.out_of_credit:
             return None
         times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
         plan = self._planned(self._now)
@@ -177,6 +177,11 @@ class Sender:
         queue = self._queues[topic_id]
         return queue.policy, queue.deadline_s
 
+    def depth(self, topic_id: int) -> int:
+        """Messages of a topic that may wait, 0 unbounded."""
+        depth = self.registry[topic_id].options.queue_depth
+        return self.config.queue_depth if depth is None else depth
+
     def use_credit(self) -> None:
         """From now on a packet leaves only for a credit."""
         if self._credits is None:
@@ -186,9 +191,14 @@ class Sender:
         """The PHY can take so many further packets; the first call does what ``use_credit`` does."""
         self._credits = (self._credits or 0) + packets
 
+    @property
+    def out_of_credit(self) -> bool:
+        """Whether nothing leaves before the next credit, whatever is submitted."""
+        return self._credits == 0
+
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without pushing another out."""
-        return self._queues[topic_id].room(self._depth(topic_id))
+        return self._queues[topic_id].room(self.depth(topic_id))
 
     @property
     def interval(self) -> float:
@@ -225,10 +235,6 @@ class Sender:
 
     def _deadlines(self) -> list[TopicQueue]:
         return [queue for queue in self._queues.values() if queue.deadline_s]
-
-    def _depth(self, topic_id: int) -> int:
-        depth = self.registry[topic_id].options.queue_depth
-        return self.config.queue_depth if depth is None else depth
 
     def _changed(self, now: float) -> None:
         """What waits is not what was planned for."""

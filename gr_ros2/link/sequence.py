@@ -17,6 +17,11 @@ _REMEMBERED = 128
 """How far back packets are remembered: a step is read as -128..127, so further back nothing can be met again."""
 LATEST_S = 0.5
 """How late, in seconds at the recent pace, a packet may come and still be one of this numbering."""
+EARLIEST_S = 2.0
+"""How early, in seconds at the recent pace, a packet may come and beyond doubt be one of this numbering."""
+NEAR = 16
+"""How far ahead a packet's number may be, in doubt, and still tell how many are missing: a sender that has restarted
+counts from anywhere, so seldom from so near."""
 _RESET_JUMP = 4096
 
 
@@ -65,11 +70,14 @@ class Pace:
 
 @dataclass(slots=True)
 class Placed:
-    """A packet's place: its arrival kind, its position, and how many packets are newly missing before it."""
+    """A packet's place: its arrival kind, its position, and how many packets are newly missing before it.
+
+    ``missing`` is None where that is not known: the sender may have restarted, or its numbers may have come round.
+    """
 
     arrival: Arrival
     position: int
-    missing: int = 0
+    missing: int | None = 0
 
 
 class SequenceTracker:
@@ -91,19 +99,23 @@ class SequenceTracker:
         seen = self._recent.get(position)
         if seen == data and newest - position < RECENT_PACKETS:
             return Placed(Arrival.DUPLICATE, position)
-        # Another packet under a number of the last few; a silence in which the numbers may have come round; or a
-        # packet that would have been under way for longer than any link holds one back.
+        elapsed = now - self._last_time
+        # Another packet under a number of the last few; a packet that would have been under way for longer than any
+        # link holds one back; or a silence in which the numbers may have come round.
         collision = seen is not None and seen != data and step != 0
-        silence = step != 1 and now - self._last_time > self._pace.duration(RECENT_PACKETS)
-        reset = collision or silence or (step < 0 and LATEST_S < self._pace.duration(-step) < inf)
-        if reset:
+        restart = collision or (step < 0 and LATEST_S < self._pace.duration(-step) < inf)
+        silence = step != 1 and elapsed > self._pace.duration(RECENT_PACKETS)
+        early = self._pace.duration(step) - elapsed > EARLIEST_S  # so is all while the pace is not known
+        known = not restart and (0 < step <= NEAR or not (silence or early))
+        missing = step - 1 if known else None
+        if restart or silence:
             self._recent.clear()
             self._pace.skip(now)
-            return self._accept(Placed(Arrival.RESET, newest + _RESET_JUMP + step, (step - 1) % 256), data, now, 1)
+            return self._accept(Placed(Arrival.RESET, newest + _RESET_JUMP + step, missing), data, now, 1)
         if step <= 0:
             return self._accept(Placed(Arrival.LATE if step else Arrival.NEXT, position), data, now, 0)
         kind = Arrival.NEXT if step == 1 else Arrival.GAP
-        return self._accept(Placed(kind, position, step - 1), data, now, step)
+        return self._accept(Placed(kind, position, missing), data, now, step)
 
     def _accept(self, placed: Placed, data: bytes, now: float, advance: int) -> Placed:
         if self._newest is None or placed.position > self._newest:

@@ -14,7 +14,7 @@ PHY = BackendTable(
         "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "OFDM against echoes, own or stock receiver", _GNURADIO),
         "gfsk": Backend("gr_ros2.phy.gfsk", "GfskPhy", "GMSK bursts, constant envelope", _GNURADIO),
         "psk": Backend("gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO),
-        "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format", _GNURADIO),
+        "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO),
     },
 )
 

@@ -82,8 +82,10 @@ class Phy(ABC):
         """
 
     @abstractmethod
-    def receiver(self) -> Any:
+    def receiver(self, aside: bool = False) -> Any:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
+        :param aside: in a process of its own where it is made of Python, which keeps the ROS side free; it takes a
+            second to start, and packets come a moment after the samples have passed
         :raises PhyError: for a PHY without samples
         """

@@ -10,7 +10,10 @@ from __future__ import annotations
 import zlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from math import log10
+from statistics import median
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +25,10 @@ Samples = NDArray[np.complex64]
 Octets = NDArray[np.uint8]
 
 CRC_LEN = 4
+_LOOKED_BACK = 16
+"""Packets whose SNRs make one: a single preamble is short, and says it to a decibel."""
+_LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
+"""Beyond these a preamble says nothing: no packet arrives, or what is left is rounding."""
 _SPARE = 1 << 16
 """Samples a receiver's memory holds beside one burst; more of it means less moving."""
 
@@ -45,12 +52,17 @@ class Frame:
         fill: int = 0,
         mask: Octets | None = None,
     ) -> None:
+        self._again = partial(Frame, packet_len, fec, order=order, fill=fill, mask=mask)
         self.packet_len = packet_len
         self.length = packet_len + fill + CRC_LEN
         self.coded = fec != "none"
         self._fill, self._order = bytes(fill), order
         self._mask = whitening(self.length) if mask is None else mask
         self._code = make_code(fec, 8 * self.length)
+
+    def __reduce__(self) -> Any:
+        # Codes hold GNU Radio's objects, which cannot be sent to another process: it makes its own.
+        return self._again, ()
 
     @property
     def bits(self) -> int:
@@ -105,10 +117,12 @@ class Reading:
 
     :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; filling may follow
     :param points: what they were read from, for people to look at; magnitude about 1
+    :param snr: mean power of the burst over that of the noise in the sampled band, as its preamble shows them
     """
 
     soft: Soft
     points: Samples
+    snr: float
 
 
 class BurstModem(ABC):
@@ -179,6 +193,18 @@ class BurstReceiver:
         """What the newest packet was read from."""
         self.damaged = 0
         """Bursts found whose CRC-32 was wrong; noise taken for a preamble counts too."""
+        self._snrs: tuple[float, ...] = ()
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR over the sampled band, dB, -40..60: the median of the newest packets; None before the first.
+
+        To be called from any thread.
+        """
+        if not self._snrs:
+            return None
+        snr = max(median(self._snrs), 10 ** (_LEAST_SNR_DB / 10))
+        return min(10 * log10(snr), _MOST_SNR_DB)
 
     def feed(self, samples: Samples) -> list[bytes]:
         """Take the next samples; returns the packets they complete."""
@@ -228,5 +254,6 @@ class BurstReceiver:
             else:
                 packets.append(packet)
                 self.points = reading.points
+                self._snrs = (*self._snrs[1 - _LOOKED_BACK :], reading.snr)
                 self._cursor = self._last - self._modem.margin
             self._start = self._last = None

@@ -7,35 +7,30 @@ tagged with its length, its gap behind it; all behaviour is in the modem.
 from __future__ import annotations
 
 import logging
+import os
 from abc import abstractmethod
 from collections import deque
 from typing import Annotated, Any
 
 import numpy as np
 import pmt
-from gnuradio import filter, gr, pdu
+from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.fec import CodeName
+from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.tap import SymbolTap
-from gr_ros2.phy.threads import BlockThread, keep_messages, only_warnings
+from gr_ros2.phy.threads import Held
 
 _PDUS = pmt.intern("pdus")
-_TX_KEY = "gr_ros2_tx_len"
 _SAMPLE_LEN = 8
-_SMALLEST_BUFFER = 32768
 _U8_OFFSET = 8
 """A serialized u8vector: type 10, kind 0, length u32 big-endian, one byte of padding and its count, then the bytes."""
 _log = logging.getLogger(__name__)
-
-_alive: set[Any] = set()
-_stopped: deque[Any] = deque(maxlen=32)
-"""GNU Radio calls Python blocks without holding a reference, so a flowgraph whose maker dropped the hier block around
-them would crash. They are held here until they have stopped, and a while longer, since a flowgraph may start again; not
-for ever, since a block holds the buffers in front of it."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -68,31 +63,25 @@ class BurstPhy(Phy):
     def transmitter(self) -> BurstTransmitter:
         return BurstTransmitter(self)
 
-    def receiver(self) -> BurstSink:
-        return BurstSink(self)
+    def receiver(self, aside: bool = False) -> BurstSink:
+        return BurstSink(self, aside and len(os.sched_getaffinity(0)) > 1)
 
 
-class BurstTransmitter(gr.hier_block2):  # type: ignore[misc]
+class BurstTransmitter(HierBlock):
     """Message port `pdus` in, complex stream out."""
 
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(f"gr_ros2_{phy.name}_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, _SAMPLE_LEN))
-        keep_messages()
         self.message_port_register_hier_in("pdus")
         self._airtime_samples = phy.airtime_samples()
         self._modulator = _Modulator(phy)
-        with only_warnings():
-            self._to_stream = pdu.pdu_to_tagged_stream(gr.types.complex_t, _TX_KEY)
-        if 2 * _SAMPLE_LEN * self._airtime_samples > _SMALLEST_BUFFER:
-            self._to_stream.set_min_output_buffer(2 * self._airtime_samples)
         self.msg_connect((self, "pdus"), (self._modulator, "pdus"))
-        self.msg_connect((self._modulator, "pdus"), (self._to_stream, "pdus"))
-        self.connect(self._to_stream, self)
+        self.connect(self._modulator, self)
 
     def packets_sent(self) -> int:
         """Packets that have left as samples; 0 before the flowgraph runs."""
         try:
-            return int(self._to_stream.nitems_written(0)) // self._airtime_samples
+            return int(self._modulator.nitems_written(0)) // self._airtime_samples
         except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
             return 0
 
@@ -102,51 +91,72 @@ class BurstTransmitter(gr.hier_block2):  # type: ignore[misc]
         return self._modulator.refused
 
 
-class _Modulator(gr.basic_block):  # type: ignore[misc]
-    """Message port `pdus` in, `pdus` out: a packet's burst and gap as bytes."""
+class TakesPackets(Held):
+    """Message port `pdus` in of a Python block inside a hier block; stands before GNU Radio's class.
+
+    :param packet_len: bytes of a packet; anything else is dropped and counted
+    :param args: of GNU Radio's class
+    """
+
+    def __init__(self, packet_len: int, *args: Any) -> None:
+        super().__init__(*args)
+        self._packet_len = packet_len
+        self.refused = 0
+        block: Any = self
+        block.message_port_register_in(_PDUS)
+        block.set_msg_handler(_PDUS, self._take)
+
+    @abstractmethod
+    def take_packet(self, packet: bytes) -> None:
+        """What becomes of a packet."""
+
+    def _take(self, message: Any) -> None:
+        vector = pmt.cdr(message) if pmt.is_pair(message) else message
+        if pmt.is_u8vector(vector) and pmt.length(vector) == self._packet_len:
+            self.take_packet(pmt.serialize_str(vector)[_U8_OFFSET:])
+            return
+        self.refused += 1
+        if self.refused == 1:
+            block: Any = self
+            _log.warning("%s: dropped a PDU that is not %d bytes", block.name(), self._packet_len)
+
+
+class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
+    """Message port `pdus` in, samples out: each packet's burst and gap.
+
+    One block and not a modulator before ``pdu_to_tagged_stream``: that one asks for room for a whole packet, and where
+    there is none sleeps until the next message comes, or 250 ms.
+    """
 
     def __init__(self, phy: BurstPhy) -> None:
-        super().__init__(f"gr_ros2_{phy.name}_modulator", None, None)
+        super().__init__(phy.packet_len, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._modem = phy.modem
-        self._gap = [0j] * phy.gap
-        self._packet_len = phy.packet_len
-        self.refused = 0
-        self._block_thread = BlockThread()
-        self.message_port_register_in(_PDUS)
-        self.message_port_register_out(_PDUS)
-        self.set_msg_handler(_PDUS, self._send)
-        _alive.add(self)
+        self._gap = np.zeros(phy.gap, np.complex64)
+        self._waiting: deque[bytes] = deque()
+        self._rest = self._gap[:0]
 
-    def start(self) -> bool:
-        _alive.add(self)
-        self._block_thread.keep()
-        return True
+    def take_packet(self, packet: bytes) -> None:
+        self._waiting.append(packet)
 
-    def stop(self) -> bool:
-        self._block_thread.release()
-        _alive.discard(self)
-        _stopped.append(self)
-        return True
-
-    def _send(self, message: Any) -> None:
-        vector = pmt.cdr(message) if pmt.is_pair(message) else message
-        if not pmt.is_u8vector(vector) or pmt.length(vector) != self._packet_len:
-            self.refused += 1
-            if self.refused == 1:
-                _log.warning("%s: dropped a PDU that is not %d bytes", self.name(), self._packet_len)
-            return
-        burst = self._modem.modulate(pmt.serialize_str(vector)[_U8_OFFSET:])
-        samples = burst.tolist() + self._gap
-        self.message_port_pub(_PDUS, pmt.cons(pmt.make_dict(), pmt.init_c32vector(len(samples), samples)))
+    def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
+        if not len(self._rest):
+            if not self._waiting:
+                return 0
+            self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
+        out = output_items[0]
+        count = min(len(out), len(self._rest))
+        out[:count] = self._rest[:count]
+        self._rest = self._rest[count:]
+        return count
 
 
-class BurstSink(gr.hier_block2):  # type: ignore[misc]
+class BurstSink(HierBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
-    def __init__(self, phy: BurstPhy) -> None:
+    def __init__(self, phy: BurstPhy, aside: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx", gr.io_signature(1, 1, _SAMPLE_LEN), gr.io_signature(0, 0, 0))
         self.message_port_register_hier_out("pdus")
-        self._demodulator = _Demodulator(phy)
+        self._demodulator = _Demodulator(phy, aside)
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)
         else:
@@ -158,26 +168,41 @@ class BurstSink(gr.hier_block2):  # type: ignore[misc]
         """Bursts found whose CRC-32 was wrong."""
         return self._demodulator.damaged
 
+    @property
+    def failed(self) -> int:
+        """Times the modem could not cope with what it heard, and began anew."""
+        return self._demodulator.failed
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR over the sampled band of the newest packets, dB; None before the first."""
+        return self._demodulator.snr_db
+
     def tap_symbols(self) -> SymbolTap:
         """Let the points that packets are read from be seen."""
         return SymbolTap(self._demodulator.points)
 
 
-class _Demodulator(gr.sync_block):  # type: ignore[misc]
+class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
     """Filtered samples in, message port `pdus` out."""
 
-    def __init__(self, phy: BurstPhy) -> None:
+    def __init__(self, phy: BurstPhy, aside: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
         self._modem = phy.modem
-        self._engine: BurstReceiver | None = None
-        self._damaged = 0
-        self._block_thread = BlockThread()
+        self._aside = aside
+        self._engine: BurstReceiver | ReceiverProcess | None = None
+        self._damaged = self.failed = 0
+        self._snr_db: float | None = None
         self.message_port_register_out(_PDUS)
-        _alive.add(self)
 
     @property
     def damaged(self) -> int:
         return self._damaged + (self._engine.damaged if self._engine is not None else 0)
+
+    @property
+    def snr_db(self) -> float | None:
+        engine = self._engine
+        return self._snr_db if engine is None else engine.snr_db
 
     def points(self) -> Samples:
         """What the newest packet was read from; empty before the first."""
@@ -185,23 +210,37 @@ class _Demodulator(gr.sync_block):  # type: ignore[misc]
         return np.empty(0, np.complex64) if engine is None else engine.points
 
     def start(self) -> bool:
-        _alive.add(self)
-        self._block_thread.keep()
-        self._engine = BurstReceiver(self._modem)
-        return True
+        self._engine = ReceiverProcess(self._modem, self._publish) if self._aside else BurstReceiver(self._modem)
+        return super().start()
 
     def stop(self) -> bool:
-        self._damaged, self._engine = self.damaged, None
-        self._block_thread.release()
-        _alive.discard(self)
-        _stopped.append(self)
-        return True
+        self._end_engine()
+        return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        assert self._engine is not None
-        for packet in self._engine.feed(input_items[0]):
-            self.message_port_pub(_PDUS, pdu_of(packet))
+        for packet in self._packets(input_items[0]):
+            self._publish(packet)
         return len(input_items[0])
+
+    def _packets(self, samples: Samples) -> list[bytes]:
+        assert self._engine is not None
+        try:
+            return self._engine.feed(samples)
+        except Exception as error:  # noqa: BLE001 - raised in ``work`` it would end the block's thread, and all reception
+            self.failed += 1
+            if self.failed == 1:
+                _log.exception("%s: begins anew after %s", self.name(), error)
+            self._end_engine()
+            self._engine = BurstReceiver(self._modem)
+            return []
+
+    def _end_engine(self) -> None:
+        if isinstance(self._engine, ReceiverProcess):
+            self._engine.close()
+        self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
+
+    def _publish(self, packet: bytes) -> None:
+        self.message_port_pub(_PDUS, pdu_of(packet))
 
 
 def pdu_of(data: bytes) -> Any:

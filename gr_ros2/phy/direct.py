@@ -39,5 +39,5 @@ class DirectPhy(Phy):
     def transmitter(self) -> Any:
         raise PhyError("phy direct has no transmitter; connect the source's `pdus` to the sink's")
 
-    def receiver(self) -> Any:
+    def receiver(self, aside: bool = False) -> Any:  # noqa: ARG002
         raise PhyError("phy direct has no receiver; connect the source's `pdus` to the sink's")

@@ -29,7 +29,7 @@ _CC_MIDDLE, _CC_STEP = 127.5, 12.0
 """The Viterbi decoder takes bytes: a soft bit of 10, which is certain enough, is next to their end."""
 _LDPC = ((152, 300, "n_0300_k_0152_gap_03"), (902, 1800, "n_1800_k_0902_gap_28"))
 """GNU Radio's codes of rate one half: data bits, coded bits, file."""
-_LDPC_SIGMA, _LDPC_ROUNDS = 0.5, 25
+_LDPC_ROUNDS = 25
 _LIMIT = 20.0
 """Beyond this a soft bit is certain; the LDPC decoder works with its exponential."""
 _LEAST = 1e-3
@@ -146,7 +146,7 @@ class Ldpc(Blocks):
         self._checks = self._size - self._room
         self.coded_bits = self.count * (self.each + self._checks)
         self._encoder = fec.ldpc_encoder.make(str(path))
-        self._decoder = fec.ldpc_decoder.make(str(path), _LDPC_SIGMA, _LDPC_ROUNDS)
+        self._decoder = _ldpc_decoder(str(path))
 
     def encode(self, bits: Bits) -> Bits:
         word = np.zeros(self._room, np.uint8)
@@ -164,10 +164,17 @@ class Ldpc(Blocks):
         known = np.where(np.abs(soft) < _LEAST, np.float32(_LEAST), np.clip(soft, -_LIMIT, _LIMIT))
         for block in known.reshape(self.count, -1):
             levels[: block.size] = block
-            # The decoder makes likelihoods of exp(-level / (2 sigma^2)).
-            out.append(_work(self._decoder, levels * np.float32(2 * _LDPC_SIGMA**2), self._room)[: self.each])
+            out.append(_work(self._decoder, levels, self._room)[: self.each])
         data: Bits = np.concatenate(out)[: self.bits]
         return data
+
+
+def _ldpc_decoder(path: str) -> Any:
+    """One that takes log likelihood ratios: GNU Radio's own do from 3.10.8 on, before that those of a sigma of √½."""
+    try:
+        return fec.ldpc_decoder.make(path, 0.5**0.5, _LDPC_ROUNDS)
+    except TypeError:
+        return fec.ldpc_decoder.make(path, _LDPC_ROUNDS)
 
 
 class Polar(Blocks):

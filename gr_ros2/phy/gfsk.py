@@ -48,8 +48,9 @@ class GfskModem(LinearModem):
         super().__init__(frame, 2, options.sps, turn=np.pi / 2)
         self._pulse = frequency_pulse(options.sps, options.bt)
         self.taps: NDArray[np.float32] = wiener(main_pulse(self._pulse, options.sps), options.sps).astype(np.float32)
-        self._head = np.concatenate((np.tile([1, -1], _LEAD // 2), preamble_steps()))
+        self._head = np.concatenate((np.tile([1.0, -1.0], _LEAD // 2), preamble_steps()))
         self._last = np.uint8(np.prod(preamble_steps()) < 0)
+        self._prepare_estimate()
 
     @property
     def symbol_energy(self) -> float:
@@ -59,13 +60,21 @@ class GfskModem(LinearModem):
     def burst_samples(self) -> int:
         return (_LEAD + self.symbols + _TAIL - 2) * self.sps + len(self._pulse)
 
+    @property
+    def preamble(self) -> Samples:
+        return self._wave(self._head)
+
     def modulate(self, packet: bytes) -> Samples:
         data = self.frame.wrap(packet)
         if self.frame.coded:
             data = 1 ^ data ^ np.concatenate(([self._last], data[:-1]))
         bits = np.concatenate((self._head, 2.0 * data - 1, np.tile([1, -1], _TAIL // 2)))
-        burst: Samples = np.exp(1j * np.cumsum(shape(bits, self._pulse, self.sps))).astype(np.complex64)
-        return burst
+        return self._wave(bits)
+
+    def _wave(self, signs: Reals) -> Samples:
+        """Samples of bits, given as signs."""
+        wave: Samples = np.exp(1j * np.cumsum(shape(signs, self._pulse, self.sps))).astype(np.complex64)
+        return wave
 
     def meant(self, soft: Soft) -> Soft:
         # A bit is 1 where the phase is that of the symbol before, the first one's before is the preamble's last. With a

@@ -1,14 +1,14 @@
 """Single-carrier bursts: phase-shift keying with a known preamble, synchronised feed-forward.
 
-Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it; frequency,
-phase and timing of each burst are measured on its preamble and followed along its payload in blocks, with no loop that
-could be locked wrongly from the burst before.
+Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is one
+only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
+preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +26,23 @@ PREAMBLE = 64
 """Symbols: a first one and the 63 phase steps of a maximum-length sequence."""
 _SLACK = 4
 """Samples after the last symbol that interpolation and a late start may need."""
-_THRESHOLD, _CODED_THRESHOLD = 0.45, 0.36
-"""Correlation over power: 63 steps of noise alone pass once in 10^6 samples, a burst that can be read has 0.7. With a
-code one can be read that has 0.4; then noise passes once in 10^4, which costs time only."""
+_THRESHOLD = 0.31
+"""Correlation of the phase steps over the most that equal ones could have, from which on samples are looked at closely:
+noise alone passes once in 500, a burst that can be read with a code has 0.35, without one 0.7."""
+_ALIKE = 0.28
+"""Share of the preamble's power in a single carrier, from which on it is one: a burst that can be read has 0.3, noise
+once in several 10^6 samples."""
 _RISE = 16
 """Symbols before its summit at which the correlation of a strong burst may pass the threshold."""
 _CHUNK = 256
 """Symbols between two looks at the timing: clocks may differ by 100 ppm."""
 _BLOCK = 64
 """Symbols per estimate of the phase."""
-_TINY = 1e-20
+_EDGE = 4
+"""Symbols at either end of the preamble that what lies beside it may reach into."""
+_REACH = 3
+"""Half symbols either side of a symbol from which something of it may come: echoes, and the pulse's own tails."""
+_TINY = 1e-30
 
 
 def preamble_steps() -> NDArray[np.int8]:
@@ -45,6 +52,19 @@ def preamble_steps() -> NDArray[np.int8]:
         steps.append(1 if state & 1 else -1)
         state = state >> 1 | ((state ^ state >> 1) & 1) << 5
     return np.array(steps, np.int8)
+
+
+class _Carrier(NamedTuple):
+    """A preamble's symbols without their signs, and the carrier that is left.
+
+    :param symbols: as received
+    :param frequency: radians per symbol, without the modulation's own turn
+    :param alike: share of their power that this carrier explains, 0..1
+    """
+
+    symbols: Samples
+    frequency: float
+    alike: float
 
 
 class LinearModem(BurstModem):
@@ -59,6 +79,8 @@ class LinearModem(BurstModem):
     :param turn: phase steps beside data and carrier, radians per symbol
     """
 
+    stretch = 2048
+
     def __init__(self, frame: Frame, order: int, sps: int, turn: float = 0.0) -> None:
         super().__init__(frame)
         self.order, self.sps = order, sps
@@ -68,7 +90,6 @@ class LinearModem(BurstModem):
         self.symbols = PREAMBLE + self.payload_symbols
         self.margin = sps + _SLACK
         self._turn = turn
-        self._threshold = _CODED_THRESHOLD if frame.coded else _THRESHOLD
         self._steps = preamble_steps().astype(np.float32)
         known = np.concatenate(([1], np.cumprod(preamble_steps()))) * np.exp(1j * turn * np.arange(PREAMBLE))
         self._known = known.astype(np.complex64)
@@ -93,6 +114,27 @@ class LinearModem(BurstModem):
     def peak_samples(self) -> int:
         return 2 * self.sps
 
+    @property
+    @abstractmethod
+    def preamble(self) -> Samples:
+        """The beginning of every burst, as sent."""
+
+    def _prepare_estimate(self) -> None:
+        """Learn what the preamble is like behind the filter, without noise."""
+        pause = np.zeros(2 * _RISE * self.sps)
+        clean = np.convolve(np.concatenate((pause, self.preamble, pause)), self.taps).astype(np.complex64)
+        start = self.find(clean).start
+        assert start is not None
+        inner = np.arange(_EDGE, PREAMBLE - _EDGE)
+        places = start + inner * self.sps
+        shifts = [round(half * self.sps / 2) for half in range(-_REACH, _REACH + 1)]
+        columns = np.stack([clean[places + shift] for shift in shifts], axis=1) * self._known[inner, None].conj()
+        self._clean_energy = float((np.abs(columns[:, _REACH]) ** 2).sum())
+        # A carrier that is measured wrongly turns a column in proportion to the place.
+        columns = np.concatenate((columns, columns[:, _REACH : _REACH + 1] * (inner[:, None] - PREAMBLE / 2)), axis=1)
+        basis, _ = np.linalg.qr(columns)
+        self._explained = np.asarray(basis.conj().T, np.complex64)
+
     def payload(self, packet: bytes) -> Samples:
         """The payload's points."""
         return self.constellation.map(self.frame.wrap(packet))
@@ -103,28 +145,29 @@ class LinearModem(BurstModem):
         if positions <= 0:
             return Search(0)
         steps = samples[sps:] * samples[:-sps].conj()
-        match = np.empty(positions, np.float32)
+        match, chance = np.empty((2, positions), np.float32)
         for phase in range(min(sps, positions)):
-            real = np.correlate(np.ascontiguousarray(steps[phase::sps].real), self._steps)
-            imag = np.correlate(np.ascontiguousarray(steps[phase::sps].imag), self._steps)
-            length = len(match[phase::sps])
-            match[phase::sps] = np.hypot(real, imag)[:length]
-        power = np.concatenate(([0.0], np.cumsum(np.abs(samples) ** 2, dtype=np.float64)))
-        width = (PREAMBLE - 1) * sps + 1
-        energy = (power[width:] - power[:-width]) / sps
-        head = (power[width // 4 : width // 4 + positions] - power[:positions]) / sps
-        # A window that still reaches into silence holds few steps, and few steps match by chance.
-        above = np.flatnonzero((match > self._threshold * energy + _TINY) & (head > energy / 8))
-        if not len(above):
-            return Search(positions)
-        first = int(above[0])
-        if first + _RISE * sps > positions:  # the highest point may still be to come
-            return Search(first)
-        return Search(first, first + int(np.argmax(match[first : first + _RISE * sps])))
+            real = np.ascontiguousarray(steps[phase::sps].real)
+            imag = np.ascontiguousarray(steps[phase::sps].imag)
+            match[phase::sps] = np.correlate(real, self._steps) ** 2 + np.correlate(imag, self._steps) ** 2
+            chance[phase::sps] = np.correlate(real**2 + imag**2, self._steps**2)
+        # By chance the square of a sum of steps is the sum of their squares, be they 63 of noise or, where a window
+        # reaches into silence, a few of a burst. Over their power those few would often look like a preamble.
+        above = np.flatnonzero(match > _THRESHOLD**2 * (PREAMBLE - 1) * chance + _TINY)
+        at = 0
+        while at < len(above):
+            first = int(above[at])
+            if first + _RISE * sps > positions:  # the highest point may still be to come
+                return Search(first)
+            best = first + int(np.argmax(match[first : first + _RISE * sps]))
+            if self._carrier(samples, best).alike > _ALIKE:
+                return Search(first, best)
+            at = int(np.searchsorted(above, best + 1))
+        return Search(positions)
 
     def read(self, samples: Samples, start: int) -> Reading:
         sps, order = self.sps, self.order
-        start, frequency, phase = self._measure(samples, start)
+        frequency, phase, snr = self._measure(samples, start)
         late = 0.0
         start_exact = start + self._lateness(samples, start, frequency)
         points = np.empty(self.payload_symbols, np.complex64)
@@ -149,26 +192,43 @@ class LinearModem(BurstModem):
         decided = self.constellation.nearest(points)
         gain, noise = spread_about(points, decided)
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
-        return Reading(self.meant(self.constellation.soft(likely)), points / np.float32(gain))
+        return Reading(self.meant(self.constellation.soft(likely)), points / np.float32(gain), snr)
 
     def meant(self, soft: Soft) -> Soft:
         """Soft bits of the frame from those of the phases: the same unless the modulation has memory."""
         return soft
 
-    def _measure(self, samples: Samples, start: int) -> tuple[int, float, float]:
-        """Reference sample, carrier frequency and phase from the preamble, in radians per symbol and radians.
+    def _measure(self, samples: Samples, start: int) -> tuple[float, float, float]:
+        """Carrier frequency and phase from the preamble, in radians per symbol and radians, and SNR.
 
         The turn of the modulation counts as carrier here.
         """
+        symbols, frequency, _ = self._carrier(samples, start)
+        straight = symbols * np.exp(-1j * frequency * np.arange(PREAMBLE))
+        return frequency + self._turn, float(np.angle(straight.sum())), self._snr(straight[_EDGE:-_EDGE])
+
+    def _carrier(self, samples: Samples, start: int) -> _Carrier:
+        """Look closely at a preamble."""
         size = 4 * PREAMBLE
-        known = samples[start : start + PREAMBLE * self.sps : self.sps] * self._known.conj()
-        spectrum = np.fft.fft(known, size)
-        height = np.abs(spectrum)
+        symbols = samples[start : start + PREAMBLE * self.sps : self.sps] * self._known.conj()
+        height = np.abs(np.fft.fft(symbols, size))
         peak = int(np.argmax(height))
         place = peak + summit(height[peak - 1], height[peak], height[(peak + 1) % size])
         frequency = 2 * np.pi * ((place + size / 2) % size - size / 2) / size
-        phase = float(np.angle((known * np.exp(-1j * frequency * np.arange(PREAMBLE))).sum()))
-        return start, frequency + self._turn, phase
+        power = PREAMBLE * float(np.vdot(symbols, symbols).real)
+        return _Carrier(symbols, frequency, float(height[peak]) ** 2 / max(power, _TINY))
+
+    def _snr(self, received: Samples) -> float:
+        """Mean power of a burst over that of the noise, from its preamble's inner symbols.
+
+        What an echo, a place between samples or the pulse itself adds to a symbol from its neighbours is no noise.
+        """
+        explained = self._explained @ received
+        unknowns, count = self._explained.shape
+        total = float(np.vdot(received, received).real)
+        rest = max(total - float(np.vdot(explained, explained).real), _TINY)
+        noise = rest / (count - unknowns)
+        return (total - count * noise) / (self._clean_energy * noise)
 
     def _lateness(self, samples: Samples, start: int, frequency: float) -> float:
         """Samples by which the preamble's symbols lie behind ``start``, -0.5..0.5."""

@@ -2,13 +2,13 @@
 
 Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame of known length; the
 format is our own (it has LoRa's chirps, Gray code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no
-header), so it does not talk to LoRa modems.
+header), so it does not talk to LoRa modems. With `implementation: lora_sdr` all of this is that module's.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import build
 from gr_ros2.errors import ConfigError
-from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frame, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import summit
+from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 
 MAX_BURST = 1 << 22
@@ -33,6 +34,8 @@ _LOOK = 6
 _LIMIT, _THRESHOLD = 10.0, 36.0
 """Powers over the mean of all bins: what one chirp counts at most, and what a burst's chirps add up to. A burst that
 can be read has 50, noise alone passes once in 10^6 symbols."""
+_MEDIAN = (1 - 1 / (9 * _LOOK)) ** 3
+"""Of the noise in a bin that so many chirps add up to, over its mean: a chi-squared distribution's."""
 _TINY = 1e-20
 _FINE = 4
 """Parts of a bin that peaks are searched in."""
@@ -46,6 +49,9 @@ _NIBBLE = np.array([8, 4, 2, 1])
 """Weights of a nibble's bits, in the order they come."""
 _SINC = 12
 """Samples to either side that a value between two samples is made from."""
+_SDR_ONLY = ("oversampling", "sync_word", "ldro", "carrier_hz")
+_SDR_GAP, _SDR_LEAST_GAP = 32, 24
+"""Chips; what filter and synchroniser of the module's receiver hold back are 20."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -55,10 +61,36 @@ class LoraOptions(BurstOptions):
     :param spreading_factor: bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and
         2.5 dB less SNR
     :param coding_rate: check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none
+    :param implementation: ``own``, or ``lora_sdr`` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr,
+        which has to be installed. Neither understands the other, so it is chosen by name, the same at both ends, and
+        never by what is installed
+    :param gap: zero samples after each packet, up to 100000; None = 32, with ``lora_sdr`` 32 chips. Below 16, with
+        ``lora_sdr`` 24 chips, the receiver would keep the last packet waiting for the next
+    :param oversampling: ``lora_sdr`` only: samples per chip, 2, 4 or 8; None = 2. With 1 the module loses packets that
+        come half a sample late; symbols of more than 2048 samples (factor 11 with 2) make it crash and are refused
+    :param sync_word: ``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; None = 0x12, private networks
+    :param ldro: ``lora_sdr`` only: low data rate optimisation, two bits fewer per symbol; LoRa modems turn it on where
+        a symbol takes more than 16 ms; None = off
+    :param carrier_hz: ``lora_sdr`` only: the radio's carrier frequency, 1e6..4.2e9 Hz, by which the module tells how
+        much the clocks differ; None = it takes them to be alike
     """
 
     spreading_factor: Annotated[int, Field(ge=7, le=12)] = 7
     coding_rate: Annotated[int, Field(ge=1, le=4)] = 4
+    implementation: Literal["own", "lora_sdr"] = "own"
+    gap: Annotated[int, Field(ge=16, le=100_000)] | None = None  # type: ignore[assignment]
+    oversampling: Literal[2, 4, 8] | None = None
+    sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | None = None
+    ldro: bool | None = None
+    carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9)] | None = None
+
+
+class _Place(NamedTuple):
+    """Where a burst's payload begins, carrier offset in bins, and SNR."""
+
+    begin: float
+    carrier: float
+    snr: float
 
 
 class LoraModem(BurstModem):
@@ -73,6 +105,9 @@ class LoraModem(BurstModem):
         n = np.arange(self.chips)
         self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)
         self._down = self._up.conj()
+        taper = np.hanning(self.chips)
+        self._tapered = (taper * self._down).astype(np.complex64)
+        self._median_share = 1 / (_LOOK * _MEDIAN * float((taper**2).sum()))
         self._roots = np.exp(2j * np.pi * n / self.chips).astype(np.complex64)
         self._words = code_words(options.coding_rate)
         gray = n ^ n >> 1
@@ -110,11 +145,11 @@ class LoraModem(BurstModem):
             return Search(0)
         powers = np.abs(np.fft.fft(samples[: count * self.chips].reshape(count, -1) * self._down)) ** 2
         powers = powers / np.maximum(powers.mean(axis=1, keepdims=True), _TINY)
-        # However strong, one chirp counts no more than a few times the noise: data repeat a value now and then.
-        summed = np.cumsum(np.concatenate((np.zeros((1, self.chips)), np.minimum(powers, _LIMIT))), axis=0)
-        summed = summed[_LOOK:] - summed[:-_LOOK]
-        # Neighbours count together: a burst that starts between two samples shares its peak between two bins.
-        pairs = summed + np.roll(summed, 1, axis=1)
+        # Neighbours count together: a burst that starts between two samples shares its peak between two bins. However
+        # strong, one chirp counts no more than a few times the noise: data repeat a value now and then, and end.
+        pairs = np.minimum(powers + np.roll(powers, 1, axis=1), _LIMIT)
+        pairs = np.cumsum(np.concatenate((np.zeros((1, self.chips)), pairs)), axis=0)
+        pairs = pairs[_LOOK:] - pairs[:-_LOOK]
         above = np.flatnonzero(pairs.max(axis=1) > _THRESHOLD)
         if not len(above):
             return Search((count - _LOOK) * self.chips)
@@ -122,19 +157,19 @@ class LoraModem(BurstModem):
         if first + _LOOK >= len(pairs):  # a strong burst is seen as it comes in; the best place is yet to come
             return Search(first * self.chips)
         best = first + int(np.argmax(pairs[first : first + _LOOK + 1].max(axis=1)))
-        late = int(np.argmax(summed[best]))
+        late = int(np.argmax(np.minimum(powers[best : best + _LOOK], _LIMIT).sum(axis=0)))
         return Search(first * self.chips, best * self.chips + (self.chips - late) % self.chips)
 
     def end(self, samples: Samples, start: int) -> int:
         place = self._place(samples, start)
         # What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
-        return start + self.span if place is None else int(place[0]) + self.symbols * self.chips - _SINC
+        return start + self.span if place is None else int(place.begin) + self.symbols * self.chips - _SINC
 
     def read(self, samples: Samples, start: int) -> Reading | None:
         place = self._place(samples, start)
         if place is None:
             return None
-        begin, carrier = place
+        begin, carrier, snr = place
         turn = np.exp(-2j * np.pi * carrier * np.arange(self.chips) / self.chips) * self._down
         soft = np.empty((self.symbols, self.spreading_factor), np.float32)
         points = np.empty(self.symbols, np.complex64)
@@ -152,7 +187,7 @@ class LoraModem(BurstModem):
             late = self._late(tones, peaks)
             pace -= _PACE_GAIN * late
             begin += pace - _GAIN * late
-        return Reading(self._collect(soft), points)
+        return Reading(self._collect(soft), points, snr)
 
     def _soft(self, heights: NDArray[np.float64]) -> Soft:
         """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
@@ -180,8 +215,8 @@ class LoraModem(BurstModem):
         turned = float((part * whole.conj()).imag.sum())
         return float(np.clip(turned * 6 / (np.pi * max(power, _TINY)), -0.5, 0.5))
 
-    def _place(self, samples: Samples, start: int) -> tuple[float, float] | None:
-        """Where the payload begins, and carrier offset in bins; None where this is no burst."""
+    def _place(self, samples: Samples, start: int) -> _Place | None:
+        """Look closely at a preamble; None where this is no burst."""
         windows = samples[start : start + (_HEAD + 1) * self.chips]
         windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
         falls = self._powers(windows, self._up)
@@ -198,9 +233,23 @@ class LoraModem(BurstModem):
         if first < 0:
             return None
         windows = samples[first:begin].reshape(-1, self.chips)
-        rise = self._bin(self._powers(windows[:_LOOK], self._down).sum(axis=0))
+        rises = self._powers(windows[:_LOOK], self._down).sum(axis=0)
+        rise = self._bin(rises)
         fall = self._bin(self._powers(windows[-_DOWN:], self._up).sum(axis=0))
-        return begin + (fall - rise) / 2, (fall + rise) / 2
+        snr = self._snr(windows[:_LOOK], float(rises.max()))
+        return _Place(begin + (fall - rise) / 2, (fall + rise) / 2, snr)
+
+    def _snr(self, chirps: Samples, top: float) -> float:
+        """Power of a burst over that of the noise.
+
+        :param chirps: its up-chirps
+        :param top: of the spectrum that they add up to
+        """
+        # Tapered, since a chirp between two samples breaks off where it jumps back, and is heard in all bins; the
+        # median, since an echo has a bin of its own.
+        powers = (np.abs(np.fft.fft(chirps * self._tapered)) ** 2).sum(axis=0)
+        noise = max(float(np.median(powers)) * self._median_share, _TINY)
+        return (top / (_LOOK * self.chips) - noise) / (noise * self.chips)
 
     def _powers(self, windows: Samples, chirp: Samples) -> NDArray[np.float64]:
         """Spectra of windows against a chirp, ``_FINE`` places a bin."""
@@ -264,27 +313,77 @@ def _delayed(samples: Samples, at: float, count: int) -> Samples:
 
 
 class LoraPhy(BurstPhy):
-    """For links far below the noise, at a low rate: half of all packets of 64 B arrive at -8 dB with factor 7.
+    """For links far below the noise, at a low rate: half of all packets of 64 B arrive at -11 dB with factor 7.
 
-    Carrier offset up to a tenth of the band, clocks within 10 ppm. One packet is one frame, however long, as long as it
-    has at most 2^22 samples: 4095 B with spreading factor 9 and below, 767 B with 12 (with 4 check bits).
+    Carrier offset up to a tenth of the band, clocks within 60 ppm with factor 7, 15 ppm with 12. One packet is one
+    frame, however long, as long as it has at most 2^22 samples: 4095 B with spreading factor 9 and below, 767 B with 12
+    (with 4 check bits); with ``lora_sdr`` 251 B.
 
     :param options: see :class:`LoraOptions`
-    :raises ConfigError: for an option that is unknown or out of range, or a burst above 2^22 samples
+    :raises ConfigError: for an option that is unknown or out of range, or a packet that is too long
+    :raises BackendMissingError: for ``lora_sdr`` where gr-lora_sdr is not installed
     """
 
     name = "lora"
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate)
-        self.options = build(LoraOptions, options, "phy lora")
-        self.modem: LoraModem = LoraModem(Frame(packet_len, self.options.fec), self.options)
-        self.gap = self.options.gap
+        self.options = chosen = build(LoraOptions, options, "phy lora")
+        self._sdr: SdrFrame | None = None
+        if chosen.implementation == "lora_sdr":
+            self._sdr = self._checked_sdr()
+            self.gap = self._sdr.gap
+            return
+        for name in _SDR_ONLY:
+            if getattr(chosen, name) is not None:
+                raise ConfigError(f"phy lora: {name} = {getattr(chosen, name)}: only with implementation = lora_sdr")
+        self.modem: LoraModem = LoraModem(Frame(packet_len, chosen.fec), chosen)
+        self.gap = BurstOptions.gap if chosen.gap is None else chosen.gap
         if self.modem.burst_samples > MAX_BURST:
             raise ConfigError(
-                f"phy lora: packet_len = {packet_len} with spreading_factor = {self.options.spreading_factor}: a burst "
+                f"phy lora: packet_len = {packet_len} with spreading_factor = {chosen.spreading_factor}: a burst "
                 f"of {self.modem.burst_samples} samples is above {MAX_BURST}; take a smaller one of either"
             )
+
+    def _checked_sdr(self) -> SdrFrame:
+        chosen = self.options
+        if chosen.fec != "none":
+            raise ConfigError(
+                f"phy lora: fec = {chosen.fec!r}: gr-lora_sdr gives no soft bits; take implementation = own"
+            )
+        if self.packet_len > MAX_PAYLOAD - CRC_LEN:
+            raise ConfigError(
+                f"phy lora: packet_len = {self.packet_len}: at most {MAX_PAYLOAD - CRC_LEN} with lora_sdr; "
+                f"a LoRa frame has {MAX_PAYLOAD} bytes, {CRC_LEN} of them our CRC-32"
+            )
+        sync_word = 0x12 if chosen.sync_word is None else chosen.sync_word
+        if not sync_word & 0x0F:
+            raise ConfigError(f"phy lora: sync_word = 0x{sync_word:02x}: the module takes no digit of 0")
+        per_chip = chosen.oversampling or 2
+        gap = _SDR_GAP * per_chip if chosen.gap is None else chosen.gap
+        if gap < _SDR_LEAST_GAP * per_chip:
+            raise ConfigError(
+                f"phy lora: gap = {gap}: below {_SDR_LEAST_GAP * per_chip} the last packet stays in gr-lora_sdr"
+            )
+        if per_chip << chosen.spreading_factor > MAX_SYMBOL:
+            raise ConfigError(
+                f"phy lora: spreading_factor = {chosen.spreading_factor} with oversampling = {per_chip}: gr-lora_sdr "
+                f"crashes with symbols above {MAX_SYMBOL} samples; take less of either, or implementation = own"
+            )
+        load()
+        return SdrFrame(
+            packet_len=self.packet_len,
+            spreading_factor=chosen.spreading_factor,
+            coding_rate=chosen.coding_rate,
+            oversampling=per_chip,
+            sync_word=sync_word,
+            ldro=bool(chosen.ldro),
+            gap=gap,
+            carrier=None if chosen.carrier_hz is None else chosen.carrier_hz * per_chip / self.sample_rate,
+        )
+
+    def airtime_samples(self) -> int:
+        return super().airtime_samples() if self._sdr is None else self._sdr.airtime_samples
 
     @property
     def receiver_taps(self) -> Any:
@@ -298,9 +397,18 @@ class LoraPhy(BurstPhy):
 
         For hard decisions, and an upper bound on their loss: two wrong symbols need not meet in a code word.
         """
-        modem = self.modem
-        wrong = orthogonal_symbol_error(modem.chips, 10 ** (snr_db / 10) * modem.chips)
-        if modem.frame.coded:
-            return coded_orthogonal_success(modem.chips, wrong, modem.frame.data_bits, modem.symbols)
-        lost = at_least(2 if self.options.coding_rate >= 3 else 1, modem.code_bits, wrong)
-        return packet_success(lost, modem.blocks)
+        chips, check_bits = 1 << self.options.spreading_factor, self.options.coding_rate
+        samples = chips if self._sdr is None else self._sdr.symbol_samples
+        wrong = orthogonal_symbol_error(chips, 10 ** (snr_db / 10) * samples)
+        lost = at_least(2 if check_bits >= 3 else 1, 4 + check_bits, wrong)
+        if self._sdr is not None:
+            return (1 - at_least(2, 8, wrong)) * packet_success(lost, self._sdr.blocks)
+        if self.modem.frame.coded:
+            return coded_orthogonal_success(chips, wrong, self.modem.frame.data_bits, self.modem.symbols)
+        return packet_success(lost, self.modem.blocks)
+
+    def transmitter(self) -> Any:
+        return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
+
+    def receiver(self, aside: bool = False) -> Any:
+        return super().receiver(aside) if self._sdr is None else SdrReceiver(self._sdr)

@@ -11,19 +11,19 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pmt
 from gnuradio import blocks, gr
 
+from gr_ros2.backends import uninterrupted
 from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.burst_blocks import pdu_of
 from gr_ros2.phy.channel import Channel
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.threads import begin, finish, run_through
 
 _PDUS = pmt.intern("pdus")
 _PATIENCE_S = 60.0
@@ -77,8 +77,9 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
     outlet = _Outlet()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
     wanted = len(packets) * phy.airtime_samples()
-    begin(top.start)
     try:
+        with uninterrupted():
+            begin(top.start)
         for packet in packets:
             outlet.message_port_pub(_PDUS, pdu_of(packet))
         came, deadline = 0, time.monotonic() + _PATIENCE_S
@@ -90,8 +91,8 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
             time.sleep(_POLL_S)
     finally:
         top.stop()
-        top.wait()
-        release(transmitter)
+        finish(top)
+        transmitter.release()
     return Recording(list(packets), np.array(sink.data(), np.complex64))
 
 
@@ -101,20 +102,10 @@ def deliver(phy: Phy, recording: Recording, channel: ChannelConfig) -> list[byte
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
     top.msg_connect(receiver, "pdus", log, "store")
-    begin(top.start)
-    top.wait()
-    release(receiver)
+    run_through(top)
+    receiver.release()
     vectors = (pmt.cdr(log.get_message(place)) for place in range(log.num_messages()))
     return [bytes(pmt.u8vector_elements(vector)) for vector in vectors]
-
-
-def release(hier_block: Any) -> None:
-    """Let GNU Radio free a hier block after its last run.
-
-    One with message ports holds itself, and with it every buffer of its flowgraph: 60 shared memory segments for an
-    OFDM receiver, of 4096 a system has.
-    """
-    hier_block.disconnect_all()
 
 
 def pdr(phy: Phy, recording: Recording, channel: ChannelConfig) -> float:

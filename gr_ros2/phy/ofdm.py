@@ -15,7 +15,7 @@ from gr_ros2.config import build
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.burst import Frame
 from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
-from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, point_power
+from gr_ros2.phy.ofdm_layout import Layout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
@@ -111,14 +111,7 @@ class OfdmPhy(BurstPhy):
         return self.layout.symbols(self.frame_bits()) * self.layout.symbol_samples + self.gap
 
     def burst_power(self) -> float:
-        # The transmitter's inverse FFT is not normalised, so a symbol's mean power is the sum over its carriers.
-        # The first sync word has every other carrier, at twice the power; unused carriers of the last symbol are 0.
-        data, pilots = len(self.layout.data[0]), len(self.layout.pilots[0])
-        symbols = self.layout.symbols(self.frame_bits())
-        points = -(-self.frame_bits() // self.layout.bits_per_carrier)
-        head = HEAD_SYMBOLS * (data + pilots)
-        tail = (symbols - HEAD_SYMBOLS) * pilots
-        return (head + tail + points * point_power(self.options.payload_modulation)) / symbols
+        return self.layout.power(self.frame_bits())
 
     def computed_pdr(self, snr_db: float) -> float:
         noise = self.burst_power() / 10 ** (snr_db / 10)
@@ -136,5 +129,5 @@ class OfdmPhy(BurstPhy):
     def transmitter(self) -> Any:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self) -> Any:
-        return super().receiver() if self._stock is None else StockReceiver(self._stock)
+    def receiver(self, aside: bool = False) -> Any:
+        return super().receiver(aside) if self._stock is None else StockReceiver(self._stock)

@@ -55,19 +55,28 @@ class Layout:
     pilot_places: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        outermost, places = max(self.data[0]), self.pilots[0]
-        if outermost >= self.fft_len // 2:
-            raise ConfigError(f"phy ofdm: carriers = {outermost}: at most {self.fft_len // 2 - 1} with this fft_len")
-        for place in places:
-            if not 0 < abs(place) <= outermost:
-                raise ConfigError(f"phy ofdm: pilots: {place} is not one of the carriers 1 to {outermost} either side")
-        if len(set(places)) < max(len(places), 2):
-            raise ConfigError(f"phy ofdm: pilots = {places}: at least two are needed, each once")
-        if len(self.data[0]) < _HEADER_BITS:
+        places, left = self.pilots[0], len(self.data[0])
+        if self.outermost >= self.fft_len // 2:
             raise ConfigError(
-                f"phy ofdm: {len(self.data[0])} carriers are left for data, the header needs {_HEADER_BITS}; "
+                f"phy ofdm: carriers = {self.outermost}: at most {self.fft_len // 2 - 1} with this fft_len"
+            )
+        if left < _HEADER_BITS:
+            raise ConfigError(
+                f"phy ofdm: {left} carriers are left for data, the header needs {_HEADER_BITS}; "
                 "use more carriers, or fewer pilots"
             )
+        if self.pilot_places is None and self.outermost < max(places):
+            raise ConfigError(
+                f"phy ofdm: carriers = {self.outermost}: unless set, pilots are {places}; "
+                f"give pilots too, at most {self.outermost} either side"
+            )
+        for place in places:
+            if not 0 < abs(place) <= self.outermost:
+                raise ConfigError(
+                    f"phy ofdm: pilots: {place} is not one of the carriers 1 to {self.outermost} either side"
+                )
+        if len(set(places)) < max(len(places), 2):
+            raise ConfigError(f"phy ofdm: pilots = {places}: at least two are needed, each once")
 
     @property
     def symbol_samples(self) -> int:
@@ -91,6 +100,17 @@ class Layout:
         """Of a frame with so many bits of payload: sync words, header, payload."""
         return HEAD_SYMBOLS + -(-bits // (self.bits_per_carrier * len(self.data[0])))
 
+    def power(self, bits: int) -> float:
+        """Mean squared magnitude of the samples of such a frame."""
+        # The transmitter's inverse FFT is not normalised, so a symbol's mean power is the sum over its carriers.
+        # The first sync word has every other carrier, at twice the power; unused carriers of the last symbol are 0.
+        data, pilots = len(self.data[0]), len(self.pilots[0])
+        symbols = self.symbols(bits)
+        points = -(-bits // self.bits_per_carrier)
+        head = HEAD_SYMBOLS * (data + pilots)
+        tail = (symbols - HEAD_SYMBOLS) * pilots
+        return (head + tail + points * point_power(self.modulation)) / symbols
+
     def mask(self, length: int) -> NDArray[np.uint8]:
         """What scrambling adds to the bytes of a payload, zeros where it is off."""
         seed = _SCRAMBLER["seed"] if self.scramble else 0
@@ -113,9 +133,14 @@ class Layout:
         return (tuple(place * scale for place in (-21, -7, 7, 21)),)
 
     @property
+    def outermost(self) -> int:
+        """Outermost carrier used, either side."""
+        return 26 * self.fft_len // 64 if self.edge is None else self.edge
+
+    @property
     def data(self) -> tuple[tuple[int, ...], ...]:
         """Data carriers: all up to the edge without pilots and the middle one."""
-        edge = 26 * self.fft_len // 64 if self.edge is None else self.edge
+        edge = self.outermost
         return (tuple(place for place in range(-edge, edge + 1) if place and place not in self.pilots[0]),)
 
     @property

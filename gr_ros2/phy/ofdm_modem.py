@@ -81,6 +81,7 @@ class OfdmModem(BurstModem):
         self.margin = self._prefix
         self.stretch = max(2048, 16 * self._size)
         self.symbols = layout.symbols(frame.bits)
+        self._power = layout.power(frame.bits)
         self._carriers = np.array(sorted(layout.data[0] + layout.pilots[0]))
         self._data = np.flatnonzero(np.isin(self._carriers, layout.data[0]))
         self._pilots = np.searchsorted(self._carriers, layout.pilots[0])
@@ -89,6 +90,9 @@ class OfdmModem(BurstModem):
         self._header = self._bpsk.map(layout.header_bits(-(-frame.bits // 8)))
         words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
         self._words = words[:, self._carriers].astype(np.complex64)
+        self._twice, self._once = np.flatnonzero(self._words[0]), np.flatnonzero(self._words[0] == 0)
+        self._crosswise = self._words[::-1, self._twice]
+        self._pair_weight = float((np.abs(self._crosswise) ** 2).sum()) / len(self._twice)
         self._prepare_search(words)
         self._prepare_estimate()
 
@@ -179,6 +183,7 @@ class OfdmModem(BurstModem):
         clock = _Clock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
         channel = self._first_estimate(rows[:2])
+        snr = self._snr(rows[:2])
         channel, _, _, _ = self._decide(rows[2:], channel, self._bpsk, np.ones((1, len(self._data)), bool), rounds=1)
         count = self.symbols - HEAD_SYMBOLS
         points = -(-self.frame.bits // self.constellation.bits)
@@ -192,7 +197,7 @@ class OfdmModem(BurstModem):
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
             clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
-        return Reading(np.concatenate(soft), np.concatenate(looked))
+        return Reading(np.concatenate(soft), np.concatenate(looked), snr)
 
     def _place(self, samples: Samples, at: int) -> _Place:
         """Look closely at a place where the first half of a symbol is repeated."""
@@ -245,6 +250,20 @@ class OfdmModem(BurstModem):
         rest = rows - gains * self._words
         noise = float((np.abs(rest) ** 2).sum()) / self._degrees
         return _Channel(gains, self._word_weight, max(noise, _TINY))
+
+    def _snr(self, rows: NDArray[np.complex64]) -> float:
+        """Mean power of a burst over that of the noise in the sampled band, from both sync words.
+
+        Noise is what stands on carriers that the first word leaves empty, and what both words differ by on the others:
+        unlike the rest of an estimate of the channel it holds nothing of the channel, whatever that is like.
+        """
+        first, second = rows[:, self._twice] * self._crosswise
+        alike = abs(complex(np.vdot(first, second)))
+        differ = float(np.vdot(first, first).real + np.vdot(second, second).real) - 2 * alike
+        empty = float(np.vdot(rows[0, self._once], rows[0, self._once]).real)
+        noise = max(empty + differ / self._pair_weight, _TINY) / (len(self._carriers) - 0.5)
+        signal = float(np.vdot(rows, rows).real) - rows.size * noise
+        return signal * self._power / (float(self._word_weight.sum()) * noise * self._size)
 
     def _decide(
         self, rows: NDArray[np.complex64], channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2

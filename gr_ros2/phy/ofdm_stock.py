@@ -20,6 +20,7 @@ from typing import Any
 import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
+from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, Layout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import keep_messages, only_warnings
@@ -33,7 +34,7 @@ _TX_KEY, _RX_KEY, _RX_FRAME_KEY, _RX_PACKET_KEY = (
 _SPINNING_THREAD = "header_pay"
 """How the name of the demultiplexer's thread begins: the kernel keeps 15 characters, GNU Radio's block number too."""
 SPINNING_NICE = 10
-"""Nice value of such a thread: a tenth of the weight of a normal one."""
+"""Added to the nice value of such a thread: a tenth of the weight of the others."""
 _THREADS_WAIT_S = 0.2
 _SMALLEST_BUFFER = 32768
 """Bytes GNU Radio gives every buffer anyway."""
@@ -100,16 +101,17 @@ def idle_spinning_threads() -> None:
     """
     tasks = Path("/proc/self/task")
     deadline = time.monotonic() + _THREADS_WAIT_S
+    nice = os.getpriority(os.PRIO_PROCESS, 0) + SPINNING_NICE
     found = False
     while tasks.is_dir() and not found and time.monotonic() < deadline:
         for task in tasks.iterdir():
             with suppress(OSError):  # threads come and go
                 if (task / "comm").read_text().startswith(_SPINNING_THREAD):
-                    os.setpriority(os.PRIO_PROCESS, int(task.name), SPINNING_NICE)
+                    os.setpriority(os.PRIO_PROCESS, int(task.name), nice)
                     found = True
 
 
-class StockTransmitter(gr.hier_block2):  # type: ignore[misc]
+class StockTransmitter(HierBlock):
     """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
 
     def __init__(self, frame: StockFrame) -> None:
@@ -143,16 +145,16 @@ class StockTransmitter(gr.hier_block2):  # type: ignore[misc]
             return 0
 
 
-class StockReceiver(gr.hier_block2):  # type: ignore[misc]
+class StockReceiver(HierBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: StockFrame) -> None:
         super().__init__("gr_ros2_ofdm_rx", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
         self.message_port_register_hier_out("pdus")
         self._frame = frame
+        self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
         # Header parser and demultiplexer tell of every header lost in noise.
-        with only_warnings():
-            self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
+        only_warnings(self._demodulator.parts)
         self.connect(self, self._demodulator)
         last, key, parts = self._demodulator, _RX_KEY, list(self._demodulator.parts)
         if frame.fill:
@@ -222,7 +224,7 @@ class OfdmModulator(gr.hier_block2):  # type: ignore[misc]
         note(self.parts, self, points)
 
 
-class OfdmDemodulator(gr.hier_block2):  # type: ignore[misc]
+class OfdmDemodulator(HierBlock):
     """Samples in, tagged bytes out: frames whose CRC-32 is right.
 
     :param packet_key, frame_key: names of the length tags of packets and frames, not that of the transmitter

@@ -46,6 +46,7 @@ class PskModem(LinearModem):
         pulse /= np.sqrt((pulse**2).sum())
         self.taps: NDArray[np.float32] = pulse.astype(np.float32)
         self._pulse = pulse * np.sqrt(self.symbol_energy)
+        self._prepare_estimate()
 
     @property
     def symbol_energy(self) -> float:
@@ -54,6 +55,10 @@ class PskModem(LinearModem):
     @property
     def burst_samples(self) -> int:
         return (self.symbols - 1) * self.sps + len(self.taps)
+
+    @property
+    def preamble(self) -> Samples:
+        return shape(self._known, self._pulse, self.sps).astype(np.complex64)
 
     def modulate(self, packet: bytes) -> Samples:
         return shape(np.concatenate((self._known, self.payload(packet))), self._pulse, self.sps).astype(np.complex64)

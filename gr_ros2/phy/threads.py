@@ -11,11 +11,12 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterable
 from functools import cached_property
+from typing import Any, ClassVar
 
-from gnuradio import gr
+from gr_ros2.backends import uninterrupted
 
 SWITCH_INTERVAL_S = 5e-5
 """Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
@@ -23,6 +24,9 @@ default of 5 ms (two hops), 0.2 ms with this."""
 
 _MAX_MESSAGES = "GR_CONF_DEFAULT_MAX_MESSAGES"
 """Environment variable of GNU Radio's setting ``max_messages``, read when a flowgraph starts."""
+
+_LOOK_S = 0.1
+"""A thread that waits without end does not always hear a signal."""
 
 _START_ATTEMPTS = 20
 """GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
@@ -60,16 +64,43 @@ def begin(start: Callable[[], None]) -> None:
     start()
 
 
-@contextmanager
-def only_warnings() -> Iterator[None]:
-    """Blocks made in here log warnings only, not each buffer set on them."""
-    logging = gr.logging()
-    level = logging.default_level()
-    logging.set_default_level(gr.log_levels.warn)
+def finish(flowgraph: Any) -> None:
+    """Wait until a flowgraph has come to its end.
+
+    KeyboardInterrupt stops it and comes through. GNU Radio's own ``wait`` stops it too, but returns as if all
+    of it had passed.
+    """
+    waiting = threading.Thread(target=flowgraph.wait, daemon=True)  # signals reach the main thread alone
     try:
-        yield
-    finally:
-        logging.set_default_level(level)
+        with uninterrupted():
+            waiting.start()
+        while waiting.is_alive():
+            waiting.join(_LOOK_S)
+    except BaseException:
+        flowgraph.stop()
+        waiting.join()
+        raise
+
+
+def run_through(flowgraph: Any) -> None:
+    """Start a flowgraph and wait until it has come to its end; see :func:`begin` and :func:`finish`.
+
+    Whatever happens it is stopped: one that is let go while it runs waits for its threads with Python's lock held.
+    """
+    try:
+        with uninterrupted():
+            begin(flowgraph.start)
+        finish(flowgraph)
+    except BaseException:
+        flowgraph.stop()
+        flowgraph.wait()
+        raise
+
+
+def only_warnings(blocks: Iterable[Any]) -> None:
+    """Let these blocks log warnings only, not each buffer set on them."""
+    for block in blocks:
+        block.set_log_level("warn")
 
 
 class BlockThread:
@@ -110,3 +141,28 @@ class KeepsThread:
     def stop(self) -> bool:
         self._block_thread.release()
         return True
+
+
+class Held(KeepsThread):
+    """A Python block inside a hier block; stands before GNU Radio's class.
+
+    GNU Radio calls Python blocks without holding a reference, so a flowgraph whose maker dropped the hier block around
+    them would crash. They are held here until they have stopped, and a while longer, since a flowgraph may start again;
+    not for ever, since a block holds the buffers in front of it.
+    """
+
+    _alive: ClassVar[set[Any]] = set()
+    _stopped: ClassVar[deque[Any]] = deque(maxlen=32)
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._alive.add(self)
+
+    def start(self) -> bool:
+        self._alive.add(self)
+        return super().start()
+
+    def stop(self) -> bool:
+        self._alive.discard(self)
+        self._stopped.append(self)
+        return super().stop()

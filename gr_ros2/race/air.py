@@ -234,6 +234,8 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
     def __init__(self, tun: Tun, radio: Radio, log: AirLog) -> None:
         super().__init__("gr_ros2_tun_source", None, None)
         self._tun, self._log = tun, log
+        self.emitted = 0
+        """PDUs that have left."""
         self._airtimes = [radio.airtime_s(length) for length in range(MTU + 1)]
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -267,6 +269,7 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
                 return
             self._log.note(free, len(packet), airtime)
             self.message_port_pub(PDUS, pmt.cons(pmt.make_dict(), pmt.init_u8vector(len(packet), list(packet))))
+            self.emitted += 1
 
 
 class TunSink(KeepsThread, gr.basic_block):  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Bursts as transmitting devices want them: padded, at the right level, begun and ended by tags; and a deaf receiver
+"""Bursts as transmitting devices want them: padded, at the right level, their length told by a tag; and a deaf receiver
 meanwhile, where the device needs it.
 
 Laws: every burst has the same length, so where one begins and ends is arithmetic on sample numbers, never a tag from
@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from gr_ros2.phy.threads import KeepsThread
 
-SOB, EOB = pmt.intern("tx_sob"), pmt.intern("tx_eob")
-"""What `uhd.usrp_sink` begins and ends a burst at."""
+LENGTH_TAG = "burst_len"
+"""On a burst's first sample: how many it has. With ``tx_sob`` and ``tx_eob`` instead ``uhd.usrp_sink`` would begin one
+of its own when it starts, which can damage the first two of ours (gnuradio#1944)."""
+_LENGTH = pmt.intern(LENGTH_TAG)
 _REMEMBERED = 64
 """Bursts whose times are kept: more than a receiver can be behind."""
 
@@ -51,7 +53,7 @@ class BurstLayout:
 
 
 class BurstShaper(KeepsThread, gr.basic_block):  # type: ignore[misc]
-    """A transmitter's samples in, whole bursts out: tags ``tx_sob`` and ``tx_eob``, no others.
+    """A transmitter's samples in, whole bursts out, tagged with their length.
 
     A sample beyond full scale, which a converter would turn into its opposite, is brought back to it and counted.
 
@@ -116,10 +118,8 @@ class BurstShaper(KeepsThread, gr.basic_block):  # type: ignore[misc]
 
     def _tagged(self, bursts: int) -> int:
         total = self._layout.total
-        first = self.nitems_written(0)
-        for begin in range(first, first + bursts * total, total):
-            self.add_item_tag(0, begin, SOB, pmt.PMT_T)
-            self.add_item_tag(0, begin + total - 1, EOB, pmt.PMT_T)
+        for burst in range(bursts):
+            self.add_item_tag(0, self.nitems_written(0) + burst * total, _LENGTH, pmt.from_long(total))
         return bursts * total
 
 

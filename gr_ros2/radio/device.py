@@ -1,19 +1,19 @@
 """What all radios have in common: frequencies, gains, antennas, and a transmitter that works in bursts.
 
 Laws: a device gets its samples at the time they go on the air, whole bursts only, none beyond full scale; a device
-that cannot run at the PHY's sample rate is refused, since packets at another rate are noise; whatever the vendor's
-library throws, and a device that falls silent, becomes one line that names front end, args and remedy.
+that is not at the sample rate, frequency and gain asked for is refused before it sends: packets at another rate are
+noise, and another frequency may be somebody else's; whatever the vendor's library throws, and a device that falls
+silent or deaf, becomes one line that names front end, args and remedy.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import sqrt
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from gnuradio import blocks, gr
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -21,18 +21,24 @@ from gr_ros2.config import Count, Seconds
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
+from gr_ros2.radio.events import GapCounter
 from gr_ros2.radio.front_end import STRICT, FrontEnd, FrontEndOptions, Hertz
 
-RATE_TOLERANCE = 1e-4
-"""How far from the sample rate asked for a device may run; the PHYs are made for clocks within 100 ppm."""
+TOLERANCE = 1e-4
+"""How far from the sample rate and frequency asked for a device may be; the PHYs are made for clocks within 100 ppm."""
+
+GAIN_TOLERANCE = 0.5
+"""dB a gain may differ from what was asked for, where the device has no coarser step."""
 
 SILENT_S = 3.0
-"""s without a sample after which a device is taken for dead; changing direction takes some a tenth of that."""
+"""s without a sample given or taken after which a device is held for dead; changing direction takes a tenth of it."""
 
 _LEAD_S = 0.002
-"""s before its airtime begins at which a device gets a packet, so that one follows the other without a pause."""
+"""s before its airtime begins at which a device gets a packet, so that one follows the other without a pause; where
+there is to be a pause, it gets it when that is over."""
 
 Decibels = Annotated[float, Field(ge=-200, le=200)]
+Direction = Literal["tx", "rx"]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -100,8 +106,8 @@ class DeviceFrontEnd(FrontEnd):
         self._blanker: Blanker | None = None
         if chosen.half_duplex:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround, phy.sample_rate)
-        self._arrivals = self._blanker or blocks.copy(gr.sizeof_gr_complex)
-        self._heard, self._heard_at = -1, float("-inf")
+        self._gaps = GapCounter()
+        self._given, self._taken = _Progress(), _Progress()
         self._transmitting: Any = None
         self._receiving: Any = None
         with self.one_line():
@@ -126,33 +132,51 @@ class DeviceFrontEnd(FrontEnd):
 
     @property
     def source(self) -> Any:
-        return self._arrivals
+        return self._blanker or self._receiving
 
     def wire(self, graph: Any) -> None:
         graph.connect(self._shaper, self._transmitting)
-        graph.connect(self._receiving, self._arrivals)
+        graph.connect(self._receiving, self._gaps)
+        if self._blanker is not None:
+            graph.connect(self._receiving, self._blanker)
+
+    def _silence(self) -> float:
+        """s after each burst in which nothing is sent."""
+        return float(self.options.guard + (self.options.turnaround if self.options.half_duplex else 0.0))
 
     def airtime(self) -> float:
-        deaf = self.options.turnaround if self.options.half_duplex else 0.0
-        return self.layout.total / self.phy.sample_rate + float(self.options.guard) + float(deaf)
+        return self.layout.total / self.phy.sample_rate + self._silence()
 
     def early(self) -> float:
-        return self.airtime() + _LEAD_S
+        return self.airtime() + (0.0 if self._silence() else _LEAD_S)
 
     def check(self, now: float) -> None:
-        heard = int(self._arrivals.nitems_written(0))
-        if heard != self._heard:
-            self._heard, self._heard_at = heard, now
-        elif now - self._heard_at > SILENT_S:
-            raise RadioError(
-                f"front_end {self.name}: args = {self.options.args!r}: no samples for {SILENT_S:g} s; was the device "
-                "unplugged, or is the machine too slow for phy.sample_rate?"
-            )
+        if self._given.still_s(self._gaps.nitems_read(0), now) > SILENT_S:
+            raise self._dead("no samples")
+        taken = self._transmitting.nitems_read(0)
+        waiting = taken < self._shaper.nitems_written(0)
+        if self._taken.still_s(taken if waiting else None, now) > SILENT_S + self.layout.total / self.phy.sample_rate:
+            raise self._dead("a burst to send was not taken")
+
+    def _dead(self, symptom: str) -> RadioError:
+        return RadioError(
+            f"front_end {self.name}: args = {self.options.args!r}: {symptom} for {SILENT_S:g} s; was the device "
+            "unplugged, or is the machine too slow for phy.sample_rate?"
+        )
 
     def counters(self) -> dict[str, int]:
-        """``clipped``: samples beyond full scale; ``blanked``: samples not heard because we were sending."""
+        """What was lost, and what the device tells of it.
+
+        ``clipped``: samples beyond full scale; ``blanked``: samples not heard because we were sending; ``overflows``:
+        places where samples received were lost before they came here; and :meth:`_told`.
+        """
         blanked = {} if self._blanker is None else {"blanked": self._blanker.blanked}
-        return {"clipped": self._shaper.clipped, **blanked}
+        overflows = {} if self._gaps.gaps is None else {"overflows": self._gaps.gaps}
+        return {"clipped": self._shaper.clipped, **blanked, **overflows, **self._told()}
+
+    def _told(self) -> dict[str, int]:
+        """What is known of bursts behind the shaper, by name."""
+        return {}
 
     def close(self) -> None:
         # The device is let go when nothing holds its blocks.
@@ -161,11 +185,54 @@ class DeviceFrontEnd(FrontEnd):
     def check_rate(self, got: float) -> None:
         """:raises RadioError: when a device runs at another sample rate than the PHY"""
         wanted = self.phy.sample_rate
-        if abs(got - wanted) > RATE_TOLERANCE * wanted:
-            raise RadioError(
-                f"front_end {self.name}: args = {self.options.args!r}: the device runs at {got:,.0f} samples/s, not at "
-                f"{wanted:,.0f}; set phy.sample_rate to one it has"
-            )
+        if not abs(got - wanted) <= TOLERANCE * wanted:
+            raise self._unlike(f"runs at {got:,.0f} samples/s, not at {wanted:,.0f}", "phy.sample_rate")
+
+    def check_antenna(self, direction: Direction, known: Sequence[str]) -> str:
+        """The antenna asked for, '' for the device's choice.
+
+        :raises RadioError: when the device has no such antenna
+        """
+        key = f"antenna_{direction}"
+        antenna: str = getattr(self.options, key)
+        if antenna and antenna not in known:
+            raise RadioError(f"front_end {self.name}: {key} = {antenna!r}: the device has {', '.join(known)}")
+        return antenna
+
+    def check_frequency(self, direction: Direction, got: float) -> None:
+        """:raises RadioError: when a device is tuned elsewhere than asked
+
+        :param got: Hz
+        """
+        options = self.options
+        wanted = options.frequency if direction == "tx" else options.receive_frequency
+        key = "frequency" if direction == "tx" or options.frequency_rx is None else "frequency_rx"
+        if not abs(got - wanted) <= TOLERANCE * wanted:
+            raise self._unlike(f"is tuned to {got:,.0f} Hz, not to {wanted:,.0f}", key)
+
+    def check_gain(
+        self,
+        direction: Direction,
+        got: float,
+        low: float = float("-inf"),
+        high: float = float("inf"),
+        step: float = 0.0,
+    ) -> None:
+        """:raises RadioError: when a device has another gain than asked, or cannot have it
+
+        :param got: dB, and so are ``low`` to ``high``, what it can have, in steps of ``step``
+        """
+        key = f"gain_{direction}"
+        wanted: float = getattr(self.options, key)
+        near = max(GAIN_TOLERANCE, step)
+        if not low - near <= wanted <= high + near:
+            raise RadioError(f"front_end {self.name}: {key} = {wanted:g} dB: the device has {low:g} to {high:g} dB")
+        if not abs(got - wanted) <= near:
+            raise self._unlike(f"has a gain of {got:g} dB, not of {wanted:g}", key)
+
+    def _unlike(self, found: str, key: str) -> RadioError:
+        args = self.options.args
+        return RadioError(f"front_end {self.name}: args = {args!r}: the device {found}; set {key} to one it has")
 
     @contextmanager
     def one_line(self) -> Iterator[None]:
@@ -180,3 +247,17 @@ class DeviceFrontEnd(FrontEnd):
                 f"front_end {self.name}: args = {self.options.args!r}: {said}; is the device plugged in, and free? "
                 f"{self.find_with} lists devices, args look like {self.example_args}"
             ) from error
+
+
+class _Progress:
+    """Whether a count goes on."""
+
+    def __init__(self) -> None:
+        self._count: int | None = None
+        self._since = 0.0
+
+    def still_s(self, count: int | None, now: float) -> float:
+        """s for which it has been the same; 0 for None, which is no count."""
+        if count is None or count != self._count:
+            self._count, self._since = count, now
+        return now - self._since

@@ -1,7 +1,7 @@
 """Says on the ROS graph how a link is doing: ``/diagnostics`` for people's tools, and all its counters as JSON.
 
-Laws: one thread, which lives on when a message cannot be published and counts that; nothing is published after
-``stop`` has returned; all judgement is in ``gr.health``.
+Laws: one thread, which lives on whatever fails in it and counts that, and which alone publishes and leaves the graph;
+nothing is published once ``stop`` has returned; all judgement is in ``gr.health``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gr_ros2.config import DiagnosticsConfig
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.health import LinkHealth, Status
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.type_definitions import typestore
@@ -23,7 +23,8 @@ DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE = "/diagnostics", "diagnostic_msgs/msg/Diagn
 STATISTICS_TYPE = "std_msgs/msg/String"
 
 _QOS = Qos("reliable", "volatile", 10)
-_JOIN_S = 1.0
+_JOIN_S = 5.0
+"""s ``stop`` waits: a subscriber that does not keep up holds each of two messages for a second."""
 _log = logging.getLogger(__name__)
 
 
@@ -32,9 +33,8 @@ class Diagnostics:
 
     :param node_name: of the link on the graph; its counters come out as ``/<node_name>/statistics``
     :param stats: a snapshot of the link's counters
-    :param queue_depth: messages that may wait per topic at the source
     :param clock: s, monotonic
-    :ivar failed: messages that could not be published
+    :ivar failed: times that it could not be told
     :raises MiddlewareError: when the topics cannot be announced
     """
 
@@ -45,14 +45,13 @@ class Diagnostics:
         node_name: str,
         stats: Callable[[], Mapping[str, Any]],
         *,
-        queue_depth: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._period_s = config.period_s
         self._node_name = node_name
         self._stats = stats
         self._clock = clock
-        self._health = LinkHealth(config, node_name, queue_depth)
+        self._health = LinkHealth(config, node_name)
         self._array = middleware.advertise(DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE, _QOS)
         self._counters = middleware.advertise(f"/{node_name}/statistics", STATISTICS_TYPE, _QOS)
         self._stop = threading.Event()
@@ -66,22 +65,34 @@ class Diagnostics:
     def stop(self) -> None:
         """End, and take both topics off the graph. Idempotent."""
         self._stop.set()
-        if self._thread.ident is not None:
+        if self._thread.ident is None:
+            self._leave()
+        else:
             self._thread.join(_JOIN_S)
-        self._array.close()
-        self._counters.close()
 
     def _run(self) -> None:
         while not self._stop.wait(self._period_s):
-            stats = self._stats()
-            statuses = self._health.judge(stats, self._clock())
             try:
-                self._array.publish(diagnostic_array(statuses, self._node_name, time.time_ns()))
-                self._counters.publish(statistics(stats))
-            except MiddlewareError as error:
+                self._tell()
+            except Exception as error:  # noqa: BLE001 - nobody would see that the link's state is told no more
                 self.failed += 1
                 if self.failed == 1:
-                    _log.warning("%s: diagnostics were not published: %s", self._node_name, error)
+                    trace = None if isinstance(error, GrRos2Error) else error
+                    _log.warning("%s: diagnostics were not published: %s", self._node_name, error, exc_info=trace)
+        self._leave()
+
+    def _tell(self) -> None:
+        stats = self._stats()
+        statuses = self._health.judge(stats, self._clock())
+        array = diagnostic_array(statuses, self._node_name, time.time_ns())
+        for publisher, message in ((self._array, array), (self._counters, statistics(stats))):
+            # What came before may have taken longer than ``stop`` waits.
+            if not self._stop.is_set():
+                publisher.publish(message)
+
+    def _leave(self) -> None:
+        self._array.close()
+        self._counters.close()
 
 
 def diagnostic_array(statuses: list[Status], hardware_id: str, stamp_ns: int) -> bytes:

@@ -1,7 +1,8 @@
 """The `file` front end: what would be sent goes into a SigMF recording, what was recorded is received again.
 
 Laws: a replay comes at its sample rate by the clock, whole packets' worth of zeros behind it, so that its last packet
-comes out too; a transmission is recorded without the silence between packets, each burst annotated.
+comes out too; a sample that is not a finite number comes as 0 and is counted, since no receiver's filters and loops
+would recover from it; a transmission is recorded without the silence between packets, each burst annotated.
 """
 
 from __future__ import annotations
@@ -81,12 +82,17 @@ class FileFrontEnd(FrontEnd):
         return self._replay
 
     @property
+    def ends(self) -> bool:
+        return self._replay is not None
+
+    @property
     def finished(self) -> bool:
         return self._replay is not None and self._replay.finished and self._recorder is None
 
     def counters(self) -> dict[str, int]:
-        """``unwritten``: samples that could not be written, as on a full disk."""
-        return {} if self._recorder is None else {"unwritten": self._recorder.failed}
+        """Samples. ``unwritten``: not written, as on a full disk; ``not_finite``: recorded as no number, taken as 0."""
+        written = {} if self._recorder is None else {"unwritten": self._recorder.failed}
+        return written if self._replay is None else {**written, "not_finite": self._replay.not_finite}
 
     def close(self) -> None:
         if self._recorder is not None:
@@ -107,6 +113,8 @@ class _Replay(KeepsThread, gr.sync_block):  # type: ignore[misc]
         self._begin: float | None = None
         self.finished = False
         """Whether the last sample, and the zeros behind it, are out."""
+        self.not_finite = 0
+        """Samples that were no finite numbers."""
         self.set_blkd_input_timer_value(AGAIN_MS)
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
@@ -119,7 +127,9 @@ class _Replay(KeepsThread, gr.sync_block):  # type: ignore[misc]
             self._at = 0
         count = min(len(out), total - self._at, self._due(len(out)))
         recorded = self._samples[self._at : self._at + count]
-        out[: len(recorded)] = recorded
+        finite = np.isfinite(recorded)
+        out[: len(recorded)] = np.where(finite, recorded, 0)
+        self.not_finite += len(recorded) - int(finite.sum())
         out[len(recorded) : count] = 0
         self._at += count
         self._given += count

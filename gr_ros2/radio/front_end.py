@@ -78,6 +78,11 @@ class FrontEnd(ABC):
         return 0.0
 
     @property
+    def ends(self) -> bool:
+        """Whether what is received comes to an end by itself, as a recording does."""
+        return False
+
+    @property
     def finished(self) -> bool:
         """Whether nothing will ever be received any more, as at the end of a recording."""
         return False

@@ -13,19 +13,16 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from types import TracebackType
 from typing import Any, Protocol
 
-from gnuradio import gr
-
 from gr_ros2.config import SinkConfig
-from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
@@ -48,7 +45,7 @@ class LinkObserver(Protocol):
         """What the receiver reports; of a delivery once it is published."""
 
 
-class RobotLink(gr.top_block):  # type: ignore[misc]
+class RobotLink(Flowgraph):
     """A robot's end of a link.
 
     :param config: see :class:`LinkConfig`
@@ -70,12 +67,11 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         instrumented: bool = False,
     ) -> None:
-        super().__init__(f"gr_ros2_link_{config.name}", catch_exceptions=True)
+        super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
         self.registry = config.load_registry()
         self._clock = clock
         self._started: float | None = None
-        self._running = False
         self._instrumented = instrumented
         self._stack = ExitStack()
         try:
@@ -117,9 +113,8 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
         self.msg_connect(self.radio, "pdus", self.sink, "pdus")
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
-            queue_depth = config.ros_source.queue_depth
             self._diagnostics = Diagnostics(
-                config.diagnostics, graphs[1], self.node_name, self.stats, queue_depth=queue_depth, clock=self._clock
+                config.diagnostics, graphs[1], self.node_name, self.stats, clock=self._clock
             )
             self._stack.callback(self._diagnostics.stop)
 
@@ -160,12 +155,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
 
         :raises PhyError: when GNU Radio refuses the flowgraph
         """
-        self._running = True
-        try:
-            begin(partial(super().start, max_noutput_items))
-        except (RuntimeError, MemoryError) as error:
-            self.stop()
-            raise PhyError(f"{self.config.name}: the flowgraph does not start ({error})") from error
+        super().start(max_noutput_items)
         self._started = self._clock()
         self.phy.prefer_latency()
         if self._diagnostics is not None:
@@ -173,12 +163,9 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
 
     def stop(self) -> None:
         """Stop, leave the ROS graph and close the front end. Idempotent; a stopped link does not start again."""
-        if self._running:
-            self._running = False
-            super().stop()
-            self.wait()
-            # A device is let go with its blocks, which the flowgraph would hold for as long as it is held itself.
-            self.disconnect_all()
+        super().stop()
+        # A device is let go with its blocks, which the flowgraph would hold for as long as it is held itself.
+        self.disconnect_all()
         self._stack.close()
 
     def check(self) -> None:
@@ -214,15 +201,7 @@ class RobotLink(gr.top_block):  # type: ignore[misc]
                 "name": phy.name,
                 "sample_rate": phy.sample_rate if phy.has_samples else None,
                 "airtime_s": self.front_end.airtime(),
+                "snr_db": self.radio.snr_db,
             },
             "front_end": {"name": self.front_end.name, **self.front_end.counters()},
         }
-
-    def __enter__(self) -> RobotLink:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()

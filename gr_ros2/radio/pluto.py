@@ -1,20 +1,31 @@
 """The `pluto` front end: ADALM-Pluto through IIO.
 
 Its transmitter takes whole buffers, so a buffer is exactly one burst and leaves at once; between bursts the converter
-has nothing to send, and each burst ends in zeros.
+has nothing to send, and each burst ends in zeros. Laws: GNU Radio's blocks go on where the device refuses a setting,
+so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that went well,
+else in the log of debugging, and our line says what went wrong; the connection stays open until the process ends.
 """
 
 from __future__ import annotations
 
+import ctypes
+import logging
+import os
+import struct
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
-from gnuradio import iio
+from gnuradio import blocks, gr, iio
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import RadioError
-from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions
-from gr_ros2.radio.front_end import STRICT
+from gr_ros2.phy.threads import begin
+from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
+from gr_ros2.radio.front_end import STRICT, Hertz
 
 SLOWEST, FASTEST = 521e3, 61.44e6
 """samples/s; below 2.083 million with the decimating filter that GNU Radio's block loads by itself."""
@@ -22,6 +33,14 @@ SLOWEST, FASTEST = 521e3, 61.44e6
 _CHANNELS = [True, True]
 _LARGEST_ATTENUATION = 89.75
 _AUTOMATIC_FILTER = ("Auto", "", 0.0, 0.0)
+_PHY = "ad9361-phy"
+_CONVERTERS = {"tx": "cf-ad9361-dds-core-lpc", "rx": "cf-ad9361-lpc"}
+_OSCILLATORS = {"tx": "altvoltage1", "rx": "altvoltage0"}
+_DOUBLE = struct.Struct("=d")
+_EVERY_MS, _PATIENCE_S = 5, 10.0
+"""How often a setting is asked for, and s until it is not told: more than libiio waits for an answer."""
+_STDERR = 2
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -29,11 +48,13 @@ class PlutoOptions(DeviceOptions):
     """Settings of this front end.
 
     :param gain_tx: dB, 0 = full power, down to -89.75; -40 unless set
+    :param bandwidth: Hz, of the transmitter's analogue filter, 0 = ``sample_rate``; the receiver's stays as it is
     :param buffer_rx: samples the receiver hands over at a time, 0 = 5 ms
     """
 
     gain_tx: Annotated[float, Field(ge=-_LARGEST_ATTENUATION, le=0)] = -40.0
     gain_rx: Annotated[float, Field(ge=-3, le=76)] = 30.0
+    bandwidth: Hertz = 0.0
     buffer_rx: Annotated[int, Field(ge=0, le=1 << 22)] = 0
 
 
@@ -59,11 +80,13 @@ class PlutoFrontEnd(DeviceFrontEnd):
         block.set_bandwidth(int(options.bandwidth or rate))
         block.set_frequency(int(options.frequency))
         block.set_attenuation(0, -options.gain_tx)
+        self._check_settings("tx")
         return block
 
     def _open_receiver(self) -> Any:
         rate, options = self.phy.sample_rate, self.options
         block = iio.fmcomms2_source_fc32(options.args, _CHANNELS, options.buffer_rx or max(1024, int(rate * 0.005)))
+        self._receiving = block  # for `close`, should it not be as it ought to be
         block.set_filter_params(*_AUTOMATIC_FILTER)
         block.set_samplerate(int(rate))
         block.set_frequency(int(options.receive_frequency))
@@ -72,4 +95,66 @@ class PlutoFrontEnd(DeviceFrontEnd):
         block.set_quadrature(True)
         block.set_rfdc(True)
         block.set_bbdc(True)
+        self._check_settings("rx")
         return block
+
+    def close(self) -> None:
+        if self._receiving is not None:
+            self._receiving.stop()
+            # Kept for ever: its destructor waits for a thread of its own that never ends when it was not started, or
+            # ran for less than a second.
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._receiving))
+        super().close()
+
+    @contextmanager
+    def one_line(self) -> Iterator[None]:
+        with _stderr_aside(), super().one_line():
+            yield
+
+    def _check_settings(self, direction: Direction) -> None:
+        """:raises RadioError: when the device is not as asked"""
+        output = direction == "tx"
+        for device in (_CONVERTERS[direction], _PHY):
+            # Where the converters tell no rate they have no filter either, and run at that of the chip.
+            if rate := self._read(device, "voltage0", "sampling_frequency", output=output):
+                break
+        self.check_rate(rate)
+        self.check_frequency(direction, self._read(_PHY, _OSCILLATORS[direction], "frequency", output=True))
+        self.check_gain(direction, self._read(_PHY, "voltage0", "hardwaregain", output=output))
+
+    def _read(self, device: str, channel: str, attribute: str, *, output: bool) -> float:
+        """A setting as the device has it, 0 where it does not tell."""
+        kind = (iio.data_type_t.DOUBLE, iio.attr_type_t.CHANNEL)
+        asked = iio.attr_source(self.options.args, device, channel, attribute, _EVERY_MS, 1, *kind, output, 0)
+        asked.set_log_level("error")
+        told = blocks.vector_sink_b(_DOUBLE.size)
+        graph = gr.top_block("gr_ros2_pluto_setting")
+        graph.connect(asked, blocks.head(_DOUBLE.size, 1), told)
+        begin(graph.start)
+        end = time.monotonic() + _PATIENCE_S
+        while not told.nitems_read(0) and time.monotonic() < end:
+            time.sleep(_EVERY_MS * 1e-3)
+        # It would go on asking.
+        graph.stop()
+        graph.wait()
+        return float(_DOUBLE.unpack(bytes(told.data()))[0]) if told.nitems_read(0) else 0.0
+
+
+@contextmanager
+def _stderr_aside() -> Iterator[None]:
+    """Keeps what any thread writes to stderr meanwhile: it comes out afterwards, or is logged after an error."""
+    with tempfile.TemporaryFile() as kept, os.fdopen(os.dup(_STDERR), "wb") as real:
+        os.dup2(kept.fileno(), _STDERR)
+        try:
+            yield
+        except BaseException:
+            os.dup2(real.fileno(), _STDERR)
+            _log.debug("front_end pluto: while it was opened: %s", _content(kept).decode("utf-8", "replace").strip())
+            raise
+        os.dup2(real.fileno(), _STDERR)
+        real.write(_content(kept))
+
+
+def _content(file: Any) -> bytes:
+    file.seek(0)
+    return bytes(file.read())

@@ -7,34 +7,35 @@ where no real channel does it already.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig, replaced
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.config import ChannelConfig, build
+from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
-from gr_ros2.phy.channel import Channel, PacketLoss
-from gr_ros2.phy.loopback import TAP_SIZE, LinkCounts
-from gr_ros2.phy.tap import Samples, Tap
+from gr_ros2.phy.channel import PacketLoss
+from gr_ros2.phy.flowgraph import HierBlock
+from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.sigmf import Recording, SigmfRecorder
 
 
-class Radio(gr.hier_block2):  # type: ignore[misc]
+class Radio(PacketPath, HierBlock):
     """Message ports `pdus` in, `pdus` out and `credit` out (one message: one more packet may come).
 
     :param phy: makes samples of packets
     :param front_end: carries the samples; closed with this
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
+    :param changeable: build in a channel that can be changed while running, where there is no radio
     :param instrumented: build in what a person at a dashboard uses: a channel that can be changed, and taps for
         spectrum and constellation
-    :raises ConfigError: for a channel that this PHY or front end cannot have
+    :raises ConfigError: for a channel that this PHY or front end cannot have, or a recording of nothing
     :raises RadioError: when the recording cannot be written
     """
 
@@ -45,6 +46,7 @@ class Radio(gr.hier_block2):  # type: ignore[misc]
         *,
         channel: ChannelConfig | None = None,
         record: str = "",
+        changeable: bool = False,
         instrumented: bool = False,
     ) -> None:
         super().__init__("gr_ros2_radio", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
@@ -56,77 +58,54 @@ class Radio(gr.hier_block2):  # type: ignore[misc]
         phy.check_channel(self.channel)
         if front_end.has_radio and self.channel != ChannelConfig():
             raise ConfigError(f"channel: front_end {front_end.name} has a real one; leave channel out")
-        self._instrumented = instrumented
-        self._transmitter: Any = None
-        self._receiver: Any = None
-        self._faded: Channel | None = None
-        self._tap: Tap | None = None
-        self._symbols: Tap | None = None
+        if record and (front_end.source is None or not phy.has_samples):
+            raise ConfigError(
+                f"record = {record!r}: front_end {front_end.name} gives no samples with phy {phy.name} and these "
+                "settings; leave record out"
+            )
+        self._simulated = (changeable or instrumented) and not front_end.has_radio
         self._recorder: SigmfRecorder | None = None
-        impaired = self.channel.loses_packets or (instrumented and not front_end.has_radio)
-        self._loss = PacketLoss(self.channel) if impaired else None
         self._gate = AirtimeGate(front_end.airtime(), early=front_end.early())
-        self.msg_connect((self, "pdus"), (self._gate, "pdus"))
-        self.msg_connect((self._gate, "credit"), (self, "credit"))
+        self.msg_connect(self, "pdus", self._gate, "pdus")
+        self.msg_connect(self._gate, "credit", self, "credit")
         last: Any = self._gate
         if phy.has_samples:
-            last = self._connect_samples(record)
-        if last is not None and self._loss is not None:
-            self.msg_connect((last, "pdus"), (self._loss, "pdus"))
-            last = self._loss
-        if last is not None:
-            self.msg_connect((last, "pdus"), (self, "pdus"))
+            self._connect_samples(record, instrumented)
+            last = self._receiver
+        if last is None:
+            return
+        if self.channel.loses_packets or self._simulated:
+            self._loss = PacketLoss(self.channel)
+            last = self._follow(last, self._loss)
+        self._follow(last, self)
 
-    def _connect_samples(self, record: str) -> Any:
-        """Transmitter to front end, front end to receiver; the receiver, None where nothing is received."""
+    def _connect_samples(self, record: str, instrumented: bool) -> None:
+        """Transmitter to front end, front end to receiver, where there is either."""
         front_end = self.front_end
         front_end.wire(self)
         if front_end.sink is not None:
-            self._transmitter = self.phy.transmitter()
-            self.msg_connect((self._gate, "pdus"), (self._transmitter, "pdus"))
-            self.connect(self._transmitter, front_end.sink)
+            self.connect(self._transmit(self._gate), front_end.sink)
         if front_end.source is None:
-            return None
-        self._receiver = self.phy.receiver()
-        last = front_end.source
+            return
         # The channel stops tags too: the transmitter's would overrule what the receiver reads in a packet's header.
-        if front_end.loops_back or self.channel.on_samples() or (self._instrumented and not front_end.has_radio):
-            self._faded = Channel(self.channel, self.phy)
-            self.connect(last, self._faded)
-            last = self._faded
-        self.connect(last, self._receiver)
+        faded = front_end.loops_back or bool(self.channel.on_samples()) or self._simulated
+        # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
+        heard = self._receive(front_end.source, faded=faded, shown=instrumented, aside=not front_end.ends)
         if record:
             frequency = getattr(front_end.options, "receive_frequency", None)
             about = Recording(self.phy.sample_rate, frequency, f"received by {front_end.name}, phy {self.phy.name}")
             self._recorder = SigmfRecorder(Path(record), about)
-            self.connect(last, self._recorder)
-        if self._instrumented:
-            self._tap = Tap(TAP_SIZE)
-            self.connect(last, self._tap)
-            self._symbols = self._receiver.tap_symbols() if hasattr(self._receiver, "tap_symbols") else None
-        return self._receiver
+            self.connect(heard, self._recorder)
 
     def close(self) -> None:
         """Give back device, sockets, files and memory. The flowgraph has stopped, or never ran. Idempotent."""
-        # A hier block with message ports holds itself, and shared memory segments of which the system has few.
-        # And a device is let go with its blocks only.
+        # A device is let go with its blocks only.
         for hier_block in (self._transmitter, self._receiver, self):
             if hier_block is not None:
-                hier_block.disconnect_all()
+                hier_block.release()
         if self._recorder is not None:
             self._recorder.close()
         self.front_end.close()
-
-    def counts(self) -> LinkCounts:
-        """A snapshot; ``received`` are packets that came whole."""
-        passed = self._gate.passed
-        return LinkCounts(
-            passed=passed,
-            backlog=self._gate.backlog,
-            transmitted=passed if self._transmitter is None else self._transmitter.packets_sent(),
-            received=0 if self._loss is None else self._loss.received,
-            losses={} if self._loss is None else dict(self._loss.dropped),
-        )
 
     @property
     def refused(self) -> int:
@@ -138,44 +117,9 @@ class Radio(gr.hier_block2):  # type: ignore[misc]
         """Packets heard that were not whole, as far as the PHY tells."""
         return int(getattr(self._receiver, "damaged", 0))
 
-    def samples(self) -> Samples | None:
-        """Newest samples received; None where there is no tap or nothing came."""
-        return None if self._tap is None else self._tap.samples()
-
-    def symbols(self) -> Samples | None:
-        """Newest equalised payload symbols, of an instrumented radio whose PHY shows them; otherwise None."""
-        return None if self._symbols is None else self._symbols.samples()
-
-    def set_snr_db(self, snr_db: float | None) -> None:
-        """Noise on what is received, dB, None = none.
-
-        :raises RadioError: where a real channel does that
-        """
-        self._changeable("snr_db", self._faded).set_snr_db(snr_db)
-        self.channel = replace(self.channel, snr_db=snr_db)
-
-    def set_frequency_offset(self, frequency_offset: float) -> None:
-        """Carrier frequency offset of what is received, fraction of the sample rate.
-
-        :raises RadioError: where a real channel does that
-        """
-        self._changeable("frequency_offset", self._faded).set_frequency_offset(frequency_offset)
-        self.channel = replace(self.channel, frequency_offset=frequency_offset)
-
-    def set_packet_loss(self, probability: float) -> None:
-        """Probability that a packet received is dropped.
-
-        :raises ConfigError: out of range
-        :raises RadioError: where a real channel does that
-        """
-        loss = self._changeable("packet_loss", self._loss)
-        self.channel = replaced(self.channel, packet_loss=probability)
-        loss.set_packet_loss(probability)
-
-    def _changeable(self, setting: str, block: Any) -> Any:
-        if block is None:
-            raise RadioError(f"{setting}: front_end {self.front_end.name} has no simulated channel to change")
-        return block
+    @property
+    def _medium(self) -> str:
+        return f"front_end {self.front_end.name}"
 
 
 def make_radio(
@@ -184,6 +128,9 @@ def make_radio(
     sample_rate: float,
     front_end: str,
     phy_options: dict[str, Any] | None = None,
+    *,
+    channel: Mapping[str, Any] | None = None,
+    record: str = "",
     **options: Any,
 ) -> Radio:
     """A radio by the names of its parts, as GRC makes it.
@@ -193,9 +140,18 @@ def make_radio(
     :param sample_rate: samples/s
     :param front_end: a name of ``gr_ros2.radio.FRONT_ENDS``
     :param phy_options: settings of the PHY beside these
+    :param channel: settings of :class:`gr_ros2.config.ChannelConfig`, for front ends without a radio; given, even
+        empty, they can be changed while the radio runs
+    :param record: SigMF recording to write of all samples received, '' = none
     :param options: settings of the front end
     :raises ConfigError: for an unknown name or setting, or a value out of range
-    :raises RadioError: when the front end cannot be opened
+    :raises RadioError: when the front end cannot be opened, or the recording cannot be written
     """
     modem: Phy = PHY.load(phy)(packet_len, sample_rate, **(phy_options or {}))
-    return Radio(modem, FRONT_ENDS.load(front_end)(modem, **options))
+    impairments = build(ChannelConfig, channel or {}, "channel")
+    opened: FrontEnd = FRONT_ENDS.load(front_end)(modem, **options)
+    try:
+        return Radio(modem, opened, channel=impairments, record=record, changeable=channel is not None)
+    except BaseException:
+        opened.close()
+        raise

@@ -7,6 +7,7 @@ with; a recording is never written over another.
 from __future__ import annotations
 
 import json
+import logging
 import threading
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -27,6 +28,7 @@ SAMPLE = np.dtype("<c8")
 _DATATYPE = "cf32_le"
 _MOST_ANNOTATIONS = 100_000
 """Bursts annotated; those beyond are recorded all the same."""
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -128,8 +130,22 @@ class SigmfRecorder(KeepsThread, gr.sync_block):  # type: ignore[misc]
             self._write(samples)
         return len(samples)
 
+    def stop(self) -> bool:
+        # A flowgraph made by GRC stops, and closes nothing.
+        try:
+            with self._lock:
+                if not self._file.closed:
+                    self._file.flush()
+                    self._write_meta()
+        except OSError as error:
+            _log.warning("recording %s: cannot be finished (%s)", self._meta, error.strerror)
+        return super().stop()
+
     def close(self) -> None:
-        """Finish the metadata. Idempotent."""
+        """Finish the recording. Idempotent.
+
+        :raises OSError: when the rest of it cannot be written, as on a full disk
+        """
         with self._lock:
             if not self._file.closed:
                 self._file.close()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from gnuradio import soapy
 
 from gr_ros2.errors import RadioError
+from gr_ros2.phy import Phy
 from gr_ros2.radio.device import DeviceFrontEnd
 from gr_ros2.radio.soapy_sink import SoapySink
 
@@ -20,14 +22,20 @@ class SoapyFrontEnd(DeviceFrontEnd):
     example_args = "driver=hackrf,serial=0123"
     find_with = "SoapySDRUtil --find"
 
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        self._counted = Counter(unsent=0)
+        super().__init__(phy, **options)
+
     def _open_transmitter(self) -> Any:
         options = self.options
-        block = SoapySink(options.args, self.layout.total, self.phy.sample_rate)
+        block = SoapySink(options.args, self.layout.total, self.phy.sample_rate, self._counted)
         try:
             self.check_rate(block.sample_rate)
-            self._check_antenna("tx", block.antennas())
-            block.tune(options.frequency, options.gain_tx, options.bandwidth, options.antenna_tx)
-        except RuntimeError:
+            antenna = self.check_antenna("tx", block.antennas())
+            block.tune(options.frequency, options.gain_tx, options.bandwidth, antenna)
+            self.check_frequency("tx", block.frequency)
+            self.check_gain("tx", block.gain, *block.gains())
+        except BaseException:
             block.close()
             raise
         return block
@@ -39,26 +47,31 @@ class SoapyFrontEnd(DeviceFrontEnd):
         self.check_rate(block.get_sample_rate(_CHANNEL))
         if options.bandwidth:
             block.set_bandwidth(_CHANNEL, options.bandwidth)
-        self._check_antenna("rx", block.list_antennas(_CHANNEL))
-        if options.antenna_rx:
-            block.set_antenna(_CHANNEL, options.antenna_rx)
+        if antenna := self.check_antenna("rx", block.list_antennas(_CHANNEL)):
+            block.set_antenna(_CHANNEL, antenna)
         block.set_frequency(_CHANNEL, options.receive_frequency)
+        self.check_frequency("rx", block.get_frequency(_CHANNEL))
         if block.has_gain_mode(_CHANNEL):
             block.set_gain_mode(_CHANNEL, False)
         block.set_gain(_CHANNEL, options.gain_rx)
+        has = block.get_gain_range(_CHANNEL)
+        self.check_gain("rx", block.get_gain(_CHANNEL), has.minimum(), has.maximum(), has.step())
         return block
 
-    def counters(self) -> dict[str, int]:
-        """Also ``unsent``: samples the device did not take in time."""
-        sink = self._transmitting
-        return {**super().counters(), "unsent": 0 if sink is None else sink.unsent}
+    def check(self, now: float) -> None:
+        if trouble := self._transmitting.trouble:
+            raise RadioError(
+                f"front_end soapy: args = {self.options.args!r}: the device does not begin to send ({trouble}); "
+                "is another program using it?"
+            )
+        super().check(now)
+
+    def _told(self) -> dict[str, int]:
+        if self._transmitting is not None:
+            self._transmitting.ask()
+        return dict(self._counted)
 
     def close(self) -> None:
         if self._transmitting is not None:
             self._transmitting.close()
         super().close()
-
-    def _check_antenna(self, direction: str, known: list[str]) -> None:
-        antenna = getattr(self.options, f"antenna_{direction}")
-        if antenna and antenna not in known:
-            raise RadioError(f"front_end soapy: antenna_{direction} = {antenna!r}: the device has {', '.join(known)}")

@@ -2,7 +2,8 @@
 
 `soapy.sink` of GNU Radio 3.10 does not initialise its count of what remains of a burst: now and then it drops the first
 packets, or hands the driver a negative length and the process dies. Laws: one call brings a whole burst and ends it;
-what a device does not take in time is dropped and counted, so that a device that hangs does not hang the link.
+what a device does not take in time is dropped and counted, so that a device that hangs does not hang the link; what it
+tells of its bursts is asked for with each of them, never waited for.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import logging
+import threading
 import time
+from collections import Counter
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
 from typing import Any
 
@@ -22,11 +25,23 @@ from gr_ros2.phy.threads import BlockThread
 
 _TX, _CHANNEL = 0, 0
 _END_BURST = 1 << 1
-_TIMEOUT = -1
+_TIMEOUT, _NOT_SUPPORTED, _UNDERFLOW = -1, -5, -7
+_EVENTS = {_UNDERFLOW: "underflows", -6: "late", -3: "corrupted"}
+"""What we call what a device tells, by SoapySDR's code."""
+_MOST_EVENTS = 256
+"""At a time, lest a driver that always tells something keep us there."""
+_AGAIN = (0, _TIMEOUT, _UNDERFLOW)
+"""What a call that brings samples may return without having taken any: then it is made again."""
 _CALL_US = 100_000
 _PATIENCE_S = 1.0
 """s beyond its airtime that a burst may take to be taken."""
 _log = logging.getLogger(__name__)
+
+
+class _Range(ctypes.Structure):
+    """SoapySDR's, of a gain in dB."""
+
+    _fields_ = (("minimum", c_double), ("maximum", c_double), ("step", c_double))
 
 
 def _library() -> Any:
@@ -48,7 +63,10 @@ def _library() -> Any:
         ("setBandwidth", c_int, [c_void_p, c_int, c_size_t, c_double]),
         ("setAntenna", c_int, [c_void_p, c_int, c_size_t, c_char_p]),
         ("setFrequency", c_int, [c_void_p, c_int, c_size_t, c_double, c_void_p]),
+        ("getFrequency", c_double, [c_void_p, c_int, c_size_t]),
         ("setGain", c_int, [c_void_p, c_int, c_size_t, c_double]),
+        ("getGain", c_double, [c_void_p, c_int, c_size_t]),
+        ("getGainRange", _Range, [c_void_p, c_int, c_size_t]),
         ("listAntennas", POINTER(c_char_p), [c_void_p, c_int, c_size_t, POINTER(c_size_t)]),
         ("setupStream", c_void_p, [c_void_p, c_int, c_char_p, POINTER(c_size_t), c_size_t, c_void_p]),
         ("activateStream", c_int, [c_void_p, c_void_p, c_int, c_longlong, c_size_t]),
@@ -59,9 +77,16 @@ def _library() -> Any:
             c_int,
             [c_void_p, c_void_p, POINTER(c_void_p), c_size_t, POINTER(c_int), c_longlong, c_long],
         ),
+        (
+            "readStreamStatus",
+            c_int,
+            [c_void_p, c_void_p, POINTER(c_size_t), POINTER(c_int), POINTER(c_longlong), c_long],
+        ),
     ):
         entry = getattr(library, f"SoapySDRDevice_{function}")
         entry.restype, entry.argtypes = result, arguments
+    library.SoapySDRStrings_clear.argtypes = [POINTER(POINTER(c_char_p)), c_size_t]
+    library.SoapySDR_errToStr.restype, library.SoapySDR_errToStr.argtypes = c_char_p, [c_int]
     return library
 
 
@@ -77,9 +102,8 @@ def _call(function: str, *arguments: Any) -> Any:
     # Functions that make something return nothing, the others a code other than 0.
     failed = result is None if function in ("makeStrArgs", "setupStream") else isinstance(result, int) and result != 0
     if failed:
-        raise RuntimeError(
-            (_soapy.SoapySDRDevice_lastError() or b"").decode("utf-8", "replace") or f"{function} failed"
-        )
+        said = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
+        raise RuntimeError(said.decode("utf-8", "replace") or f"{function} failed")
     return result
 
 
@@ -88,23 +112,32 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     :param args: which device
     :param sample_rate: samples/s
+    :param counted: what became of bursts, by name. ``unsent``: samples the device did not take in time. As soon as it
+        tells of any, ``bursts_out``: bursts it has sent whole; ``underflows``: it ran out of samples; ``late``: bursts
+        whose time was over; ``corrupted``: bursts damaged on their way to it
     :raises RuntimeError: when there is no such device, or it cannot send
     """
 
-    def __init__(self, args: str, burst: int, sample_rate: float) -> None:
+    def __init__(self, args: str, burst: int, sample_rate: float, counted: Counter[str]) -> None:
         super().__init__("gr_ros2_soapy_sink", [np.complex64], None)
         self._burst = burst
         self._patience = burst / sample_rate + _PATIENCE_S
         self._stream: Any = None
-        self.unsent = 0
-        """Samples the device did not take."""
+        self._counted = counted
+        self._tells = True
+        self._asking = threading.Lock()
         self._block_thread = BlockThread()
         self.set_output_multiple(burst)
+        self.trouble = ""
+        """Why the device does not begin to send: GNU Radio takes no notice of it."""
         self._device: Any = _call("makeStrArgs", args.encode())
-        if not _soapy.SoapySDRDevice_getNumChannels(self._device, _TX):
+        try:
+            if not _soapy.SoapySDRDevice_getNumChannels(self._device, _TX):
+                raise RuntimeError("the device has no transmitter")
+            _call("setSampleRate", self._device, _TX, _CHANNEL, sample_rate)
+        except RuntimeError:
             self.close()
-            raise RuntimeError("the device has no transmitter")
-        _call("setSampleRate", self._device, _TX, _CHANNEL, sample_rate)
+            raise
 
     @property
     def sample_rate(self) -> float:
@@ -115,7 +148,24 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         """Its ports to send from."""
         count = c_size_t()
         names = _soapy.SoapySDRDevice_listAntennas(self._device, _TX, _CHANNEL, byref(count))
-        return [names[number].decode() for number in range(count.value)]
+        known = [names[number].decode() for number in range(count.value)]
+        _soapy.SoapySDRStrings_clear(byref(names), count)
+        return known
+
+    @property
+    def frequency(self) -> float:
+        """Hz the device is tuned to."""
+        return float(_soapy.SoapySDRDevice_getFrequency(self._device, _TX, _CHANNEL))
+
+    @property
+    def gain(self) -> float:
+        """dB the device is set to."""
+        return float(_soapy.SoapySDRDevice_getGain(self._device, _TX, _CHANNEL))
+
+    def gains(self) -> tuple[float, float, float]:
+        """dB it can have: from, to, and in which steps, 0 where it does not tell."""
+        has = _soapy.SoapySDRDevice_getGainRange(self._device, _TX, _CHANNEL)
+        return has.minimum, has.maximum, has.step
 
     def tune(self, frequency: float, gain: float, bandwidth: float, antenna: str) -> None:
         """Set it up and open its stream; 0 Hz of bandwidth and '' leave the device's choice.
@@ -132,7 +182,11 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._block_thread.keep()
-        return bool(_soapy.SoapySDRDevice_activateStream(self._device, self._stream, 0, 0, 0) == 0)
+        try:
+            _call("activateStream", self._device, self._stream, 0, 0, 0)
+        except RuntimeError as error:
+            self.trouble = str(error)
+        return not self.trouble
 
     def stop(self) -> bool:
         _soapy.SoapySDRDevice_deactivateStream(self._device, self._stream, 0, 0)
@@ -141,29 +195,55 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     def close(self) -> None:
         """Let the device go. Idempotent."""
-        if self._stream is not None:
-            _soapy.SoapySDRDevice_closeStream(self._device, self._stream)
-        if self._device is not None:
-            _soapy.SoapySDRDevice_unmake(self._device)
-        self._device = self._stream = None
+        with self._asking:
+            if self._stream is not None:
+                _soapy.SoapySDRDevice_closeStream(self._device, self._stream)
+            if self._device is not None:
+                _soapy.SoapySDRDevice_unmake(self._device)
+            self._device = self._stream = None
+
+    def ask(self) -> None:
+        """Count what the device has to tell of its bursts by now. From any thread."""
+        with self._asking:
+            for _ in range(_MOST_EVENTS):
+                if not self._tells or self._stream is None or not self._look():
+                    break
+
+    def _look(self) -> bool:
+        """Count one thing the device tells; whether there was one."""
+        channels, flags, when = c_size_t(1 << _CHANNEL), c_int(), c_longlong()
+        result = _soapy.SoapySDRDevice_readStreamStatus(
+            self._device, self._stream, byref(channels), byref(flags), byref(when), 0
+        )
+        self._tells = result != _NOT_SUPPORTED
+        if result in _EVENTS:
+            self._counted[_EVENTS[result]] += 1
+        elif result >= 0 and flags.value & _END_BURST:
+            self._counted["bursts_out"] += 1
+        return result >= 0 or result in _EVENTS
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
-        samples = input_items[0]
-        for begin in range(0, len(samples), self._burst):
-            self._send(samples[begin : begin + self._burst])
-        return len(samples)
+        self._send(input_items[0][: self._burst])
+        self.ask()
+        return self._burst
 
     def _send(self, burst: NDArray[np.complex64]) -> None:
         deadline = time.monotonic() + self._patience
-        done, result = 0, _TIMEOUT
-        while done < len(burst) and (result >= 0 or (result == _TIMEOUT and time.monotonic() < deadline)):
+        done = result = 0
+        while done < len(burst) and (result > 0 or (result in _AGAIN and time.monotonic() < deadline)):
             rest = burst[done:]
             where, flags = c_void_p(rest.ctypes.data), c_int(_END_BURST)
             result = _soapy.SoapySDRDevice_writeStream(
                 self._device, self._stream, byref(where), len(rest), byref(flags), 0, _CALL_US
             )
             done += max(0, result)
+            if result == _UNDERFLOW:
+                self._note(_EVENTS[result])
         if done < len(burst):
-            self.unsent += len(burst) - done
-            if self.unsent == len(burst) - done:
+            if not self._counted["unsent"]:
                 _log.warning("front_end soapy: the device did not take a burst (SoapySDR error %d)", result)
+            self._note("unsent", len(burst) - done)
+
+    def _note(self, name: str, count: int = 1) -> None:
+        with self._asking:
+            self._counted[name] += count

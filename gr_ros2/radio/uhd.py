@@ -1,18 +1,21 @@
-"""The `uhd` front end: USRPs. Bursts begin and end at the tags of the shaper; between them the USRP sends nothing."""
+"""The `uhd` front end: USRPs. A burst ends where the shaper's tag says; between bursts the USRP sends nothing."""
 
 from __future__ import annotations
 
 import os
-from typing import Any, Literal
+from typing import Annotated, Any
 
 # Otherwise its library greets on stderr before every word of ours; what it warns of still comes.
 os.environ.setdefault("UHD_LOG_CONSOLE_LEVEL", "warning")
 
 from gnuradio import uhd
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import RadioError
-from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions
+from gr_ros2.phy import Phy
+from gr_ros2.radio.bursts import LENGTH_TAG
+from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
+from gr_ros2.radio.events import UsrpEvents
 from gr_ros2.radio.front_end import STRICT
 
 _CHANNEL = 0
@@ -22,12 +25,12 @@ _CHANNEL = 0
 class UhdOptions(DeviceOptions):
     """Settings of this front end.
 
-    :param clock_source: '' = the device's default, or internal, external, gpsdo
+    :param clock_source: '' = the device's default, or internal, external, mimo, gpsdo
     :param subdev_tx: frontend to send with, as in ``A:A``, '' = the device's default
     :param subdev_rx: frontend to receive with, '' = the device's default
     """
 
-    clock_source: str = ""
+    clock_source: Annotated[str, Field(examples=["", "internal", "external", "mimo", "gpsdo"])] = ""
     subdev_tx: str = ""
     subdev_rx: str = ""
 
@@ -40,15 +43,25 @@ class UhdFrontEnd(DeviceFrontEnd):
     example_args = "type=b200 or addr=192.168.10.2"
     find_with = "uhd_find_devices"
 
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        self._events = UsrpEvents()
+        super().__init__(phy, **options)
+
+    def wire(self, graph: Any) -> None:
+        super().wire(graph)
+        graph.msg_connect(self._transmitting, "async_msgs", self._events, "async_msgs")
+
+    def _told(self) -> dict[str, int]:
+        return dict(self._events.counted)
+
     def _open_transmitter(self) -> Any:
-        return self._open(uhd.usrp_sink, "tx")
+        return self._set_up(uhd.usrp_sink(self.options.args, _stream(), LENGTH_TAG), "tx")
 
     def _open_receiver(self) -> Any:
-        return self._open(uhd.usrp_source, "rx")
+        return self._set_up(uhd.usrp_source(self.options.args, _stream()), "rx")
 
-    def _open(self, kind: Any, direction: Literal["tx", "rx"]) -> Any:
+    def _set_up(self, block: Any, direction: Direction) -> Any:
         options, sending = self.options, direction == "tx"
-        block = kind(options.args, uhd.stream_args(cpu_format="fc32", channels=[_CHANNEL]))
         if options.clock_source:
             block.set_clock_source(options.clock_source)
         if subdev := options.subdev_tx if sending else options.subdev_rx:
@@ -57,12 +70,15 @@ class UhdFrontEnd(DeviceFrontEnd):
         self.check_rate(block.get_samp_rate())
         if options.bandwidth:
             block.set_bandwidth(options.bandwidth, _CHANNEL)
-        antenna = options.antenna_tx if sending else options.antenna_rx
-        if antenna and antenna not in block.get_antennas(_CHANNEL):
-            known = ", ".join(block.get_antennas(_CHANNEL))
-            raise RadioError(f"front_end uhd: antenna_{direction} = {antenna!r}: the device has {known}")
-        if antenna:
+        if antenna := self.check_antenna(direction, block.get_antennas(_CHANNEL)):
             block.set_antenna(antenna, _CHANNEL)
         block.set_center_freq(options.frequency if sending else options.receive_frequency, _CHANNEL)
+        self.check_frequency(direction, block.get_center_freq(_CHANNEL))
         block.set_gain(options.gain_tx if sending else options.gain_rx, _CHANNEL)
+        has = block.get_gain_range(_CHANNEL)
+        self.check_gain(direction, block.get_gain(_CHANNEL), has.start(), has.stop(), has.step())
         return block
+
+
+def _stream() -> Any:
+    return uhd.stream_args(cpu_format="fc32", channels=[_CHANNEL])

@@ -3,7 +3,8 @@
 Every robot publishes what it sends at one address and subscribes to those of the others; each packet is one message: a
 header, then its samples. Laws: bursts only, so silence costs nothing, and a burst leaves whole or not at all; nobody
 waits for a peer: what is sent while it is away, or while the cable is unplugged, is lost as on the air; either end may
-be killed and started again, the other carries on; nothing of a message is believed before its header is checked.
+be killed and started again, the other carries on; nothing of a message is believed before its header is checked, and no
+sample that is not a finite number goes on to a receiver, whose filters and loops would never recover from it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import logging
 import os
 import struct
+import weakref
 from collections import Counter
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -19,7 +21,7 @@ import numpy as np
 import zmq
 from gnuradio import gr
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import RadioError
@@ -36,8 +38,23 @@ _HEARTBEAT_MS, _DEAD_MS = 250, 1000
 """A peer silent for so long is given up, with what waits for it, and looked for again."""
 _RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
 _POLL_MS = 100
-_MAX_SENDERS = 256
+MAX_SENDERS = 256
+"""Senders whose numbers are followed; beyond, the one heard longest ago is forgotten."""
+_MAX_PORT = 65535
 _log = logging.getLogger(__name__)
+
+
+def _with_port(address: str) -> str:
+    # ZeroMQ takes a port's last 16 bits, or what of it is a number, and listens elsewhere than the peers call.
+    _, colon, port = address.removeprefix("tcp://").rpartition(":")
+    numbered = address.startswith("tcp://") and colon and port != "*"
+    if numbered and not (port.isdecimal() and 1 <= int(port) <= _MAX_PORT):
+        raise ValueError(f"port {port}: must be 1 to {_MAX_PORT}")
+    return address
+
+
+Address = Annotated[str, Field(min_length=1), AfterValidator(_with_port)]
+"""As ZeroMQ writes them."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -50,8 +67,8 @@ class ZmqOptions(FrontEndOptions):
     :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
     """
 
-    bind: Annotated[str, Field(min_length=1)]
-    connect: Annotated[tuple[str, ...], Field(min_length=1)]
+    bind: Address
+    connect: Annotated[tuple[Address, ...], Field(min_length=1)]
     queue: Annotated[int, Field(ge=1, le=10_000)] = 300
 
 
@@ -63,7 +80,9 @@ class ZmqFrontEnd(FrontEnd):
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
-        self._context = zmq.Context()
+        self._context, self._sockets = zmq.Context(), list[Any]()
+        # With the sockets at hand: a context that is found to be garbage together with them waits for them for ever.
+        self._let_go = weakref.finalize(self, _let_go, self._context, self._sockets)
         self._counters: Counter[str] = Counter()
         try:
             publisher = self._socket(zmq.PUB)
@@ -97,10 +116,11 @@ class ZmqFrontEnd(FrontEnd):
         return counted | {name: self._counters[name] for name in ("malformed", "wrong_rate")}
 
     def close(self) -> None:
-        self._context.destroy(linger=0)
+        self._let_go()
 
     def _socket(self, kind: int) -> Any:
         socket = self._context.socket(kind)
+        self._sockets.append(socket)
         socket.linger = 0
         socket.sndhwm = socket.rcvhwm = self.options.queue
         socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
@@ -113,6 +133,12 @@ class ZmqFrontEnd(FrontEnd):
         # One burst is one message; anything larger is none of ours.
         socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + 2 * self.phy.airtime_samples() * _SAMPLE.itemsize)
         return socket
+
+
+def _let_go(context: Any, sockets: list[Any]) -> None:
+    for socket in sockets:
+        socket.close(linger=0)
+    context.term()
 
 
 def _open(action: Callable[[str], object], key: str, address: str) -> None:
@@ -185,17 +211,23 @@ class _BurstSubscriber(KeepsThread, gr.sync_block):  # type: ignore[misc]
                 f"a peer sends {sample_rate:g} samples/s, not {self._sample_rate:g}; set the same phy at both ends",
             )
             return nothing
+        samples = np.frombuffer(message, _SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
+        if not np.isfinite(samples).all():
+            self._refuse("malformed", "a burst has samples that are no finite numbers")
+            return nothing
         self._follow(sender, number)
         self._counters["bursts_in"] += 1
-        return np.frombuffer(message, _SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
+        return samples
 
     def _follow(self, sender: int, number: int) -> None:
-        if sender not in self._senders:
-            if len(self._senders) == _MAX_SENDERS:
+        before = self._senders.pop(sender, None)
+        if before is None:
+            if len(self._senders) == MAX_SENDERS:
+                # Each moves to the end when it is heard.
                 del self._senders[next(iter(self._senders))]
             self._counters["senders"] += 1
         else:
-            self._counters["missed"] += max(0, number - self._senders[sender] - 1)
+            self._counters["missed"] += max(0, number - before - 1)
         self._senders[sender] = number
 
     def _refuse(self, name: str, problem: str) -> None:

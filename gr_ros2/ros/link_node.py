@@ -2,21 +2,25 @@
 
 Laws: the configuration file names what the link is, parameters given at the start replace single settings of it, and
 both are checked as one; what the running blocks can change may be set while they run, everything else is read-only; an
-error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`.
+error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`; what the
+library logs goes where the node's own lines go, console and /rosout.
 """
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.radio.config import load_link
@@ -24,9 +28,11 @@ from gr_ros2.radio.link import RobotLink
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 
 CONFIG = "config"
+_USAGE = f"--ros-args -p {CONFIG}:=my_link.yaml"
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _LARGEST_INT, _LARGEST_FLOAT = 2**63 - 1, sys.float_info.max
 _LOOK_S = 0.5
+_LIBRARY_LOG = logging.getLogger("gr_ros2")
 
 
 class LinkNode(Node):  # type: ignore[misc]
@@ -39,21 +45,26 @@ class LinkNode(Node):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_link", automatically_declare_parameters_from_overrides=True)
+        self._log = _NodeLog(self)
+        _LIBRARY_LOG.setLevel(logging.INFO)
+        _LIBRARY_LOG.addHandler(self._log)
         given = {name: item.value for name, item in self.get_parameters_by_prefix("").items()}
         path = given.pop(CONFIG, None)
         if not path:
-            raise ConfigError(
-                f"parameter {CONFIG} is missing; give the YAML file: --ros-args -p {CONFIG}:=my_link.yaml"
-            )
+            raise ConfigError(f"parameter {CONFIG} is missing; give the YAML file: {_USAGE}")
         chosen = {name: value for name, value in given.items() if not name.startswith((*_OF_ROS, "qos_overrides."))}
         if given.get("use_sim_time"):
             chosen.setdefault("ros_sink.use_sim_time", True)
-        self.link = RobotLink(load_link(path, overrides(chosen)))
+        self.link = RobotLink(load_link(Path(str(path)).expanduser(), overrides(chosen)))
         self._setters = dict(_setters(self.link))
         for parameter in _settings(self.link):
             self._show(parameter)
         self.add_on_set_parameters_callback(self._set)
-        self.create_timer(_LOOK_S, self._end_with_link)
+
+    def destroy_node(self) -> None:
+        """Leave the graph."""
+        _LIBRARY_LOG.removeHandler(self._log)
+        super().destroy_node()
 
     def _show(self, parameter: Parameter) -> None:
         """Declare a parameter with the value the link has, also one that was given at the start as some other type."""
@@ -72,9 +83,22 @@ class LinkNode(Node):  # type: ignore[misc]
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _end_with_link(self) -> None:
-        if self.link.finished:
-            raise ExternalShutdownException
+
+class _NodeLog(logging.Handler):
+    """Passes log records on to a node's logger; those of ``debug``, which somebody asked for, as information."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self._logger = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # One call each: rclpy wants every line of code to keep to one severity.
+        if record.levelno >= logging.ERROR:
+            self._logger.error(self.format(record))
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(self.format(record))
+        else:
+            self._logger.info(self.format(record))
 
 
 def _settings(link: RobotLink) -> list[Parameter]:
@@ -116,19 +140,44 @@ def _descriptor(parameter: Parameter, *, read_only: bool) -> ParameterDescriptor
     return made
 
 
+def _join(words: Sequence[str]) -> None:
+    """Start rclpy with the arguments of the command line, its own name first.
+
+    :raises ConfigError: for arguments that ROS cannot read, or that are not for ROS
+    """
+    try:
+        # Handlers of our own: rclpy's would end every context at once, also one that the link still publishes through.
+        rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise ConfigError(f"{error}; write {_USAGE}") from error
+    others = remove_ros_args(list(words))[1:]
+    if others:
+        raise ConfigError(f"argument {others[0]!r}: every setting is a ROS parameter; write {_USAGE}")
+
+
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the node until it is interrupted or its link is over."""
-    # Handlers of our own: rclpy's would end every context at once, also one that the link still publishes through.
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    """Run the node until it is interrupted or its link is over.
+
+    :param args: the command line, the program's name first
+    """
+    asked: list[int] = []
+    # Not KeyboardInterrupt: raised in an import or a callback of C, while all this opens, it would be lost. And one
+    # Ctrl-C may come twice, from the terminal and from `ros2 launch`.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: asked.append(number))
     node = None
     status: int | str = 0
     try:
+        _join(sys.argv if args is None else args)
         node = LinkNode()
         node.link.start()
         node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {node.link.phy.name}")
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not (asked or node.link.finished):
+            executor.spin_once(timeout_sec=_LOOK_S)
+            node.link.check()
+    except ExternalShutdownException:
         pass
     except GrRos2Error as error:
         print(f"gr_ros2 link: {error}", file=sys.stderr)

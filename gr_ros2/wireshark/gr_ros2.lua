@@ -71,8 +71,9 @@ local function read_registry(path)
     end
     local id = 0
     for line in file:lines() do
-        local name, kind = line:match("^%s*/?([%w_/]+)%s*,%s*([%w_/]+)")
-        if name and not (name == "topic" and kind == "type") then
+        local name, kind = line:gsub("^\239\187\191", ""):gsub('"', ""):match("^%s*/?([%w_/]+)%s*,%s*([%w_/]+)")
+        local heading = name and (name:lower() == "topic" or name:lower() == "name") and kind:lower() == "type"
+        if name and not heading then
             topics[id] = { name = name, kind = kind }
             id = id + 1
         end

@@ -12,6 +12,8 @@ import pytest
 
 from gr_ros2.cli.completion import SHELLS
 from gr_ros2.cli.main import COMMANDS, run
+from gr_ros2.cli.params import setting_keys
+from gr_ros2.experiment.scenario import Scenario, dump, load_scenario
 
 
 @pytest.mark.parametrize("shell", SHELLS)
@@ -29,7 +31,7 @@ def test_the_script_is_one_that_the_shell_reads(shell: str, tmp_path: Path, caps
 def completions(words: list[str], tmp_path: Path) -> list[str]:
     """What bash offers for a command line whose last word is being typed."""
     program = tmp_path / "gr-ros2"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gr_ros2.cli.main "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gr_ros2.cli "$@"\n')
     program.chmod(0o755)
     line = " ".join(words)
     script = (
@@ -47,3 +49,13 @@ def test_bash_completes_commands_scenarios_and_options(tmp_path: Path) -> None:
     offered = completions(["gr-ros2", "run", "paper-"], tmp_path)
     assert {"paper-direct", "paper-ofdm"} <= set(offered)
     assert "--duration" in completions(["gr-ros2", "run", "--du"], tmp_path)
+    assert completions(["gr-ros2", "run", "demo", "--set", "phy.sam"], tmp_path) == ["phy.sample_rate"]
+
+
+def test_the_settings_offered_are_there() -> None:
+    keys = list(setting_keys(Scenario))
+    assert {"packet_len", "ros_source.domain_id", "phy.options", "back"} <= set(keys)
+    for key in keys:
+        value = dump(load_scenario("demo"))
+        for name in key.split("."):
+            value = value[name]

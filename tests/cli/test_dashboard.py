@@ -97,7 +97,7 @@ def test_beside_what_was_started_without(what: str, tmp_path: Path, capsys: pyte
     config = tmp_path / "link.yaml"
     config.write_text("registry: odom\nros_source: {namespace: /robot_1}\nphy: {name: direct}\n")
     started = {"run": ["run", "paper-direct", "--out", str(tmp_path / "out")], "link": ["link", str(config)]}[what]
-    command = [sys.executable, "-m", "gr_ros2.cli.main", *started, "--duration", "600", *MEMORY]
+    command = [sys.executable, "-m", "gr_ros2.cli", *started, "--duration", "600", *MEMORY]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
         try:
             assert run(["dashboard", "0", "--wait", "60", "--no-browser"]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -30,4 +31,17 @@ def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert command.run(["run", "paper-direct", "--repetitions", "1", *LOSSY, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "result.json").is_file()
     assert not (tmp_path / "repetitions.json").exists()
-    assert "Where every sent message went" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "paper-direct: 1 s of simulated time" in out
+    assert "Where every sent message went" in out
+
+
+def test_progress_is_told_where_the_output_is_no_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("gr_ros2.cli.run.LOG_S", 0.0)
+    words = ["run", "paper-direct", "--duration", "10", "--set", "time=packets", "--out", str(tmp_path)]
+    assert command.run(words) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if " s of 10 s, " in line]
+    assert told
+    assert all(re.fullmatch(r"paper-direct: \d+\.\d s of 10 s, \d+ sent, \d+ delivered", line) for line in told)

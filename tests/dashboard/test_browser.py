@@ -28,7 +28,7 @@ from tests.gr.probe import wait_for
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(
-    not (CHROMIUM and DRIVER), reason="no chromium: apt-get install chromium chromium-driver"
+    not (CHROMIUM and DRIVER), reason="no chromium or chromedriver; Debian: apt-get install chromium chromium-driver"
 )
 
 PATIENCE_S = 90.0
@@ -109,7 +109,7 @@ def program(out: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], s
     """A long run over OFDM with a dashboard, and where that is."""
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
     settings += ["phy.sample_rate=1e6", "channel.snr_db=30"]
-    command = [sys.executable, "-m", "gr_ros2.cli.main", "run", "paper-direct", "--duration", "3600"]
+    command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:

@@ -36,6 +36,7 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     wait_for(lambda: [desk.look(), desk.tick(), desk.radio.spectrum_db is not None][-1], "a spectrum")
     assert desk.radio.has_samples
     assert desk.radio.symbols is not None
+    assert desk.radio.snr_db == pytest.approx(30, abs=1.5)
     desk.set_snr_db(-20.0)
     desk.set_frequency_offset(0.001)
     desk.set_packet_loss(1.0)
@@ -65,6 +66,7 @@ def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:
     assert desk.refused == ""
     thread.join()
     assert not desk.radio.has_samples
+    assert desk.radio.snr_db is None
     assert desk.radio.channel is not None
     assert desk.radio.channel.packet_loss == 0.25
 

@@ -43,7 +43,7 @@ def snapshot(name: str = "/robot_4/at") -> Snapshot:
 
 def test_what_is_written_is_well_formed_with_data_and_without() -> None:
     for shown in (Snapshot(), snapshot(), snapshot("<script>alert(1)</script>&")):
-        for text in (tiles_html(shown, 3), tiles_html(shown, None), topics_html(shown), paths_html(shown)):
+        for text in (tiles_html(shown, 3, 12.3), tiles_html(shown, None, None), topics_html(shown), paths_html(shown)):
             assert "<script" not in text
             Balanced(text)
         Balanced(packets_html(shown))
@@ -51,11 +51,12 @@ def test_what_is_written_is_well_formed_with_data_and_without() -> None:
 
 def test_the_exact_value_stands_beside_the_rounded_one() -> None:
     shown = snapshot()
-    tiles = Balanced(tiles_html(shown, 3)).values
+    tiles = Balanced(tiles_html(shown, 3, 12.34)).values
     assert tiles["sent"] == "40"
     assert tiles["pdr"] == repr(shown.pdr)
-    assert tiles["backlog"] == "3"
-    assert Balanced(tiles_html(shown, None)).values["backlog"] is None
+    assert (tiles["backlog"], tiles["snr"]) == ("3", "12.34")
+    unknown = Balanced(tiles_html(shown, None, None)).values
+    assert unknown["backlog"] is unknown["snr"] is None
     assert Balanced(topics_html(shown)).values["sent"] == "20"
 
 

@@ -9,11 +9,14 @@ from __future__ import annotations
 import sys
 import threading
 
+from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from tests.middleware.support import BEST_EFFORT, CUSTOM, RELIABLE, message
+from tests.middleware.support import BEST_EFFORT, CUSTOM, message
 
 DOMAIN = 7
 PERIOD_S = 0.05
+CHAT = Qos("reliable", "volatile", 10)
+"""Bounded, as ROS's default is: a publisher that keeps everything waits for a link that was killed."""
 
 
 def main(robot: str, other: str) -> None:
@@ -24,7 +27,7 @@ def main(robot: str, other: str) -> None:
         BEST_EFFORT,
         lambda data: print("got", int.from_bytes(data[4:8], "little"), flush=True),
     )
-    chat = graph.advertise(f"/robot_{robot}/chat", CUSTOM, RELIABLE)
+    chat = graph.advertise(f"/robot_{robot}/chat", CUSTOM, CHAT)
     over = threading.Event()
 
     def talk() -> None:

@@ -18,7 +18,7 @@ from tests.middleware.support import same
 
 DDS_PADDING = 3
 """Zeros DDS may put behind a message."""
-COMMAND = (sys.executable, "-m", "gr_ros2.cli.main")
+COMMAND = (sys.executable, "-m", "gr_ros2.cli")
 HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
 needs_husky = pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording: {HUSKY} is missing")
 

@@ -61,7 +61,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     first, again = (numbers(run("paper-ofdm-paced", time, *NOISY).result) for _ in range(2))
     assert first == again
     settings = [word for override in (f"time={time}", *NOISY) for word in ("--set", override)]
-    command = [sys.executable, "-m", "gr_ros2.cli.main", "run", "paper-ofdm-paced", *settings]
+    command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-ofdm-paced", *settings]
     out = tmp_path / "out"
     subprocess.run(
         [*command, "--duration", "3", "--seed", "0", "--out", str(out)], check=True, env=os.environ, capture_output=True

@@ -25,7 +25,7 @@ def pdu(data: bytes) -> Any:
 
 
 class Probe(gr.basic_block):
-    """Posts on `pdus`, collects what comes in on `pdus` and counts messages on `credit`."""
+    """Posts on `pdus`, collects what comes in on `pdus` and adds up what `credit` brings."""
 
     def __init__(self) -> None:
         super().__init__("probe", None, None)
@@ -37,7 +37,7 @@ class Probe(gr.basic_block):
         self.set_msg_handler(pmt.intern("credit"), self._count)
         self.messages: list[Any] = []
         self.times: list[float] = []
-        self.handled = 0
+        self.handled = self.emitted = 0
         self.credits = 0
         self.uses_credit = False
 
@@ -48,6 +48,7 @@ class Probe(gr.basic_block):
         self.post_message(pdu(data))
 
     def post_message(self, message: Any) -> None:
+        self.emitted += 1
         self.message_port_pub(pmt.intern("pdus"), message)
 
     @property
@@ -59,5 +60,5 @@ class Probe(gr.basic_block):
         self.messages.append(message)
         self.handled += 1
 
-    def _count(self, _message: Any) -> None:
-        self.credits += 1
+    def _count(self, message: Any) -> None:
+        self.credits += pmt.to_long(message)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import MISSING, fields
 from pathlib import Path
 from types import ModuleType
@@ -23,12 +25,14 @@ from gnuradio.grc.core.platform import Platform
 from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
 
 from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import RadioError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.grc_path import example, grc_path
 from gr_ros2.link import SCHEDULER
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.radio.radio import make_radio
+from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.radio import Radio, make_radio
 from tests.gr.probe import Probe, wait_for
 
 DESCRIPTIONS = sorted(grc_path().glob("*.block.yml"))
@@ -38,6 +42,20 @@ ON_THE_AIR = ("uhd_radio", "soapy_radio", "pluto_radio")
 ONE_WAY = ("file_radio",)
 """Examples in which nothing comes out by itself."""
 CARRYING = [path for path in EXAMPLES if path.stem not in (*ON_THE_AIR, *ONE_WAY)]
+PURE_NUMBERS = {
+    "bt",
+    "carriers",
+    "detection_threshold",
+    "domain_id",
+    "dst_id",
+    "max_sources",
+    "pilots",
+    "robot_id",
+    "rolloff",
+    "sps",
+    "sync_word",
+}
+"""Numbers without a unit: identifiers, ratios, and counts of what their label says."""
 BLOCKS = {"ros2_source": (RosSource, SourceConfig), "ros2_sink": (RosSink, SinkConfig)}
 
 
@@ -78,7 +96,6 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
     loaded = description(name)
     for parameter in loaded["parameters"]:
         assert f"{parameter['id']}=${{{parameter['id']}}}" in loaded["templates"]["make"]
-        assert f"{parameter['label'].split(' (')[0].rstrip('.')}".split()[0] in loaded["documentation"]
     for callback in loaded["templates"]["callbacks"]:
         assert hasattr(BLOCKS[name][0], callback.split("(")[0])
 
@@ -87,6 +104,61 @@ def test_the_phys_blocks_are_as_their_settings_say() -> None:
     tool = Path(__file__).resolve().parents[2] / "tools" / "write-grc"
     done = subprocess.run([sys.executable, tool, "--check"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("path", DESCRIPTIONS, ids=lambda path: path.stem)
+def test_every_field_is_named_in_plain_words_with_its_unit_and_explained(path: Path) -> None:
+    loaded = yaml.safe_load(path.read_text())
+    labels = [parameter["label"] for parameter in loaded["parameters"]]
+    assert len(set(labels)) == len(labels)
+    explained = tuple(re.findall(r"^([^:\n]+): ", loaded["documentation"], re.MULTILINE))
+    for parameter in loaded["parameters"]:
+        words, _, unit = parameter["label"].partition(" (")
+        assert words.startswith(explained), words
+        number = parameter["dtype"] in ("int", "real") or parameter["default"] == "None"
+        # A drop-down may need no unit: its choices speak for themselves.
+        assert unit or not number or parameter["dtype"] == "enum" or parameter["id"] in PURE_NUMBERS, words
+
+
+def test_the_manifest_says_what_cgran_reads() -> None:
+    text = (Path(__file__).resolve().parents[2] / "MANIFEST.md").read_text()
+    header, _, body = text.partition("\n---\n")
+    loaded = yaml.safe_load(header)
+    wanted = {"title", "brief", "tags", "author", "copyright_owner", "license", "gr_supported_version", "dependencies"}
+    assert wanted <= set(loaded)
+    assert loaded["gr_supported_version"] == "v3.10"  # a bare 3.10 is the number 3.1
+    assert body.strip()
+
+
+def test_a_setting_has_one_label_wherever_it_stands() -> None:
+    labels: dict[str, set[str]] = {}
+    for path in DESCRIPTIONS:
+        for parameter in yaml.safe_load(path.read_text())["parameters"]:
+            labels.setdefault(parameter["id"], set()).add(parameter["label"])
+    assert {name: said for name, said in labels.items() if len(said) > 1} == {}
+
+
+@pytest.mark.parametrize("name", list(FRONT_ENDS))
+def test_a_radio_offers_what_it_can_do(name: str) -> None:
+    loaded = description(f"ros2_radio_{name}")
+    offered = {parameter["id"]: parameter["dtype"] for parameter in loaded["parameters"]}
+    settings = {item.name for item in fields(FRONT_ENDS.load(name).Options)}
+    refused = {"antenna_tx", "antenna_rx"} if name == "pluto" else set()
+    channel = set() if FRONT_ENDS.load(name).has_radio else {"snr_db", "frequency_offset", "packet_loss"}
+    made = {"phy", "phy_options", "packet_len", "sample_rate", "record"}
+    assert set(offered) == settings - refused | channel | made
+    assert offered["record"] == "file_save"
+    for setting in offered:
+        assert f"{setting}=${{{setting}}}" in loaded["templates"]["make"]
+    callbacks = loaded["templates"].get("callbacks", [])
+    assert {callback.partition("(")[0] for callback in callbacks} == {f"set_{setting}" for setting in channel}
+    assert all(hasattr(Radio, callback.partition("(")[0]) for callback in callbacks)
+
+
+def test_what_a_radio_does_not_offer_it_refuses() -> None:
+    for setting in ("antenna_tx", "antenna_rx"):
+        with pytest.raises(RadioError, match="leave antennas out"):
+            make_radio("psk", 220, 1e6, "pluto", frequency=433e6, **{setting: "A"})
 
 
 def test_options_are_the_tables() -> None:
@@ -125,15 +197,37 @@ def test_an_example_opens_without_a_complaint(platform: Platform, path: Path) ->
     assert [str(message) for message in graph.iter_error_messages()] == []
 
 
-@pytest.mark.parametrize(("setting", "value"), [("packet_len", "13"), ("robot_id", "255"), ("domain_id", "233")])
-def test_grc_refuses_what_the_block_would_refuse(platform: Platform, setting: str, value: str) -> None:
-    graph = platform.make_flow_graph(str(example("direct_loopback.grc")))
-    for name in BLOCKS:
-        graph.get_block(f"{name}_0").params[setting].set_value(value)
+def complaints(platform: Platform, name: str, blocks: Iterable[str], setting: str, value: str) -> str:
+    """What GRC says of an example with a setting of some blocks changed."""
+    graph = platform.make_flow_graph(str(example(name)))
+    for block in blocks:
+        graph.get_block(block).params[setting].set_value(value)
     graph.rewrite()
     graph.validate()
-    complaints = " ".join(str(message) for message in graph.iter_error_messages())
-    assert all(f"{name}_0" in complaints for name in BLOCKS)
+    return " ".join(str(message) for message in graph.iter_error_messages())
+
+
+@pytest.mark.parametrize(("setting", "value"), [("packet_len", "13"), ("robot_id", "255"), ("domain_id", "233")])
+def test_grc_refuses_what_the_block_would_refuse(platform: Platform, setting: str, value: str) -> None:
+    blocks = [f"{name}_0" for name in BLOCKS]
+    said = complaints(platform, "direct_loopback.grc", blocks, setting, value)
+    assert all(block in said for block in blocks)
+
+
+@pytest.mark.parametrize(
+    ("setting", "good", "bad"),
+    [("snr_db", "None", "101"), ("snr_db", "-3", "'20'"), ("packet_loss", "0.5", "1.1"), ("guard", "0.001", "-1")],
+)
+def test_grc_knows_the_range_of_a_radios_settings(platform: Platform, setting: str, good: str, bad: str) -> None:
+    assert not complaints(platform, "sim_radio.grc", ["radio"], setting, good)
+    assert setting in complaints(platform, "sim_radio.grc", ["radio"], setting, bad)
+
+
+def test_grc_offers_clock_sources_and_takes_others(platform: Platform) -> None:
+    for source in ("", "external", "another"):
+        assert not complaints(platform, "uhd_radio.grc", ["radio"], "clock_source", source)
+    offered = next(item for item in description("ros2_radio_uhd")["parameters"] if item["id"] == "clock_source")
+    assert {"", "internal", "external", "gpsdo"} <= set(offered["options"])
 
 
 def compiled(path: Path, folder: Path) -> ModuleType:
@@ -161,6 +255,34 @@ def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: 
     done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert f"RadioError: front_end {name.removesuffix('_radio')}: args = " in done.stderr.splitlines()[-1]
+
+
+def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path: Path) -> None:
+    copy = tmp_path / "sim_radio.grc"
+    copy.write_text(example("sim_radio.grc").read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    top = compiled(copy, tmp_path).sim_radio()
+    heard: list[bytes] = []
+    try:
+        with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:
+            other.subscribe("/rx_robot_1/odom", "nav_msgs/Odometry", Qos(depth=0), heard.append)
+            top.start()
+            publisher = robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=0))
+
+            def send() -> None:
+                publisher.publish(b"\0\1\0\0" + bytes(720))
+
+            wait_for(lambda: send() or heard, "the first message")
+            top.set_snr_db(3)  # as GRC's widgets call it; enough to be found, too little to be read
+            wait_for(lambda: send() or top.radio.damaged > 20, "packets that are lost in noise")
+            top.set_snr_db(None)
+            heard.clear()
+            wait_for(lambda: send() or heard, "a message without noise")
+    finally:
+        top.stop()
+        top.wait()
+        top.ros2_source_0.close()
+        top.ros2_sink_0.close()
+        top.radio.close()
 
 
 def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

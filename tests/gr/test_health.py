@@ -14,11 +14,21 @@ def stats(**changes: Any) -> dict[str, Any]:
     """What a link would say after a quiet start."""
     values: dict[str, Any] = {
         "out": 0, "packets": 0, "missing": 0, "rejected": 0, "delivered": 0, "lost": 0, "latency": None, "age": None,
-        "queued": 0, "snr_db": None, **changes,
+        "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, **changes,
     }  # fmt: skip
     latency = None if values["latency"] is None else {"p50": values["latency"], "p95": 2 * values["latency"]}
     return {
-        "source": {"topics": {"/odom": {"queued": values["queued"], "refused": {"stale": 3}}}},
+        "source": {
+            "topics": {
+                "/odom": {
+                    "queued": values["queued"],
+                    "queue": values["queue"],
+                    "queue_depth": values["depth"],
+                    "refused": {"stale": 3},
+                },
+                "/map": {"queued": values["queued"], "queue": "fifo", "queue_depth": 1000, "refused": {}},
+            }
+        },
         "sink": {
             "packets": values["packets"],
             "packet_loss_est": values["missing"],
@@ -43,8 +53,8 @@ def parts(health: LinkHealth, now: float, **changes: Any) -> tuple[Status, Statu
     return receiver, transmitter, topic
 
 
-def make(queue_depth: int = 100, **limits: float) -> LinkHealth:
-    return LinkHealth(DiagnosticsConfig(**limits), "link", queue_depth)
+def make(**limits: float) -> LinkHealth:
+    return LinkHealth(DiagnosticsConfig(**limits), "link")
 
 
 def test_a_quiet_start_is_ok() -> None:
@@ -94,15 +104,22 @@ def test_topics_are_judged_each() -> None:
 
 
 def test_the_transmitter_tells_airtime_queues_and_drops() -> None:
-    health = make(queue_depth=10)
+    health = make()
     parts(health, 0.0)
-    _, transmitter, _ = parts(health, 2.0, out=100, queued=9)
+    _, transmitter, _ = parts(health, 2.0, out=100, queued=9, depth=10)
     assert transmitter.level is Level.WARN
     assert transmitter.message == "fullest queue 0.9"
     assert transmitter.values["airtime used"] == "0.5"
     assert transmitter.values["messages dropped: stale"] == "3"
-    _, transmitter, _ = parts(make(queue_depth=0), 0.0, queued=9)
-    assert "fullest queue" not in transmitter.values
+
+
+@pytest.mark.parametrize("queue", [{"depth": 0}, {"depth": 1, "queue": "latest"}])
+def test_a_queue_without_a_bound_or_of_the_newest_alone_is_never_full(queue: dict[str, Any]) -> None:
+    _, transmitter, _ = parts(make(), 0.0, queued=9, **queue)
+    assert (transmitter.level, transmitter.values["fullest queue"]) == (Level.OK, "0.009")
+    alone = stats(queued=9, **queue)
+    del alone["source"]["topics"]["/map"]
+    assert "fullest queue" not in make().judge(alone, 0.0)[1].values
 
 
 def test_the_snr_is_told_where_it_is_known() -> None:
@@ -115,3 +132,29 @@ def test_a_limit_of_zero_is_none() -> None:
     parts(health, 0.0)
     parts(health, 1.0, packets=1, missing=99)
     assert parts(health, 99.0, packets=1, missing=99)[0].level is Level.OK
+
+
+def test_what_a_front_end_loses_warns_once_and_is_named() -> None:
+    health = make()
+    at = iter(range(10))
+
+    def front_end(**counters: int) -> Status:
+        values = {**stats(), "front_end": {"name": "uhd", **counters}}
+        (status,) = (status for status in health.judge(values, float(next(at))) if status.name == "link: front end")
+        return status
+
+    assert front_end(underflows=0, bursts_out=5).message == "OK"
+    grown = front_end(underflows=2, sequence_errors=1, bursts_out=9, blanked=700)
+    assert (grown.level, grown.message) == (Level.WARN, "2 underflows; 1 sequence errors")
+    assert grown.values == {"underflows": "2", "sequence errors": "1", "bursts out": "9", "blanked": "700"}
+    assert front_end(underflows=2, sequence_errors=1, bursts_out=12, blanked=900).level == Level.OK
+
+
+def test_what_a_front_end_lost_before_the_first_look_is_told() -> None:
+    values = {**stats(), "front_end": {"name": "uhd", "overflows": 3}}
+    assert [status.message for status in make().judge(values, 0.0)] == ["OK", "OK", "3 overflows", "OK"]
+
+
+def test_a_front_end_that_counts_nothing_is_no_part() -> None:
+    values = {**stats(), "front_end": {"name": "sim"}}
+    assert len(make().judge(values, 0.0)) == 3

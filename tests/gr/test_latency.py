@@ -47,6 +47,15 @@ def test_percentiles_and_negative_values() -> None:
     assert (summary.measured, summary.negative) == (101, 1)
 
 
+def test_a_copy_stays_as_it_was() -> None:
+    window = LatencyWindow()
+    window.add(-2.0)
+    copied = window.copy()
+    window.add(3.0)
+    assert copied.summary() == (-2.0, -2.0, -2.0, -2.0, 1, 1)
+    assert window.summary().measured == 2
+
+
 def test_the_window_is_bounded_and_the_count_is_not() -> None:
     window = LatencyWindow()
     for value in range(WINDOW + 10):

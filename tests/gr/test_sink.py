@@ -20,6 +20,7 @@ from gnuradio import gr
 from gr_ros2.config import SourceConfig
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
+from gr_ros2.gr.latency import Latency, LatencyWindow
 from gr_ros2.link import Delivered, Lost, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -195,6 +196,65 @@ def test_a_failing_observer_does_not_end_reception(rig: Rig) -> None:
         rig.probe.post(data)
     wait_for(lambda: len(rig.heard) == 2)
     wait_for(lambda: sink.stats()["handler_failed"] == 2)
+
+
+def test_a_failing_observer_does_not_end_the_watch_over_timeouts(rig: Rig) -> None:
+    def fail(_event: Any) -> None:
+        raise ValueError("observer")
+
+    sink = rig.make(reassembly_timeout=0.05, observer=fail)
+    rig.start()
+    for count in (1, 2):
+        rig.probe.post(packets((0, stamped(count) + bytes(600)))[0])
+        wait_for(lambda count=count: sink.stats()["handler_failed"] == count)
+    assert [thread for thread in threading.enumerate() if thread.name == "gr-ros2-sink"]
+
+
+def test_what_an_observer_makes_of_a_loss_does_not_cost_the_next_message(rig: Rig) -> None:
+    def fail(event: Any) -> None:
+        if isinstance(event, Lost):
+            raise ValueError("observer")
+
+    sink = rig.make(observer=fail)
+    rig.start()
+    # The same entry id: the second message ends the first, which is not complete.
+    for data in packets((0, bytes(600)))[:1] + packets((0, stamped(5)[:40])):
+        rig.probe.post(data)
+    wait_for(lambda: rig.heard == [stamped(5)[:40]])
+    assert sink.stats()["handler_failed"] == 1
+
+
+def test_nothing_waits_while_latencies_are_sorted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    sink = rig.make()
+    rig.start()
+    rig.probe.post(packets((0, stamped(5)[:40]))[0])
+    wait_for(lambda: rig.heard and sink.handled)
+    free: list[bool] = []
+    summary = LatencyWindow.summary
+
+    def watched(window: LatencyWindow, *newest: int) -> Latency:
+        free.append(sink._lock.acquire(timeout=5))
+        sink._lock.release()
+        return summary(window, *newest)
+
+    monkeypatch.setattr(LatencyWindow, "summary", watched)
+    topic = sink.stats()["topics"]["/rx_robot_1/odom"]
+    assert free == [True, True]
+    assert topic["latency_s"]["measured"] == topic["recent_latency_s"]["measured"] == 1
+
+
+def test_latencies_of_a_sender_that_gave_its_place_to_another_are_freed(rig: Rig) -> None:
+    now = [0.0]
+    sink = rig.make(max_sources=1, clock=lambda: now[0])
+    rig.start()
+    for number, robot in enumerate((1, 2), start=1):
+        rig.probe.post(packets((0, stamped(5)[:40]), src_id=robot)[0])
+        wait_for(lambda number=number: sink.handled == number)
+        now[0] += 100
+    gone, here = (sink.stats()["topics"][f"/rx_robot_{robot}/odom"] for robot in (1, 2))
+    assert (gone["delivered"], gone["latency_s"]) == (1, None)
+    assert here["latency_s"]["measured"] == 1
+    assert {info.topic for info in rig.listener.discover()} >= {"/rx_robot_1/odom", "/rx_robot_2/odom"}
 
 
 def test_latency_by_wall_clock(rig: Rig) -> None:

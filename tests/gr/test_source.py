@@ -107,6 +107,13 @@ def test_queues_follow_the_qos_of_the_publishers(middleware: str, monkeypatch: p
     source.close()
 
 
+def test_each_topic_has_its_depth(rig: Rig) -> None:
+    source = rig.make(topic_options={"/tf": {"queue_depth": 7}})
+    source.set_queue_depth(5)
+    depths = {name: topic["queue_depth"] for name, topic in source.stats()["topics"].items()}
+    assert depths == {"/robot_1/odom": 5, "/tf": 7}
+
+
 def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
     refused: list[Refused] = []
     rig.make(observer=lambda event: refused.append(event) if isinstance(event, Refused) else None)
@@ -146,6 +153,9 @@ def test_credit_paces(rig: Rig) -> None:
         rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
         wait_for(lambda number=number: rig.probe.handled == number)
     assert rig.source.stats()["packets"] == 3
+    rig.probe.message_port_pub(pmt.intern("credit"), pmt.from_long(4))
+    wait_for(lambda: rig.probe.handled == 7, "as many packets as the integer says")
+    assert rig.source.emitted == 7
 
 
 def test_events_reach_the_observer_in_order(rig: Rig) -> None:

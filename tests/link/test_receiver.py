@@ -169,6 +169,17 @@ def test_loss_estimates_come_from_gaps() -> None:
     assert sink.stats.message_loss_est + sink.stats.delivered[1, 0] == pytest.approx(100, abs=2)
 
 
+@pytest.mark.parametrize("start", range(0, 256, 15))
+def test_a_restart_is_no_loss(start: int) -> None:
+    sink = receiver(packet_len=64)
+    for seq in range(200):
+        sink.receive(packet(seq % 256, Entry(0, seq, 0, 1, b"a")), seq * 0.03)
+    for number in range(200):
+        sink.receive(packet((start + number) % 256, Entry(0, number, 0, 1, b"b")), 10.0 + number * 0.03)
+    near = start - 200 if 200 < start <= 215 else 0
+    assert (sink.stats.packet_loss_est, sink.stats.unknown_gaps) == (near, not near and start != 200)
+
+
 @given(st.lists(st.binary(max_size=80), max_size=60), st.integers(14, 80))
 def test_garbage_is_rejected_by_name_and_loses_nothing_else(garbage: list[bytes], packet_len: int) -> None:
     engine, sink = sender(packet_len=packet_len, min_fragment=1), receiver(packet_len=packet_len)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from gr_ros2.link.sequence import Arrival, Pace, SequenceTracker
+import pytest
+
+from gr_ros2.link.sequence import NEAR, Arrival, Pace, SequenceTracker
 
 
 def place(tracker: SequenceTracker, seq: int, now: float = 0.0, data: bytes | None = None) -> Arrival:
@@ -62,6 +64,46 @@ def test_a_packet_later_than_half_a_second_at_the_recent_pace_is_a_reset() -> No
     for seq in [*range(20), *range(21, 100)]:
         place(tracker, seq, seq * 0.01)
     assert place(tracker, 20, 1.0) is Arrival.RESET
+
+
+@pytest.mark.parametrize(
+    ("packets", "pause", "step", "missing"),
+    [
+        (100, 0.01, 61, 60),
+        (100, 3.0, 61, None),
+        (100, 3.0, -61, None),
+        (100, 3.0, 0, None),
+        (100, 3.0, 3, 2),
+        (30, 0.01, 61, None),
+        (30, 0.01, 3, 2),
+    ],
+    ids=[
+        "loss",
+        "silence",
+        "a silence, and behind",
+        "a silence of 256",
+        "near",
+        "no pace yet",
+        "no pace yet, and near",
+    ],
+)
+def test_what_is_missing_is_told_only_where_it_is_known(
+    packets: int, pause: float, step: int, missing: int | None
+) -> None:
+    tracker = SequenceTracker()
+    for seq in range(packets):
+        place(tracker, seq, seq * 0.01)
+    last = packets - 1
+    assert tracker.place((last + step) % 256, b"new", last * 0.01 + pause).missing == missing
+
+
+def test_a_number_that_a_slow_sender_cannot_have_come_to_tells_nothing() -> None:
+    tracker = SequenceTracker()
+    for seq in range(100):
+        place(tracker, seq, seq * 1.0)
+    assert tracker.place(99 + NEAR, b"a", 100.0).missing == NEAR - 1
+    placed = tracker.place(99 + NEAR + 61, b"b", 101.0)
+    assert (placed.arrival, placed.missing) == (Arrival.GAP, None)
 
 
 def test_pace_is_believed_only_after_enough() -> None:

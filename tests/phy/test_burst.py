@@ -19,6 +19,16 @@ from gr_ros2.phy.lora import code_words
 NAMES = ("ofdm", "gfsk", "psk", "lora")
 
 
+SETTINGS: list[tuple[str, dict[str, Any]]] = [
+    ("ofdm", {}),
+    ("gfsk", {}),
+    ("gfsk", {"sps": 2, "bt": 0.3, "fec": "cc"}),
+    ("psk", {}),
+    ("psk", {"modulation": "bpsk", "sps": 2, "rolloff": 0.2}),
+    ("psk", {"modulation": "8psk", "fec": "ldpc"}),
+]
+
+
 def bursts(phy: Any, count: int, seed: int = 0) -> tuple[list[bytes], np.ndarray]:
     source = random.Random(seed)
     packets = [source.randbytes(phy.packet_len) for _ in range(count)]
@@ -28,12 +38,18 @@ def bursts(phy: Any, count: int, seed: int = 0) -> tuple[list[bytes], np.ndarray
     return packets, np.concatenate([*parts, np.zeros(400)])
 
 
-def received(phy: Any, samples: np.ndarray, cut: int = 4096) -> list[bytes]:
+def listen(phy: Any, samples: np.ndarray, cut: int = 4096) -> tuple[list[bytes], int]:
+    """Packets received, and how many bursts were damaged."""
     if phy.receiver_taps is not None:
         samples = np.convolve(samples, phy.receiver_taps)
     samples = samples.astype(np.complex64)
     engine = BurstReceiver(phy.modem)
-    return [packet for at in range(0, len(samples), cut) for packet in engine.feed(samples[at : at + cut])]
+    packets = [packet for at in range(0, len(samples), cut) for packet in engine.feed(samples[at : at + cut])]
+    return packets, engine.damaged
+
+
+def received(phy: Any, samples: np.ndarray, cut: int = 4096) -> list[bytes]:
+    return listen(phy, samples, cut)[0]
 
 
 def noise(count: int, snr_db: float, seed: int = 0) -> np.ndarray:
@@ -103,11 +119,40 @@ def test_a_damaged_burst_is_counted_and_hides_nothing(name: str) -> None:
     packets, samples = bursts(phy, 4)
     start = 400 + phy.airtime_samples()
     samples[start + phy.airtime_samples() // 2 : start + phy.airtime_samples() * 5 // 6] = 0
-    if phy.receiver_taps is not None:
-        samples = np.convolve(samples, phy.receiver_taps)
-    engine = BurstReceiver(phy.modem)
-    assert engine.feed(samples.astype(np.complex64)) == [packets[0], *packets[2:]]
-    assert engine.damaged >= 1
+    got, damaged = listen(phy, samples)
+    assert got == [packets[0], *packets[2:]]
+    assert damaged >= 1
+
+
+@pytest.mark.parametrize("snr_db", [None, 20, 40, 60])
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=str)
+def test_the_silence_behind_a_burst_is_not_counted_as_a_damaged_one(
+    name: str, options: dict[str, Any], snr_db: float | None
+) -> None:
+    phy = PHY.load(name)(64, 1e6, gap=2000, **options)
+    packets, samples = bursts(phy, 50)
+    if snr_db is not None:
+        samples = samples + noise(len(samples), snr_db)
+    got, damaged = listen(phy, samples)
+    assert got == packets
+    assert damaged <= (0 if snr_db is None else 1)
+
+
+@pytest.mark.parametrize("fec", ["none", "ldpc"])
+@pytest.mark.parametrize("name", ["gfsk", "psk"])
+def test_noise_is_seldom_taken_for_a_burst(name: str, fec: str) -> None:
+    phy = PHY.load(name)(64, 1e6, fec=fec)
+    assert listen(phy, noise(1_000_000, 0.0))[1] <= 2
+
+
+@pytest.mark.parametrize("echo", [0.5, 0.5j])
+@pytest.mark.parametrize(("name", "options"), SETTINGS[:-1], ids=str)
+def test_an_echo_a_symbol_later_hides_no_burst(name: str, options: dict[str, Any], echo: complex) -> None:
+    phy = PHY.load(name)(64, 1e6, **options)
+    packets, samples = bursts(phy, 10)
+    taps = np.zeros(getattr(phy.options, "sps", 4) + 1, complex)
+    taps[0], taps[-1] = 1, echo
+    assert received(phy, np.convolve(samples, taps) + noise(len(samples) + len(taps) - 1, 25)) == packets
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -39,8 +39,13 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("lora", {"coding_rate": 1, "gap": 16}),
     ("lora", {"spreading_factor": 9, "coding_rate": 3}),
     ("lora", {"coding_rate": 1, "fec": "cc"}),
+    ("lora", {"implementation": "lora_sdr"}),
+    ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3, "oversampling": 4}),
+    ("lora", {"implementation": "lora_sdr", "spreading_factor": 8, "coding_rate": 1, "ldro": True, "gap": 48}),
 ]
 LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
+LONGEST = {"lora_sdr": 251}
+"""By implementation."""
 IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
 IN_NOISE = [
     ("ofdm", {}),
@@ -50,16 +55,23 @@ IN_NOISE = [
     ("psk", {"modulation": "bpsk"}),
     ("psk", {"modulation": "8psk"}),
 ]
-IN_NOISE += [("lora", {"coding_rate": 4})]
+IN_NOISE += [("lora", {"coding_rate": 4}), ("lora", {"implementation": "lora_sdr"})]
+CASES = [
+    pytest.param(name, options, packet_len, id=f"{packet_len}-{about}")
+    for (name, options), about in zip(SETTINGS, IDS, strict=True)
+    for packet_len in LENGTHS
+    if packet_len <= LONGEST.get(options.get("implementation", ""), max(LENGTHS))
+]
 
 
 def make(name: str, options: dict[str, Any], packet_len: int = 64) -> Phy:
+    if options.get("implementation") == "lora_sdr":
+        pytest.importorskip("gnuradio.lora_sdr", reason="gr-lora_sdr is not installed")
     phy: Phy = PHY.load(name)(packet_len, 1e6, **options)
     return phy
 
 
-@pytest.mark.parametrize("packet_len", LENGTHS)
-@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+@pytest.mark.parametrize(("name", "options", "packet_len"), CASES)
 def test_nothing_is_lost_back_to_back_and_the_air_is_as_long_and_strong_as_claimed(
     name: str, options: dict[str, Any], packet_len: int
 ) -> None:
@@ -174,3 +186,14 @@ def test_a_pdu_that_is_no_packet_is_counted_and_not_sent(name: str) -> None:
         wait_for(lambda: sink.handled == 1, "the right one")
         assert link.counts().transmitted == 1
         assert link._transmitter.refused == 1
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_a_sample_that_is_no_number_costs_packets_and_not_the_receiver(name: str, value: float) -> None:
+    phy = make(name, {})
+    recording = record(phy, 12)
+    recording.samples[3 * phy.airtime_samples() + 100] = value
+    arrived = deliver(phy, recording, ChannelConfig())
+    assert set(arrived) <= set(recording.packets)
+    assert arrived[-4:] == recording.packets[-4:]

@@ -149,7 +149,7 @@ def test_what_has_no_samples_has_no_noise() -> None:
 
 def test_a_loss_out_of_range_is_refused() -> None:
     with pytest.raises(ConfigError, match="packet_loss"):
-        LoopbackLink(make("ofdm"), Probe(), Probe()).set_packet_loss(2.0)
+        LoopbackLink(make("ofdm"), Probe(), Probe(), instrumented=True).set_packet_loss(2.0)
 
 
 @pytest.mark.parametrize("name", list(PHY))

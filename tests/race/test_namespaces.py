@@ -63,7 +63,7 @@ def test_what_is_no_namespace_cannot_be_entered(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="no setpriv")
 def test_without_root_one_line_says_so_with_the_remedy() -> None:
-    command = [sys.executable, "-m", "gr_ros2.cli.main", "race", "--short"]
+    command = [sys.executable, "-m", "gr_ros2.cli", "race", "--short"]
     if os.geteuid() == 0:
         command = ["setpriv", "--bounding-set=-sys_admin", *command]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -14,7 +14,7 @@ from tests.race.support import needs_namespaces
 
 pytestmark = needs_namespaces
 
-COMMAND = (sys.executable, "-m", "gr_ros2.cli.main", "race", "--short")
+COMMAND = (sys.executable, "-m", "gr_ros2.cli", "race", "--short")
 
 
 def wait_for(condition: Callable[[], bool], what: str) -> None:

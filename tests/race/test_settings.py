@@ -79,7 +79,7 @@ def test_a_bag_that_cannot_race_is_refused(
         ({"peers": ("nobody",)}, "peers = 'nobody': no such contender"),
         ({"source": "bag:"}, "the path of the bag is missing"),
         ({"source": "x.mcap"}, "source = 'x.mcap': write sim or bag:PATH"),
-        ({"loss": (1.5,)}, "loss.0 = 1.5: input should be less than or equal to 1"),
+        ({"loss": (1.5,)}, "loss.0 = 1.5: must be less than or equal to 1"),
         ({"load": ()}, "load"),
         ({"packet_len": 3}, "packet_len = 3"),
         ({"laps": 3}, "unknown key laps"),

@@ -15,7 +15,7 @@ from gnuradio import blocks, gr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
+from gr_ros2.radio.bursts import LENGTH_TAG, Blanker, BurstLayout, BurstShaper
 
 SIZES = st.integers(0, 5000)
 
@@ -53,10 +53,8 @@ def test_every_burst_is_padded_scaled_and_tagged(layout: BurstLayout, bursts: in
     inside = slice(layout.lead, layout.lead + layout.samples)
     assert np.allclose(shaped[:, inside].ravel(), 0.5 * packets)
     assert np.count_nonzero(shaped) == len(packets)
-    begins = range(0, bursts * layout.total, layout.total)
-    assert named(tags, "tx_sob") == dict.fromkeys(begins, True)
-    assert named(tags, "tx_eob") == {begin + layout.total - 1: True for begin in begins}
-    assert len(tags) == 2 * bursts
+    assert named(tags, LENGTH_TAG) == dict.fromkeys(range(0, bursts * layout.total, layout.total), layout.total)
+    assert len(tags) == bursts
 
 
 def test_a_part_of_a_packet_waits_for_the_rest() -> None:

@@ -58,6 +58,8 @@ def test_settings_are_replaced_one_by_one(tmp_path: Path) -> None:
         ({"frequency": 1e6}, "unknown key frequency"),
         ({"packet_len": 5}, "packet_len = 5"),
         ({"registry": ""}, "registry"),
+        ({"packet_len": 13}, "packet_len = 13: [^;]*$"),
+        ({"phy": 5}, r"phy = 5: must be keys and values \(which physical layer"),
         ({"ros_source": {}}, "robot_id = -1"),
         ({"ros_source": {"robot_id": 1, "packet_len": 99}}, "ros_source.packet_len = 99: both ends share it"),
         ({"ros_sink": {"middleware": "dsd"}}, "ros_sink.middleware = 'dsd'.*known are"),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
+import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.config import DiagnosticsConfig
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -32,8 +35,9 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = link_from(
         {
             "registry": str(registry),
-            "phy": {"name": "direct"},
+            "phy": {"name": "psk", "sample_rate": 1e6},
             "front_end": {"name": "sim"},
+            "channel": {"snr_db": 20.0},
             "ros_source": {"namespace": "/robot_1", "domain_id": number},
             "ros_sink": {"domain_id": number},
             "diagnostics": {"period_s": 0.1, "latency_warn_s": 1.0},
@@ -72,7 +76,9 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert 2 <= float(values["latency (s)"]) <= float(values["age (s)"]) + 0.01
     assert abs(arrays[-1].header.stamp.sec - time.time()) < 60
     assert counters[-1]["sink"]["topics"]["/rx_robot_1/point"]["delivered"] > 0
-    assert counters[-1]["phy"]["name"] == "direct"
+    assert counters[-1]["phy"]["name"] == "psk"
+    snr_db = {item.key: item.value for item in receiver.values}["SNR (dB)"]
+    assert float(snr_db) == pytest.approx(20, abs=1.5)
 
 
 def test_no_period_no_diagnostics(tmp_path: Path) -> None:
@@ -92,17 +98,62 @@ def test_no_period_no_diagnostics(tmp_path: Path) -> None:
         assert "/diagnostics" not in {info.topic for info in listener.discover()}
 
 
+STATS = {
+    "source": {"topics": {}},
+    "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "topics": {}},
+    "packets": {"out": 0, "backlog": 0, "damaged": 0},
+    "phy": {"airtime_s": 0.0},
+}
+QUICK = DiagnosticsConfig(period_s=0.01)
+
+
+def test_a_snapshot_that_fails_is_counted_and_survived(caplog: pytest.LogCaptureFixture) -> None:
+    snapshots = iter([{}, {**STATS, "uptime_s": object()}])
+
+    def stats() -> Mapping[str, Any]:
+        if diagnostics.failed < 2:
+            return next(snapshots)
+        if diagnostics.failed < 3:
+            raise ValueError("no figures")
+        return STATS
+
+    heard: list[bytes] = []
+    with MemoryMiddleware(domain_id=domain()) as graph:
+        graph.subscribe("/link/statistics", STATISTICS_TYPE, Qos(), heard.append)
+        diagnostics = Diagnostics(QUICK, graph, "link", stats)
+        diagnostics.start()
+        wait_for(lambda: heard, "statistics")
+        diagnostics.stop()
+    assert diagnostics.failed == 3
+    assert caplog.text.count("diagnostics were not published") == 1
+
+
+def test_nothing_is_published_after_the_end_however_long_a_snapshot_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.radio.diagnostics._JOIN_S", 0.0)
+    asked, answer = threading.Event(), threading.Event()
+
+    def stats() -> Mapping[str, Any]:
+        asked.set()
+        answer.wait()
+        return STATS
+
+    heard: list[bytes] = []
+    with MemoryMiddleware(domain_id=domain()) as graph, MemoryMiddleware(domain_id=domain()) as listener:
+        for topic, kind in (("/diagnostics", DIAGNOSTICS_TYPE), ("/link/statistics", STATISTICS_TYPE)):
+            listener.subscribe(topic, kind, Qos(), heard.append)
+        diagnostics = Diagnostics(QUICK, graph, "link", stats)
+        diagnostics.start()
+        asked.wait()
+        diagnostics.stop()
+        answer.set()
+        wait_for(lambda: not any(info.publishers for info in listener.discover()), "the thread to leave the graph")
+        assert heard == []
+        assert diagnostics.failed == 0
+
+
 def test_a_closed_graph_is_counted_and_survived() -> None:
     graph = MemoryMiddleware(domain_id=domain())
-    stats = {
-        "source": {"topics": {}},
-        "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "topics": {}},
-        "packets": {"out": 0, "backlog": 0, "damaged": 0},
-        "phy": {"airtime_s": 0.0},
-    }
-    config = link_from({"registry": "x", "phy": {"name": "direct"}, "ros_source": {"robot_id": 1},
-                        "diagnostics": {"period_s": 0.01}}).diagnostics  # fmt: skip
-    diagnostics = Diagnostics(config, graph, "link", lambda: stats, queue_depth=0)
+    diagnostics = Diagnostics(QUICK, graph, "link", lambda: STATS)
     graph.close()
     diagnostics.start()
     wait_for(lambda: diagnostics.failed >= 2, "two failures")

@@ -94,6 +94,18 @@ def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
     assert len(metadata(tmp_path / "cut")["annotations"]) == 2
 
 
+def test_samples_that_are_no_numbers_are_zeros_and_counted(tmp_path: Path) -> None:
+    said = sent_recording(tmp_path / "sent")
+    data = tmp_path / "sent.sigmf-data"
+    samples = np.fromfile(data, "<c8")
+    bad = np.array([np.nan, np.inf, 1j * np.nan, complex(1, -np.inf)], "<c8")
+    np.concatenate([bad, samples]).tofile(data)
+    with Robot(2, {"name": "file", "read": str(tmp_path / "sent")}, hears=(1,)) as robot:
+        wait_for(lambda: robot.link.finished and len(robot.heard) == len(said), "the end of the recording")
+        assert robot.heard == said
+        assert robot.link.stats()["front_end"]["not_finite"] == len(bad)
+
+
 def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
     SigmfRecorder(tmp_path / "empty", Recording(RATE)).close()
     with Robot(2, {"name": "file", "read": str(tmp_path / "empty")}) as robot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 import zmq
 
 from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.phy import PHY
 from gr_ros2.radio.link import RobotLink
-from gr_ros2.radio.zmq import HEADER, MAGIC
+from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd
 from tests.middleware.support import wait_for
 from tests.radio.robots import RATE, Robot, config
 
@@ -94,6 +96,10 @@ def test_messages_that_are_none_of_ours_are_counted_and_dropped(
             arrives(junk, "malformed", counters(robot)["malformed"] + 1)
             assert counters(robot)["bursts_in"] == 0, number
         arrives(header(0, 3e6), "wrong_rate", 1)
+        for number in (np.nan, np.inf, -np.inf):
+            poison = np.array([0, number], "<f4").tobytes()
+            arrives(header(0) + poison, "malformed", counters(robot)["malformed"] + 1)
+        assert counters(robot)["bursts_in"] == 0
         noise = np.random.default_rng(1).normal(size=100).astype("<f4").tobytes()
         arrives(header(0) + noise, "bursts_in", 1)
         missed = counters(robot)["missed"]
@@ -101,6 +107,22 @@ def test_messages_that_are_none_of_ours_are_counted_and_dropped(
         assert counters(robot)["restarts"] == 0
         assert robot.link.stats()["packets"]["in"] == 0
     assert "a peer sends 3e+06 samples/s, not 2e+06; set the same phy at both ends" in caplog.text
+
+
+def test_the_sender_forgotten_is_the_one_heard_longest_ago(ends: list[dict[str, Any]]) -> None:
+    with Robot(1, ends[0]) as robot:
+        source = robot.link.front_end.source
+
+        def bursts(*numbers: tuple[int, int]) -> int:
+            for sender, number in numbers:
+                source._take(HEADER.pack(MAGIC, sender, number, RATE))
+            return counters(robot)["missed"]
+
+        bursts(*((sender, 0) for sender in range(MAX_SENDERS)))
+        assert bursts((0, 1), (MAX_SENDERS, 0)) == 0
+        # The first is still known, the second is new again.
+        assert bursts((0, 3)) == 1
+        assert bursts((1, 9)) == 1
 
 
 def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str, Any]]) -> None:
@@ -113,6 +135,16 @@ def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str
     ):
         with pytest.raises(RadioError, match=said):
             RobotLink(config(1, {**ends[0], **change}))
+    for key, address in (
+        ("bind", "tcp://*:99999"),
+        ("bind", "tcp://127.0.0.1:0"),
+        ("bind", "tcp://127.0.0.1:-5"),
+        ("bind", "tcp://127.0.0.1:55x"),
+        ("connect", "tcp://[::1]:65536"),
+    ):
+        port = address.rpartition(":")[2]
+        with pytest.raises(ConfigError, match=rf"front_end zmq: {key}.* = '.*': port {port}: must be 1 to 65535"):
+            RobotLink(config(1, {**ends[0], key: address if key == "bind" else [address]}))
     with (
         Robot(1, {**ends[0], "bind": "tcp://127.0.0.1:45671"}),
         pytest.raises(RadioError, match="Address already in use"),
@@ -123,5 +155,15 @@ def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str
 def test_it_needs_samples_and_addresses(ends: list[dict[str, Any]]) -> None:
     with pytest.raises(ConfigError, match="phy direct has no samples"):
         RobotLink(config(1, ends[0], phy={"name": "direct"}))
-    with pytest.raises(ConfigError, match="bind is missing; front_end zmq: connect is missing"):
+    with pytest.raises(ConfigError, match=r"bind is missing .*; front_end zmq: connect is missing"):
         RobotLink(config(1, {"name": "zmq"}))
+
+
+def test_one_that_is_forgotten_lets_go_of_its_address() -> None:
+    phy = PHY.load("psk")(64, RATE)
+    one = ZmqFrontEnd(phy, bind="tcp://127.0.0.1:*", connect=["tcp://127.0.0.1:9"])
+    one.myself = one  # found by the collector only
+    context = one._context
+    del one
+    gc.collect()
+    assert context.closed

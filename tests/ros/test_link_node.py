@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,51 +16,16 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: source a ROS 2 setup (Humble or later) to run these tests")
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-import rclpy
-import rclpy.context
-import rclpy.executors
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header, String
 
 from tests.e2e.support import free_domains
 from tests.middleware.support import wait_for
+from tests.ros.graph import Graph
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, str(ROOT / "resource" / "link"), "--ros-args"]
-
-
-class Graph:
-    """A node beside the link's."""
-
-    def __init__(self, domain: int) -> None:
-        self._context = rclpy.context.Context()
-        self._context.init(args=[], domain_id=domain)
-        self.node = rclpy.create_node("beside", context=self._context)
-        self._executor = rclpy.executors.SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
-        self._thread.start()
-
-    def ask(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, f"/gr_ros2_link/{name}")
-        wait_for(client.service_is_ready, name)
-        future = client.call_async(request)
-        wait_for(future.done, name)
-        return future.result()
-
-    def set(self, name: str, value: Any) -> tuple[bool, str]:
-        kinds = {int: ("integer_value", ParameterType.PARAMETER_INTEGER), float: ("double_value", 3)}
-        field, number = kinds[type(value)]
-        parameter = Parameter(name=name, value=ParameterValue(type=number, **{field: value}))
-        (result,) = self.ask(SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])).results
-        return result.successful, result.reason
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-        self._thread.join(5)
 
 
 @pytest.fixture
@@ -121,18 +85,55 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
         process.communicate()
 
 
+@pytest.mark.parametrize("loaded", ["librcl.so", "libgnuradio-runtime", "libddsc"])
+def test_ctrl_c_while_it_starts(config: Path, loaded: str) -> None:
+    process = subprocess.Popen([*COMMAND, "-p", f"config:={config}"], stderr=subprocess.PIPE, text=True)
+    try:
+        maps = Path("/proc", str(process.pid), "maps")
+        wait_for(lambda: loaded in maps.read_text(), f"{loaded} to be loaded")
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+        assert process.returncode == 0
+        assert "Traceback" not in said
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("arguments", "said"),
     [
-        (["ros_source.hop:=30"], "ros_source.hop = 30"),
-        (["ros_source.hopp:=3"], "unknown key ros_source.hopp"),
-        (None, "parameter config is missing"),
+        (["-p", "config:=link.yaml", "-p", "ros_source.hop:=30"], "ros_source.hop = 30"),
+        (["-p", "config:=link.yaml", "-p", "ros_source.hopp:=3"], "unknown key ros_source.hopp"),
+        ([], "parameter config is missing"),
+        (["-p", "config:=12"], "link '12': no such file"),
+        (["-p", "config"], "write --ros-args -p config:=my_link.yaml"),
+        (["--", "link.yaml"], "argument 'link.yaml'"),
     ],
 )
-def test_wrong_settings_are_one_line(config: Path, parameters: list[str] | None, said: str) -> None:
-    chosen = [] if parameters is None else [f"config:={config}", *parameters]
-    command = [*COMMAND, *(word for text in chosen for word in ("-p", text))]
-    done = subprocess.run(command, capture_output=True, text=True)
+def test_wrong_settings_are_one_line(config: Path, arguments: list[str], said: str) -> None:
+    done = subprocess.run([*COMMAND, *arguments], cwd=config.parent, capture_output=True, text=True)
     assert done.returncode == 2
     *_, last = done.stderr.splitlines()  # an RMW may have said something before
     assert last.startswith("gr_ros2 link: ") and said in last
+
+
+def test_what_the_library_logs_is_in_the_log_of_ros(config: Path, graph: Graph) -> None:
+    """A warning of the middleware, and a packet where `debug` is on."""
+    (config.parent / "topics.csv").write_text("header,std_msgs/Header\nother,std_msgs/Header\n")
+    said: dict[int, str] = {}
+    graph.node.create_subscription(
+        Log, "/rosout", lambda line: said.update({line.level: said.get(line.level, "") + line.msg}), 10
+    )
+    graph.node.create_publisher(String, "/robot_1/other", 10)
+    publisher = graph.node.create_publisher(Header, "/robot_1/header", 10)
+    given = ["-p", f"config:={config}", "-p", "ros_source.debug:=true"]
+    process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy())
+    try:
+        wait_for(lambda: publisher.publish(Header()) or "0:header#" in said.get(Log.INFO[0], ""), "a packet")
+        wait_for(lambda: "/robot_1/other: a publisher sends" in said.get(Log.WARN[0], ""), "the warning")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.communicate()

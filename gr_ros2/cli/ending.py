@@ -1,0 +1,15 @@
+"""How the program ends: its exit statuses, and what Ctrl-C and SIGTERM do."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+
+def on_signals(handler: Callable[..., object]) -> None:
+    """Have Ctrl-C and SIGTERM call this; one that whoever started the program wants ignored stays so."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)

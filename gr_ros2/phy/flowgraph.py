@@ -1,0 +1,90 @@
+"""Flowgraphs and hier blocks that begin and end cleanly.
+
+Laws: after a flowgraph's ``stop`` none of its threads runs, whatever state it was in; after a hier block's
+``release`` nothing holds it, its blocks or their buffers but who made it.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import partial
+from types import TracebackType
+from typing import Any, TypeVar
+
+from gnuradio import gr
+
+from gr_ros2.backends import uninterrupted
+from gr_ros2.errors import PhyError
+from gr_ros2.phy.threads import begin
+
+_Self = TypeVar("_Self", bound="Flowgraph")
+
+
+class Flowgraph(gr.top_block):  # type: ignore[misc]
+    """Blocks that start and stop together, for instance in a ``with`` statement.
+
+    :param name: in GNU Radio's log
+    :param called: in errors
+    """
+
+    def __init__(self, name: str, called: str) -> None:
+        super().__init__(name, catch_exceptions=True)
+        self._called = called
+        self._running = False
+
+    def start(self, max_noutput_items: int = 10_000_000) -> None:
+        """Start every block's thread.
+
+        :raises PhyError: when GNU Radio refuses the flowgraph
+        """
+        self._running = True
+        try:
+            with uninterrupted():
+                begin(partial(super().start, max_noutput_items))
+        except (RuntimeError, MemoryError) as error:
+            self.stop()
+            raise PhyError(f"{self._called}: the flowgraph does not start ({error})") from error
+        except BaseException:  # Ctrl-C: nobody is there yet to stop what has begun
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Stop and wait for every thread; harmless when it is not running."""
+        if self._running:
+            self._running = False
+            super().stop()
+            self.wait()
+
+    def __enter__(self: _Self) -> _Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+class HierBlock(gr.hier_block2):  # type: ignore[misc]
+    """A hier block with message ports.
+
+    GNU Radio's ``disconnect_all`` forgets stream connections only. The message connections would go on holding it, and
+    with it shared memory, of which a system has 4096 segments: an OFDM receiver of stock blocks takes 60.
+    """
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._messages: list[tuple[Any, ...]] = []
+
+    def msg_connect(self, *ends: Any) -> None:
+        """Connect two message ports, as GNU Radio has it."""
+        super().msg_connect(*ends)
+        self._messages.append(ends)
+
+    def release(self) -> None:
+        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+        while self._messages:
+            # From a port of its own GNU Radio disconnects, and then raises, since nobody has subscribed to that.
+            with suppress(RuntimeError):
+                self.msg_disconnect(*self._messages.pop())
+        self.disconnect_all()

@@ -1,0 +1,68 @@
+"""Credits for a flowgraph that runs as fast as it can: a few packets are under way at any time, no more.
+
+Laws: credits given are at most ``window`` ahead of the packets that are through; they come several at a time, since
+each message between blocks costs about as much as a packet does; a full window is looked at now and then, because
+progress can only be polled.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import pmt
+from gnuradio import gr
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.phy.threads import quicken_threads
+
+WINDOW = 32
+"""Packets under way: enough to keep the flowgraph busy between two looks at its progress."""
+
+_SHARE = 4
+"""A grant is at least this part of the window."""
+_POLL_S = 0.001
+_JOIN_S = 1.0
+_CREDIT = pmt.intern("credit")
+
+
+class CreditWindow(gr.basic_block):  # type: ignore[misc]
+    """Message port `credit` out: an integer, how many more packets may come.
+
+    :param progress: tells how many packets are through
+    :param window: packets under way, 1 or more
+    :raises ConfigError: for a window below 1
+    """
+
+    def __init__(self, progress: Callable[[], int], window: int = WINDOW) -> None:
+        super().__init__("gr_ros2_credit_window", None, None)
+        if window < 1:
+            raise ConfigError(f"window = {window}: must be 1 or more")
+        self._progress = progress
+        self._window = window
+        self._stopped = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.message_port_register_out(_CREDIT)
+
+    def start(self) -> bool:
+        quicken_threads()
+        self._stopped.clear()
+        self._thread = threading.Thread(target=self._run, name="gr-ros2-window", daemon=True)
+        self._thread.start()
+        return True
+
+    def stop(self) -> bool:
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        return True
+
+    def _run(self) -> None:
+        granted = self._progress()
+        while not self._stopped.is_set():
+            credits = self._progress() + self._window - granted
+            if credits * _SHARE >= self._window:
+                self.message_port_pub(_CREDIT, pmt.from_long(credits))
+                granted += credits
+            self._stopped.wait(_POLL_S)
