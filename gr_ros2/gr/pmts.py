@@ -10,12 +10,9 @@ from typing import Any
 
 import pmt
 
-PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
+from gr_ros2.phy.pdus import octets, u8vector
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
-_U8_HEAD = b"\n\x00"
-_U8_OFFSET = 8
-"""A serialized u8vector: type 10, kind 0, length u32 big-endian, one byte of padding and its count, then the bytes."""
 _CACHED_HEADERS = 4096
 
 
@@ -38,8 +35,7 @@ class PduMaker:
                 self._metadata.clear()
             metadata = self._metadata[header] = _header_metadata(header)
         metadata = pmt.dict_add(metadata, _WALL, pmt.from_double(wall))
-        # Nine times as fast as pmt.to_pmt of an array, and for long packets as pmt.init_u8vector.
-        return pmt.cons(metadata, pmt.deserialize_str(_U8_HEAD + len(data).to_bytes(4, "big") + b"\x01\x00" + data))
+        return pmt.cons(metadata, u8vector(data))
 
 
 def packet_of(pdu: Any) -> tuple[bytes, str]:
@@ -49,7 +45,7 @@ def packet_of(pdu: Any) -> tuple[bytes, str]:
     vector = pmt.cdr(pdu)
     if not pmt.is_u8vector(vector):
         return b"", "not_u8"
-    return pmt.serialize_str(vector)[_U8_OFFSET:], ""
+    return octets(vector), ""
 
 
 def _header_metadata(header: bytes) -> Any:

@@ -21,10 +21,11 @@ from gr_ros2.errors import GrRos2Error, MiddlewareError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
-from gr_ros2.gr.pmts import PDUS, packet_of
+from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
 from gr_ros2.registry import Registry
 

@@ -23,11 +23,12 @@ from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
-from gr_ros2.gr.pmts import CREDIT, PDUS, PduMaker
+from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.link import Refused, Sender, SenderEvent
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.phy.pdus import CREDIT, PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
 from gr_ros2.registry import Registry, Topic
 

@@ -14,10 +14,10 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
+from gr_ros2.phy.pdus import CREDIT, PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
 
 _JOIN_S = 1.0
-_PDUS, _CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 _ONE = pmt.from_long(1)
 
 
@@ -38,10 +38,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._running = False
         self._thread: threading.Thread | None = None
         self._block_thread = BlockThread()
-        self.message_port_register_in(_PDUS)
-        self.message_port_register_out(_PDUS)
-        self.message_port_register_out(_CREDIT)
-        self.set_msg_handler(_PDUS, self._arrive)
+        self.message_port_register_in(PDUS)
+        self.message_port_register_out(PDUS)
+        self.message_port_register_out(CREDIT)
+        self.set_msg_handler(PDUS, self._arrive)
 
     @property
     def backlog(self) -> int:
@@ -79,10 +79,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                     return
                 pdus, credits = self._step()
             for pdu in pdus:
-                self.message_port_pub(_PDUS, pdu)
+                self.message_port_pub(PDUS, pdu)
             self.passed += len(pdus)
             for _ in range(credits):
-                self.message_port_pub(_CREDIT, _ONE)
+                self.message_port_pub(CREDIT, _ONE)
 
     def _step(self) -> tuple[list[Any], int]:
         """What is due, after waiting for it if nothing is yet."""

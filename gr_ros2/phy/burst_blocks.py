@@ -1,7 +1,7 @@
 """GNU Radio shells around a burst modem: PDUs in, samples out, and back.
 
 Laws: a PDU that is not one packet of the right length is counted and dropped, never sent; each burst leaves at once,
-tagged with its length, its gap behind it; all behaviour is in the modem.
+its gap behind it; all behaviour is in the modem.
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.fec import CodeName
-from gr_ros2.phy.flowgraph import HierBlock
+from gr_ros2.phy.flowgraph import HierBlock, Transmitter
+from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import Held
 
-_PDUS = pmt.intern("pdus")
 _SAMPLE_LEN = 8
-_U8_OFFSET = 8
-"""A serialized u8vector: type 10, kind 0, length u32 big-endian, one byte of padding and its count, then the bytes."""
 _log = logging.getLogger(__name__)
 
 
@@ -67,23 +65,14 @@ class BurstPhy(Phy):
         return BurstSink(self, aside and len(os.sched_getaffinity(0)) > 1)
 
 
-class BurstTransmitter(HierBlock):
+class BurstTransmitter(Transmitter):
     """Message port `pdus` in, complex stream out."""
 
     def __init__(self, phy: BurstPhy) -> None:
-        super().__init__(f"gr_ros2_{phy.name}_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, _SAMPLE_LEN))
-        self.message_port_register_hier_in("pdus")
-        self._airtime_samples = phy.airtime_samples()
+        super().__init__(f"gr_ros2_{phy.name}_tx", phy.airtime_samples())
         self._modulator = _Modulator(phy)
         self.msg_connect((self, "pdus"), (self._modulator, "pdus"))
-        self.connect(self._modulator, self)
-
-    def packets_sent(self) -> int:
-        """Packets that have left as samples; 0 before the flowgraph runs."""
-        try:
-            return int(self._modulator.nitems_written(0)) // self._airtime_samples
-        except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
-            return 0
+        self.leave_by(self._modulator)
 
     @property
     def refused(self) -> int:
@@ -103,8 +92,8 @@ class TakesPackets(Held):
         self._packet_len = packet_len
         self.refused = 0
         block: Any = self
-        block.message_port_register_in(_PDUS)
-        block.set_msg_handler(_PDUS, self._take)
+        block.message_port_register_in(PDUS)
+        block.set_msg_handler(PDUS, self._take)
 
     @abstractmethod
     def take_packet(self, packet: bytes) -> None:
@@ -113,7 +102,7 @@ class TakesPackets(Held):
     def _take(self, message: Any) -> None:
         vector = pmt.cdr(message) if pmt.is_pair(message) else message
         if pmt.is_u8vector(vector) and pmt.length(vector) == self._packet_len:
-            self.take_packet(pmt.serialize_str(vector)[_U8_OFFSET:])
+            self.take_packet(octets(vector))
             return
         self.refused += 1
         if self.refused == 1:
@@ -169,11 +158,6 @@ class BurstSink(HierBlock):
         return self._demodulator.damaged
 
     @property
-    def failed(self) -> int:
-        """Times the modem could not cope with what it heard, and began anew."""
-        return self._demodulator.failed
-
-    @property
     def snr_db(self) -> float | None:
         """SNR over the sampled band of the newest packets, dB; None before the first."""
         return self._demodulator.snr_db
@@ -191,9 +175,10 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         self._modem = phy.modem
         self._aside = aside
         self._engine: BurstReceiver | ReceiverProcess | None = None
-        self._damaged = self.failed = 0
+        self._damaged = 0
+        self._failed = False
         self._snr_db: float | None = None
-        self.message_port_register_out(_PDUS)
+        self.message_port_register_out(PDUS)
 
     @property
     def damaged(self) -> int:
@@ -227,8 +212,8 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         try:
             return self._engine.feed(samples)
         except Exception as error:  # noqa: BLE001 - raised in ``work`` it would end the block's thread, and all reception
-            self.failed += 1
-            if self.failed == 1:
+            if not self._failed:
+                self._failed = True
                 _log.exception("%s: begins anew after %s", self.name(), error)
             self._end_engine()
             self._engine = BurstReceiver(self._modem)
@@ -240,11 +225,4 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
 
     def _publish(self, packet: bytes) -> None:
-        self.message_port_pub(_PDUS, pdu_of(packet))
-
-
-def pdu_of(data: bytes) -> Any:
-    """A packet as a PDU without metadata."""
-    # Nine times as fast as pmt.to_pmt of an array, and for long packets as pmt.init_u8vector.
-    vector = pmt.deserialize_str(b"\n\x00" + len(data).to_bytes(4, "big") + b"\x01\x00" + data)
-    return pmt.cons(pmt.make_dict(), vector)
+        self.message_port_pub(PDUS, pdu_of(packet))

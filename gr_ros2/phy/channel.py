@@ -13,15 +13,14 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-import pmt
 from gnuradio import channels, gr
 
 from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
+from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread
 
-_PDUS = pmt.intern("pdus")
 _SINUSOIDS = 16
 """Of which a fading tap is the sum; GNU Radio's manual recommends 8 or more."""
 _FADING_SEEDS = 1009
@@ -108,9 +107,9 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         """s, monotonic: when the run began; outages count from here."""
         self.received = 0
         self._block_thread = BlockThread()
-        self.message_port_register_in(_PDUS)
-        self.message_port_register_out(_PDUS)
-        self.set_msg_handler(_PDUS, self._pass)
+        self.message_port_register_in(PDUS)
+        self.message_port_register_out(PDUS)
+        self.set_msg_handler(PDUS, self._pass)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -134,4 +133,4 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         passes = self._losses.passes(time.monotonic() - self.epoch)
         self.received += 1
         if passes:
-            self.message_port_pub(_PDUS, pdu)
+            self.message_port_pub(PDUS, pdu)

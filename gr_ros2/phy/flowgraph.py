@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from gnuradio import gr
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.threads import begin
 
@@ -39,8 +38,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
         """
         self._running = True
         try:
-            with uninterrupted():
-                begin(partial(super().start, max_noutput_items))
+            begin(partial(super().start, max_noutput_items))
         except (RuntimeError, MemoryError) as error:
             self.stop()
             raise PhyError(f"{self._called}: the flowgraph does not start ({error})") from error
@@ -88,3 +86,29 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
             with suppress(RuntimeError):
                 self.msg_disconnect(*self._messages.pop())
         self.disconnect_all()
+
+
+class Transmitter(HierBlock):
+    """Message port `pdus` in, complex stream out: as many samples for every packet.
+
+    :param name: in GNU Radio's log
+    :param airtime_samples: of a packet, gap included
+    """
+
+    def __init__(self, name: str, airtime_samples: int) -> None:
+        super().__init__(name, gr.io_signature(0, 0, 0), gr.io_signature(1, 1, gr.sizeof_gr_complex))
+        self.message_port_register_hier_in("pdus")
+        self._airtime_samples = airtime_samples
+        self._last: Any = None
+
+    def leave_by(self, block: Any) -> None:
+        """Let samples leave from a block within."""
+        self._last = block
+        self.connect(block, self)
+
+    def packets_sent(self) -> int:
+        """Packets that have left as samples; 0 before the flowgraph runs."""
+        try:
+            return int(self._last.nitems_written(0)) // self._airtime_samples
+        except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
+            return 0

@@ -22,8 +22,9 @@ from gnuradio.filter import firdes
 
 from gr_ros2.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
-from gr_ros2.phy.burst_blocks import TakesPackets, pdu_of
-from gr_ros2.phy.flowgraph import HierBlock
+from gr_ros2.phy.burst_blocks import TakesPackets
+from gr_ros2.phy.flowgraph import HierBlock, Transmitter
+from gr_ros2.phy.pdus import PDUS, pdu_of
 from gr_ros2.phy.threads import Held, keep_messages
 
 MAX_PAYLOAD = 255
@@ -45,7 +46,6 @@ carrier offset becomes a clock offset; this and 1 Hz make that 0."""
 _TX_KEY = "frame_len"
 _FRAME = pmt.intern("frame_info")
 _PAY_LEN = pmt.intern("pay_len")
-_PDUS = pmt.intern("pdus")
 
 
 def load() -> Any:
@@ -140,19 +140,17 @@ def whitening(length: int) -> Octets:
     return out
 
 
-class SdrTransmitter(HierBlock):
+class SdrTransmitter(Transmitter):
     """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
 
     def __init__(self, frame: SdrFrame) -> None:
-        super().__init__("gr_ros2_lora_sdr_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, gr.sizeof_gr_complex))
+        super().__init__("gr_ros2_lora_sdr_tx", frame.airtime_samples)
         lora = load()
         keep_messages()
-        self.message_port_register_hier_in("pdus")
-        self._airtime_samples = frame.airtime_samples
         factor, rate = frame.spreading_factor, frame.coding_rate
         self._framer = _Framer(frame)
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
-        self._modulator = lora.modulate(factor, frame.oversampling, 1, [frame.sync_word], frame.gap, _PREAMBLE)
+        modulator = lora.modulate(factor, frame.oversampling, 1, [frame.sync_word], frame.gap, _PREAMBLE)
         self.msg_connect((self, "pdus"), (self._framer, "pdus"))
         self.msg_connect((self._framer, "pdus"), (to_stream, "pdus"))
         self.connect(
@@ -160,16 +158,9 @@ class SdrTransmitter(HierBlock):
             lora.hamming_enc(rate, factor),
             lora.interleaver(rate, factor, int(frame.ldro), 1),
             lora.gray_demap(factor),
-            self._modulator,
-            self,
+            modulator,
         )
-
-    def packets_sent(self) -> int:
-        """Packets that have left as samples; 0 before the flowgraph runs."""
-        try:
-            return int(self._modulator.nitems_written(0)) // self._airtime_samples
-        except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
-            return 0
+        self.leave_by(modulator)
 
     @property
     def refused(self) -> int:
@@ -183,10 +174,10 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
     def __init__(self, frame: SdrFrame) -> None:
         super().__init__(frame.packet_len, "gr_ros2_lora_sdr_framer", None, None)
         self._frame = frame
-        self.message_port_register_out(_PDUS)
+        self.message_port_register_out(PDUS)
 
     def take_packet(self, packet: bytes) -> None:
-        self.message_port_pub(_PDUS, pdu_of(self._frame.wrap(packet)))
+        self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 
 
 class SdrReceiver(HierBlock):
@@ -232,7 +223,7 @@ class _Collector(Held, gr.sync_block):  # type: ignore[misc]
         self._payload = b""
         self._missing = 0
         self.damaged = 0
-        self.message_port_register_out(_PDUS)
+        self.message_port_register_out(PDUS)
 
     def work(self, input_items: list[Octets], output_items: list[Any]) -> int:  # noqa: ARG002
         octets = input_items[0]
@@ -258,4 +249,4 @@ class _Collector(Held, gr.sync_block):  # type: ignore[misc]
         if packet is None:
             self.damaged += 1
         else:
-            self.message_port_pub(_PDUS, pdu_of(packet))
+            self.message_port_pub(PDUS, pdu_of(packet))

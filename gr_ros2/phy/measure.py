@@ -17,15 +17,13 @@ import numpy.typing as npt
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
-from gr_ros2.phy.burst_blocks import pdu_of
 from gr_ros2.phy.channel import Channel
+from gr_ros2.phy.pdus import PDUS, pdu_of
 from gr_ros2.phy.threads import begin, finish, run_through
 
-_PDUS = pmt.intern("pdus")
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
 _BATCH_SAMPLES = 1 << 22
@@ -41,7 +39,7 @@ class _Outlet(gr.basic_block):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_outlet", None, None)
-        self.message_port_register_out(_PDUS)
+        self.message_port_register_out(PDUS)
 
 
 @dataclass(frozen=True)
@@ -78,10 +76,9 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
     wanted = len(packets) * phy.airtime_samples()
     try:
-        with uninterrupted():
-            begin(top.start)
+        begin(top.start)
         for packet in packets:
-            outlet.message_port_pub(_PDUS, pdu_of(packet))
+            outlet.message_port_pub(PDUS, pdu_of(packet))
         came, deadline = 0, time.monotonic() + _PATIENCE_S
         while (now := sink.nitems_read(0)) < wanted:
             if now > came:

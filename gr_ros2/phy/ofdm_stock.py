@@ -20,7 +20,7 @@ from typing import Any
 import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
-from gr_ros2.phy.flowgraph import HierBlock
+from gr_ros2.phy.flowgraph import HierBlock, Transmitter
 from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, Layout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import keep_messages, only_warnings
@@ -111,19 +111,17 @@ def idle_spinning_threads() -> None:
                     found = True
 
 
-class StockTransmitter(HierBlock):
+class StockTransmitter(Transmitter):
     """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
 
     def __init__(self, frame: StockFrame) -> None:
-        super().__init__("gr_ros2_ofdm_tx", gr.io_signature(0, 0, 0), gr.io_signature(1, 1, gr.sizeof_gr_complex))
+        super().__init__("gr_ros2_ofdm_tx", frame.airtime_samples)
         keep_messages()
-        self.message_port_register_hier_in("pdus")
-        self._airtime_samples = frame.airtime_samples
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
         modulator = OfdmModulator(frame.layout, _TX_KEY, frame.with_crc32)
         zeros = blocks.vector_source_c([0j] * frame.gap, True, 1, [_length_tag(frame.gap)])
-        self._mux = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY)
-        parts = [to_stream, *modulator.parts, zeros, self._mux]
+        mux = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY)
+        parts = [to_stream, *modulator.parts, zeros, mux]
         self.msg_connect((self, "pdus"), (to_stream, "pdus"))
         last = to_stream
         if frame.fill:
@@ -132,17 +130,10 @@ class StockTransmitter(HierBlock):
             self.connect(to_stream, (last, 0))
             self.connect(filling, (last, 1))
             parts += [filling, last]
-        self.connect(last, modulator, (self._mux, 0))
-        self.connect(zeros, (self._mux, 1))
-        self.connect(self._mux, self)
+        self.connect(last, modulator, (mux, 0))
+        self.connect(zeros, (mux, 1))
+        self.leave_by(mux)
         frame.fit_buffers(parts)
-
-    def packets_sent(self) -> int:
-        """Packets that have left as samples; 0 before the flowgraph runs."""
-        try:
-            return int(self._mux.nitems_written(0)) // self._airtime_samples
-        except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
-            return 0
 
 
 class StockReceiver(HierBlock):

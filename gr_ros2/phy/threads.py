@@ -53,15 +53,18 @@ def keep_messages() -> None:
 def begin(start: Callable[[], None]) -> None:
     """Start a flowgraph, again and again where GNU Radio could not map a buffer.
 
+    Ctrl-C waits until it has started: who calls can stop it then.
+
     :raises MemoryError: when it still cannot after many attempts
     """
-    for _ in range(_START_ATTEMPTS - 1):
-        try:
-            start()
-            return
-        except MemoryError:
-            _log.debug("GNU Radio could not map a buffer; starting again")
-    start()
+    with uninterrupted():
+        for _ in range(_START_ATTEMPTS - 1):
+            try:
+                start()
+                return
+            except MemoryError:
+                _log.debug("GNU Radio could not map a buffer; starting again")
+        start()
 
 
 def finish(flowgraph: Any) -> None:
@@ -88,8 +91,7 @@ def run_through(flowgraph: Any) -> None:
     Whatever happens it is stopped: one that is let go while it runs waits for its threads with Python's lock held.
     """
     try:
-        with uninterrupted():
-            begin(flowgraph.start)
+        begin(flowgraph.start)
         finish(flowgraph)
     except BaseException:
         flowgraph.stop()

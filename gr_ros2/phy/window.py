@@ -14,6 +14,7 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.phy.pdus import CREDIT
 from gr_ros2.phy.threads import quicken_threads
 
 WINDOW = 32
@@ -23,7 +24,6 @@ _SHARE = 4
 """A grant is at least this part of the window."""
 _POLL_S = 0.001
 _JOIN_S = 1.0
-_CREDIT = pmt.intern("credit")
 
 
 class CreditWindow(gr.basic_block):  # type: ignore[misc]
@@ -42,7 +42,7 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
         self._window = window
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
-        self.message_port_register_out(_CREDIT)
+        self.message_port_register_out(CREDIT)
 
     def start(self) -> bool:
         quicken_threads()
@@ -63,6 +63,6 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
         while not self._stopped.is_set():
             credits = self._progress() + self._window - granted
             if credits * _SHARE >= self._window:
-                self.message_port_pub(_CREDIT, pmt.from_long(credits))
+                self.message_port_pub(CREDIT, pmt.from_long(credits))
                 granted += credits
             self._stopped.wait(_POLL_S)

@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
 
-import pmt
 from gnuradio import gr
 
 from gr_ros2.config import ChannelConfig, TopicOptions
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.pmts import PDUS, packet_of
+from gr_ros2.gr.pmts import packet_of
 from gr_ros2.link import SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.pdus import PDUS, pdu_of
 from gr_ros2.phy.threads import KeepsThread, quicken_threads
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
@@ -268,7 +268,7 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
             if self._stop.wait(max(0.0, free - time.monotonic())):
                 return
             self._log.note(free, len(packet), airtime)
-            self.message_port_pub(PDUS, pmt.cons(pmt.make_dict(), pmt.init_u8vector(len(packet), list(packet))))
+            self.message_port_pub(PDUS, pdu_of(packet))
             self.emitted += 1
 
 

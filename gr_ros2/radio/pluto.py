@@ -18,12 +18,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
-from gnuradio import blocks, gr, iio
+from gnuradio import blocks, iio
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import RadioError
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
 from gr_ros2.radio.front_end import STRICT, Hertz
 
@@ -128,15 +128,12 @@ class PlutoFrontEnd(DeviceFrontEnd):
         asked = iio.attr_source(self.options.args, device, channel, attribute, _EVERY_MS, 1, *kind, output, 0)
         asked.set_log_level("error")
         told = blocks.vector_sink_b(_DOUBLE.size)
-        graph = gr.top_block("gr_ros2_pluto_setting")
+        graph = Flowgraph("gr_ros2_pluto_setting", f"front_end {self.name}")
         graph.connect(asked, blocks.head(_DOUBLE.size, 1), told)
-        begin(graph.start)
-        end = time.monotonic() + _PATIENCE_S
-        while not told.nitems_read(0) and time.monotonic() < end:
-            time.sleep(_EVERY_MS * 1e-3)
-        # It would go on asking.
-        graph.stop()
-        graph.wait()
+        with graph:  # it would go on asking
+            end = time.monotonic() + _PATIENCE_S
+            while not told.nitems_read(0) and time.monotonic() < end:
+                time.sleep(_EVERY_MS * 1e-3)
         return float(_DOUBLE.unpack(bytes(told.data()))[0]) if told.nitems_read(0) else 0.0
 
 

@@ -247,6 +247,14 @@ def compiled(path: Path, folder: Path) -> ModuleType:
     return module
 
 
+def in_memory(path: Path, folder: Path) -> Any:
+    """An example's flowgraph on the graph of tests, which needs no discovery time."""
+    copy = folder / path.name
+    copy.write_text(path.read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    assert "memory" in copy.read_text()
+    return getattr(compiled(copy, folder), path.stem)()
+
+
 @pytest.mark.parametrize("name", ON_THE_AIR)
 def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: Path) -> None:
     copy = tmp_path / f"{name}.grc"
@@ -258,9 +266,7 @@ def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: 
 
 
 def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path: Path) -> None:
-    copy = tmp_path / "sim_radio.grc"
-    copy.write_text(example("sim_radio.grc").read_text().replace("'\"dds\"'", "'\"memory\"'"))
-    top = compiled(copy, tmp_path).sim_radio()
+    top = in_memory(example("sim_radio.grc"), tmp_path)
     heard: list[bytes] = []
     try:
         with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:
@@ -320,12 +326,7 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize("path", CARRYING, ids=lambda path: path.stem)
 def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) -> None:
-    copy = tmp_path / path.name
-    # The same flowgraph on the graph of tests, which needs no discovery time.
-    copy.write_text(path.read_text().replace("'\"dds\"'", "'\"memory\"'"))
-    assert "memory" in copy.read_text()
-    module = compiled(copy, tmp_path)
-    top = getattr(module, path.stem)()
+    top = in_memory(path, tmp_path)
     heard: list[bytes] = []
     try:
         with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:

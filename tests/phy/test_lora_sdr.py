@@ -18,11 +18,11 @@ from gnuradio import blocks, gr
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst_blocks import pdu_of
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.lora import LoraPhy
 from gr_ros2.phy.lora_sdr import SdrFrame, whitening
 from gr_ros2.phy.measure import Recording, deliver, record
+from gr_ros2.phy.pdus import pdu_of
 from gr_ros2.phy.threads import begin
 from tests.gr.probe import Probe, wait_for
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -12,6 +15,7 @@ from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.radio.link import LinkObserver, RobotLink
 from tests.middleware.support import CUSTOM, domain, message, wait_for
 
+ROOT = Path(__file__).resolve().parents[2]
 TOPICS = Path(__file__).with_name("topics.csv")
 RATE = 2e6
 QOS = Qos("reliable", "volatile", 0)
@@ -86,3 +90,20 @@ class Robot:
     ) -> None:
         self.link.stop()
         self._graph.close()
+
+
+def link_command(
+    path: Path, front_end: dict[str, Any], sample_rate: float, *options: str, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """``gr-ros2 link`` in a process of its own, on a configuration file that is written for it."""
+    path.write_text(
+        f"""
+        registry: {TOPICS}
+        ros_source: {{robot_id: 1, middleware: memory}}
+        ros_sink: {{middleware: memory}}
+        phy: {{name: psk, sample_rate: {sample_rate}}}
+        front_end: {json.dumps(front_end)}
+        """
+    )
+    command = [sys.executable, "-m", "gr_ros2.cli", "link", str(path), *options]
+    return subprocess.run(command, env=env, capture_output=True, text=True, cwd=ROOT, check=False)

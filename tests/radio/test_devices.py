@@ -22,9 +22,8 @@ from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.soapy import SoapyFrontEnd
-from tests.radio.robots import RATE, TOPICS, config
+from tests.radio.robots import RATE, ROOT, config, link_command
 
-ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "tests" / "peers" / "soapy_loopback.cpp"
 HEADER = Path("/usr/include/SoapySDR/Device.hpp")
 MESSAGES = 20
@@ -210,18 +209,8 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
     ],
 )
 def test_a_device_that_falls_silent_ends_the_link(driver: Path, tmp_path: Path, args: str, said: str) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text(
-        f"""
-        registry: {TOPICS}
-        ros_source: {{robot_id: 1, middleware: memory}}
-        ros_sink: {{middleware: memory}}
-        phy: {{name: psk, sample_rate: {SLOW}}}
-        front_end: {{name: soapy, args: "{args}", frequency: 1e8}}
-        """
-    )
-    command = [sys.executable, "-m", "gr_ros2.cli", "link", str(path), "--duration", "60"]
-    done = subprocess.run(command, env=with_driver(driver), capture_output=True, text=True, cwd=ROOT)
+    front_end = {"name": "soapy", "args": args, "frequency": 1e8}
+    done = link_command(tmp_path / "robot.yaml", front_end, SLOW, "--duration", "60", env=with_driver(driver))
     assert done.returncode == 1, done.stderr
     assert f"front_end soapy: args = {args!r}: {said}" in done.stderr.splitlines()[-1]
 

@@ -21,9 +21,8 @@ from gr_ros2.errors import RadioError
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.pluto import _stderr_aside
 from tests.radio.pluto import PHY, RX, Pluto
-from tests.radio.robots import TOPICS, config
+from tests.radio.robots import ROOT, config, link_command
 
-ROOT = Path(__file__).resolve().parents[2]
 SLOW = 6e5
 """samples/s; near the slowest a Pluto has."""
 MESSAGES = 10
@@ -51,18 +50,7 @@ def pluto() -> Iterator[Pluto]:
 
 def link(path: Path, *options: str, **front_end: Any) -> subprocess.CompletedProcess[str]:
     """``gr-ros2 link`` on a Pluto."""
-    front_end = {"name": "pluto", "frequency": 433e6, **front_end}
-    path.write_text(
-        f"""
-        registry: {TOPICS}
-        ros_source: {{robot_id: 1, middleware: memory}}
-        ros_sink: {{middleware: memory}}
-        phy: {{name: psk, sample_rate: {SLOW}}}
-        front_end: {json.dumps(front_end)}
-        """
-    )
-    command = [sys.executable, "-m", "gr_ros2.cli", "link", str(path), *options]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    return link_command(path, {"name": "pluto", "frequency": 433e6, **front_end}, SLOW, *options)
 
 
 def test_every_packet_is_one_buffer_and_comes_back(pluto: Pluto) -> None:

@@ -32,7 +32,7 @@ from gr_ros2.experiment.sweep.store import without_registry
 from gr_ros2.settings_file import BUILTIN_DIR, find_registry
 
 RUNS_PER_PROCESS = 200
-"""Each flowgraph leaves about 4 segments of shared memory with its process, of which a system has 4096."""
+"""A safeguard: of shared memory a system has 4096 segments, and flowgraphs that are over once kept theirs."""
 
 _CONNECT_S = 15.0
 _WORKERS_S = 60.0
