@@ -25,7 +25,9 @@ LAYERS = (
     {"phy", "sim", "grc_path"},
     {"gr"},
     {"radio"},
-    {"experiment"},
+    {"record"},
+    {"run", "report"},
+    {"study"},
     {"dashboard", "race"},
     {"cli"},
     {"ros"},
@@ -44,7 +46,7 @@ CONFINED = {
     "rclpy": ("middleware/rclpy.py", "ros/"),
     "rcl_interfaces": ("ros/",),
     "cyclonedds": ("middleware/cdr_dds.py", "middleware/dds"),
-    "distributed": ("experiment/sweep/cluster.py",),
+    "distributed": ("study/sweep/cluster.py",),
     "zenoh": ("middleware/zenoh.py", "race/"),
 }
 BLOCKED = tuple(CONFINED)
@@ -62,10 +64,10 @@ WITHOUT_BACKENDS = (
     "gr_ros2.radio",
     "gr_ros2.radio.config",
     "gr_ros2.sim",
-    "gr_ros2.experiment.ledger",
-    "gr_ros2.experiment.metrics",
-    "gr_ros2.experiment.result",
-    "gr_ros2.experiment.scenario",
+    "gr_ros2.record.ledger",
+    "gr_ros2.record.metrics",
+    "gr_ros2.record.result",
+    "gr_ros2.run.scenario",
     "gr_ros2.cli.main",
 )
 MAX_LINES = 500
