@@ -59,13 +59,13 @@ class TopicOptions:
     :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_ms``); None follows ``depth`` and the
-        publishers' QoS (docs/scheduling.md)
+        publishers' QoS (docs/explanation/scheduling.md)
     :param deadline_ms: ms after submission until which a message must be across, or it is dropped; 0 none, or without
         ``queue`` the publishers' lifespan
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
-    :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/compression.md)
-    :param quantize: bounded loss per field, '' lossless (docs/compression.md)
+    :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
+    :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
 
     qos: QosClass = "default"
@@ -90,7 +90,7 @@ class TopicOptions:
 
 @dataclass(frozen=True, config=_STRICT)
 class SourceConfig:
-    """ROS Source (the paper, section 4.3; docs/parameters.md).
+    """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
 
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
     :param topics: subset of the registry, with or without leading slash; [] = all
@@ -263,7 +263,7 @@ class BurstLoss:
 
 @dataclass(frozen=True, config=_STRICT)
 class ChannelConfig:
-    """The simulated channel between transmitter and receiver (docs/channels.md).
+    """The simulated channel between transmitter and receiver (docs/reference/channels.md).
 
     ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
     act on packets, whatever the PHY.

@@ -32,10 +32,10 @@ class LinkConfig:
     :param ros_source: the sending block; its robot_id must be another at every robot
     :param ros_sink: the receiving block; its robot_id -1 means this robot's, except with a front end that loops back
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
-    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/radios.md)
+    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
-    :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/ros2.md)
+    :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
     :param localhost_only: DDS stays on the loopback interface; None takes ROS_LOCALHOST_ONLY
     """
 

@@ -1,4 +1,4 @@
--- Wireshark dissector for gr-ros2 packets, version 0 of the wire format (docs/wire-format.md).
+-- Wireshark dissector for gr-ros2 packets, version 0 of the wire format (docs/reference/wire-format.md).
 --
 -- Captures made by `gr-ros2 run --pcap` and `gr-ros2 link --pcap` (link type USER0) are recognised by themselves; for
 -- packets carried in UDP use "Decode As". Install it with `gr-ros2 wireshark --install`, or try it with
@@ -60,7 +60,7 @@ proto.experts = {
 
 proto.prefs.registry = Pref.string("Registry CSV", "", "The registry both ends use; shows topics by name")
 
--- Topics of the registry by id, read when the preference changes: rows `name,type`, as in docs/wire-format.md.
+-- Topics of the registry by id, read when the preference changes: rows `name,type`, as in docs/reference/wire-format.md.
 local topics = {}
 
 local function read_registry(path)

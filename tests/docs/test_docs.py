@@ -1,0 +1,214 @@
+"""The documentation does what it says: every YAML loads, every command runs, every link leads somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+import yaml
+
+from gr_ros2.cli.main import LazyGroup, cli
+from gr_ros2.radio.config import link_from
+from gr_ros2.run.scenario import load_scenario, scenario_from
+from gr_ros2.study.sweep.definition import load_sweep
+from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
+
+LINK: dict[str, Any] = {
+    "registry": "table4",
+    "ros_source": {"namespace": "/robot_1"},
+    "phy": {"name": "psk", "sample_rate": 1e6},
+    "front_end": {"name": "sim"},
+}
+SCENARIO: dict[str, Any] = {"name": "trial", "registry": str(ROOT / "gr_ros2/scenarios/odom.csv"), "ros_source": {"namespace": "/robot_1"}}
+SWEEP: dict[str, Any] = {
+    "scenario": "paper-ofdm-paced",
+    "time": "samples",
+    "grid": {"channel.snr_db": [8, 10], "packet_len": [64, 128]},
+    "list": [{"phy.name": "ofdm"}, {"phy.name": "gfsk"}],
+}
+
+OTHERS = {"cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
+"""Programs that are not ours."""
+ONLY_PARSED = {
+    ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
+    ("docs/how-to/dashboard.md", "gr-ros2 dashboard"): "needs a run in another terminal; tests/cli/test_dashboard.py",
+    ("docs/how-to/dashboard.md", "gr-ros2 dashboard --wait 60"): "the same",
+    ("docs/how-to/dashboard.md", "gr-ros2 run demo --dashboard=0.0.0.0:5006"): "opens a port to the network",
+    ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --scheduler tcp://HOST:8786"): "needs a Dask cluster",
+    ("docs/how-to/sweeps.md", "gr-ros2 sweep pdr-vs-snr"): "takes minutes; tests/study runs the built-in sweeps' cells",
+    ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
+    ("docs/tutorial.md", "gr-ros2 registry from-graph --namespace /robot_1 --out topics.csv"): "needs a robot",
+    ("docs/tutorial.md", "gr-ros2 registry check topics.csv"): "the same",
+}
+"""Commands that a test cannot run as they stand: why. They are parsed like the others."""
+SHORTER = {
+    "run": ("--duration", "1"),
+    "demo": ("--duration", "1"),
+    "link": ("--duration", "3"),
+    "plan": ("--duration", "2"),
+    "replay": ("--duration", "1"),
+    "losses": ("--packets", "20"),
+    "sweep": ("--set", "duration_s=0.5"),
+}
+"""What is added to a command so that it ends soon."""
+
+
+def merged(base: Mapping[str, Any], keys: list[str], values: Any) -> dict[str, Any]:
+    """A document with settings put in at a place."""
+    result = dict(base)
+    if not keys:
+        return {**result, **values}
+    inner = result.get(keys[0], {})
+    result[keys[0]] = merged(inner, keys[1:], values)
+    return result
+
+
+@pytest.mark.parametrize("block", list(blocks("yaml")), ids=str)
+def test_every_yaml_is_accepted(block: Block, tmp_path: Path) -> None:
+    place, _, name = block.about.partition("=")
+    assert place in ("file", "part-of"), f"{block}: say `yaml file=NAME` or `yaml part-of=KIND.KEY`"
+    if place == "part-of":
+        kind, *keys = name.split(".")
+        values = yaml.safe_load(block.text)
+        if kind == "sweep":
+            path = tmp_path / "sweep.yaml"
+            path.write_text(yaml.safe_dump(merged(SWEEP, keys, values)))
+            assert load_sweep(path)
+        elif kind == "link":
+            assert link_from(merged(LINK, keys, values))
+        else:
+            assert kind == "scenario"
+            assert scenario_from(
+                {**merged(SCENARIO, keys, values), "registry": str(ROOT / "gr_ros2/scenarios/odom.csv")}
+            )
+        return
+    path = tmp_path / name
+    path.write_text(block.text)
+    values = yaml.safe_load(block.text)
+    if "front_end" in values:
+        assert link_from({"name": "trial", **values})
+    elif "scenario" in values:
+        assert load_sweep(path)
+    else:
+        assert load_scenario(path)
+
+
+def every_command() -> list[Any]:
+    return [
+        pytest.param(block, words, id=f"{block}: {' '.join(words)[:60]}")
+        for block in blocks("sh")
+        for words in commands(block)
+    ]
+
+
+@pytest.mark.parametrize(("block", "words"), every_command())
+def test_every_command_is_one(block: Block, words: list[str]) -> None:
+    if words[0] == "sudo":
+        words = words[1:]
+    if words[0] == "make":
+        targets = re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), re.M)
+        assert [word for word in words[1:] if "=" not in word and word not in targets] == []
+        return
+    if words[0] != "gr-ros2":
+        assert words[0] in OTHERS or (ROOT / words[0]).is_file(), f"{block}: what is {words[0]}?"
+        return
+    command: click.Command = cli
+    context = click.Context(cli, info_name="gr-ros2")
+    rest = words[1:]
+    while isinstance(command, LazyGroup):
+        _, found, rest = click.Group.resolve_command(command, context, rest)
+        assert found is not None
+        command = found
+    command.make_parser(context).parse_args(list(rest))  # an unknown option, or one without its value, raises
+
+
+def runnable() -> list[Any]:
+    return [
+        param
+        for param in every_command()
+        if param.values[1][0] == "gr-ros2" and (param.values[0].page, " ".join(param.values[1])) not in ONLY_PARSED
+    ]
+
+
+@pytest.fixture(scope="module")
+def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the names that pages use exist: recordings, runs, scenarios."""
+    folder = tmp_path_factory.mktemp("docs")
+    for name in ("clean", "noisy", "results/a", "results/b"):
+        ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", name, folder=folder)
+    bag = folder / "clean" / "delivered"
+    (mcap,) = bag.glob("*.mcap")
+    shutil.copy(mcap, folder / "IN.mcap")
+    renamed = ("--set", "ros_sink.namespace_format=/robot_{src_id}")
+    ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", "robot", *renamed, folder=folder)
+    shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
+    shutil.copy(ROOT / "gr_ros2/scenarios/demo.yaml", folder / "my_scenario.yaml")
+    shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
+    for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
+        shutil.copy(path, folder)
+    return folder
+
+
+def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **({} if home is None else {"HOME": str(home)})}
+    command = [sys.executable, "-m", "gr_ros2.cli", *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, f"{' '.join(arguments)}: {done.stderr}"
+    return done
+
+
+@pytest.mark.parametrize(("block", "words"), runnable())
+def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "page"
+    shutil.copytree(sample_runs, folder)
+    for other in blocks("yaml"):
+        place, _, name = other.about.partition("=")
+        if other.page == block.page and place == "file":
+            (folder / name).write_text(other.text)
+    if words[-2:-1] == ["--out"] or "--out" in words:
+        shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
+    options = SHORTER.get(words[1], ())
+    shorter = [] if not options or options[0] in words else list(options)
+    if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {re.split("=", word)[0] for word in words}:
+        shorter += ["--set", "time=samples"]
+    if "--dashboard" in words:
+        words = [word if word != "--dashboard" else "--dashboard=0" for word in words]
+    if {"--set", "front_end={name: file, read: sent}"} <= set(words):
+        ours("link", "link-file.yaml", "--duration", "3", folder=folder)
+    done = ours(*words[1:], *shorter, folder=folder, home=tmp_path)
+    assert done.stdout or words[1] in ("replay",), f"{block}: it says nothing"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)(#[^)\s]*)?\)", page.read_text(encoding="utf-8")):
+        path = (page.parent / target) if target else page
+        assert path.exists(), f"{page.name}: {target} is missing"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.M)
+            slugs = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor[1:] in slugs, f"{page.name}: {target}{anchor} is missing"
+
+
+def test_every_page_is_listed() -> None:
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    pages = {page.relative_to(ROOT / "docs").as_posix() for page in PAGES if ROOT / "docs" in page.parents}
+    assert pages - {"README.md"} <= set(re.findall(r"\]\(([^)]+)\)", index))
+
+
+def test_pages_that_code_names_exist() -> None:
+    named: dict[str, Path] = {}
+    for folder in ("gr_ros2", "tools", "bench", "fuzz", "tests", "launch"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".yml", ".yaml", ".grc", ".lua", ".csv", ".html", "") and path.is_file():
+                text = path.read_text(encoding="utf-8", errors="ignore")
+                named |= dict.fromkeys(re.findall(r"\bdocs/[\w/-]+\.md", text), path)
+    assert [f"{path}: {name}" for name, path in named.items() if not (ROOT / name).is_file()] == []
