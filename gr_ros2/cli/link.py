@@ -112,6 +112,10 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
     if stats["phy"]["snr_db"] is not None:
         parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
+    if lost := sum(topic["lost_on_graph"] for topic in source["topics"].values()):
+        parts.append(f"{lost} messages lost on the ROS graph before they were sent")
+    if sink["publish_failed"]:
+        parts.append(f"{sink['publish_failed']} messages not published")
     troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
     quiet = ("name", "bursts_in", "bursts_out")
     parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]

@@ -19,7 +19,18 @@ import numpy as np
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
-from gr_ros2.link.events import Accepted, Delivered, Lost, ReceiverEvent, Refused, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import (
+    LOST_ON_GRAPH,
+    Accepted,
+    Delivered,
+    Lost,
+    Missed,
+    ReceiverEvent,
+    Refused,
+    Rejected,
+    SenderEvent,
+    SentPacket,
+)
 from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -133,6 +144,10 @@ class DashboardState:
                 self._left(source, event)
             elif isinstance(event, Accepted):
                 self._accepted(source, src_id, event)
+            elif isinstance(event, Missed):
+                topic = self._topic((src_id, event.topic_id))
+                topic.sent += event.count
+                topic.ended[LOST_ON_GRAPH] += event.count
             else:
                 self._refused(source, src_id, event)
 

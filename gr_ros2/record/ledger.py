@@ -21,9 +21,11 @@ from typing import TypeVar
 
 from gr_ros2.errors import RunError
 from gr_ros2.link.events import (
+    LOST_ON_GRAPH,
     Accepted,
     Delivered,
     Lost,
+    Missed,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -47,9 +49,10 @@ REORDER_WINDOW = 1024
 
 @dataclass(slots=True)
 class TopicLedger:
-    """What became of one topic of one source. The arrays run in parallel, one item per sent message, by submission.
+    """What became of one topic of one source. The arrays run in parallel, one item per message handed to the source, by
+    submission.
 
-    :param sent: messages handed to the source, repeats excluded
+    :param sent: messages for this link: handed to the source, or lost by its ROS graph before; repeats excluded
     :param corrupt: deliveries that match no message; 0 unless something is badly wrong
     :param repeats_delivered: deliveries of repeats
     :param rows: ledger row -> messages
@@ -148,6 +151,10 @@ class Ledger:
                 self._sent(source, event)
             elif isinstance(event, Accepted):
                 self._accepted(source, event)
+            elif isinstance(event, Missed):
+                topic = self._topic(src_id, event.topic_id)
+                topic.sent += event.count
+                topic.rows[LOST_ON_GRAPH] += event.count
             else:
                 self._refused(source, event)
 
@@ -258,7 +265,7 @@ class Ledger:
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
         expected = event.payload if event.expected is None else event.expected
-        message = _Open(topic, event.serial, topic.sent - 1, _digest(expected))
+        message = _Open(topic, event.serial, len(topic.serial) - 1, _digest(expected))
         source.open[event.serial] = message
         source.by_digest.setdefault((event.topic_id, message.digest), {})[event.serial] = message
 
@@ -266,7 +273,7 @@ class Ledger:
         message = source.open.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
-            topic.book(topic.sent - 1, event.reason)
+            topic.book(len(topic.serial) - 1, event.reason)
         else:
             self._close(source, message, event.reason)
 
@@ -367,7 +374,8 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            if topic.rows.total() != topic.sent or len(topic.t_sent) != topic.sent:
+            submitted = topic.sent - topic.rows[LOST_ON_GRAPH]
+            if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
             if topic.rows[DELIVERED] != delivered:

@@ -52,6 +52,7 @@ class TopicResult:
     :param latency_clock: submit, stamp_wall or stamp_sim; None where there is no latency
     :param path_error_m: mean distance of the paths along their length, None where the type has no position
     :param rms_error_m: RMS distance at equal times, likewise
+    :param sent: messages for this link: handed to the source, or lost by its ROS graph before (``lost_on_graph``)
     :param ledger: row -> messages; the rows add up to ``sent``
     :param corrupt: deliveries that match no message sent; 0 unless something is badly wrong
     :param repeats_delivered: deliveries of repeats, which count nowhere else

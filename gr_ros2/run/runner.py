@@ -53,11 +53,11 @@ class Listener:
         self._publishers = {
             name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
         }
-        self._subscriptions = [
-            graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
+        self._subscriptions = {
+            name: graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
             for graph, topics in graphs.items()
             for name, kind in topics.items()
-        ]
+        }
 
     def _take(self, name: str, payload: bytes) -> None:
         self._publishers[name].publish(payload)
@@ -65,11 +65,15 @@ class Listener:
 
     def matched(self) -> bool:
         """Whether every topic has found its publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions)
+        return all(subscription.matched() for subscription in self._subscriptions.values())
+
+    def lost(self) -> dict[str, int]:
+        """Messages of each topic that were published and that the graph lost on the way here; {} where none was."""
+        return {name: subscription.lost for name, subscription in self._subscriptions.items() if subscription.lost}
 
     def close(self) -> None:
         """Stop listening and finish the bag."""
-        for subscription in self._subscriptions:
+        for subscription in self._subscriptions.values():
             subscription.close()
         self._bag.close()
 
@@ -299,4 +303,10 @@ class _Run:
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)
         heard = {} if self.listener is None else dict(self.listener.received)
-        return {**there, **({"back": back[0]} if back else {}), "listener": heard}
+        unheard = {} if self.listener is None else self.listener.lost()
+        return {
+            **there,
+            **({"back": back[0]} if back else {}),
+            "listener": heard,
+            **({"listener_lost": unheard} if unheard else {}),
+        }

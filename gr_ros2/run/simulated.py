@@ -16,7 +16,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.link import Refused
+from gr_ros2.link import Missed, Refused
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -133,7 +133,7 @@ class _Direction:
         """The steps with their times and the number of this direction."""
         now = 0.0
         for step in self._steps:
-            now = now if isinstance(step, Refused) else step.now
+            now = now if isinstance(step, Refused | Missed) else step.now
             yield now, number, step
 
     def counters(self) -> dict[str, Any]:
@@ -204,9 +204,8 @@ def _when(item: tuple[float, int, Step]) -> float:
 def _published_as(way: Scenario, registry: Registry) -> dict[str, str]:
     """Name of every topic at the sink, by its name at the source."""
     format_, src_id = way.ros_sink.namespace_format, way.ros_source.src_id()
-    return {
-        name: registry[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()
-    }
+    rows = registry.with_options(way.ros_sink.topic_options)
+    return {name: rows[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()}
 
 
 def _live_run(scenario: Scenario, registry: Registry, recorder: Recorder, clock: Callable[[], float]) -> LiveRun:

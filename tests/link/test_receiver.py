@@ -157,6 +157,17 @@ def test_a_repeat_of_a_transient_local_message_is_not_delivered_again() -> None:
     assert sink.stats.repeats == 1
 
 
+def test_what_was_not_published_is_lost_and_its_repeat_comes_out() -> None:
+    sink = receiver(packet_len=64, topic_options={"t0": TopicOptions(durability="transient_local")})
+    (event,) = sink.receive(packet(0, Entry(0, 0, 0, 1, b"A")), 0.0)
+    assert isinstance(event, Delivered)
+    assert sink.unpublished(event) == Lost(1, 0, "publish_failed", 0)
+    assert sink.stats.lost == Counter({(1, 0, "publish_failed"): 1})
+    assert sink.receive(packet(1, Entry(0, 1, 0, 1, b"A")), 0.0) == [Delivered(1, 0, b"A", 0, 1)]
+    assert sink.receive(packet(2, Entry(0, 2, 0, 1, b"A")), 0.0) == []
+    assert (sink.stats.delivered[1, 0], sink.stats.repeats) == (2, 1)
+
+
 def test_loss_estimates_come_from_gaps() -> None:
     engine, sink = sender(packet_len=64, queue_depth=0), receiver(packet_len=64)
     for _ in range(100):

@@ -251,6 +251,7 @@ def test_depth_bounds_what_waits_and_drops_are_counted(join: Callable[..., DdsMi
     wait_for(lambda: len(received) == depth + 1, "what was kept")
     assert received == [message(i) for i in (0, *range(201 - depth, 201))]
     assert here.counters == {"samples_lost:/a": 200 - depth}
+    assert subscription.lost == 200 - depth
 
 
 def test_a_subscriber_that_does_not_keep_up_blocks_for_a_second_at_most(

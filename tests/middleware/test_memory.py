@@ -50,16 +50,18 @@ def test_depth_bounds_what_waits_and_drops_are_counted(ends: Ends) -> None:
         reached.set()
         release.wait(20)
 
-    ends[0].subscribe("/a", STRING, Qos(depth=3), callback)
+    subscription = ends[0].subscribe("/a", STRING, Qos(depth=3), callback)
     publisher = ends[1].advertise("/a", STRING, RELIABLE)
     publisher.publish(message(0))
     wait_for(reached.is_set, "the first callback")
+    assert subscription.lost == 0
     for i in range(1, 11):
         publisher.publish(message(i))
     release.set()
     wait_for(lambda: len(received) == 4, "what was kept")
     assert received == [message(i) for i in (0, 8, 9, 10)]
     assert ends[0].counters == {"samples_lost:/a": 7}
+    assert subscription.lost == 7
 
 
 def test_late_joiner_gets_as_much_as_the_publisher_keeps(ends: Ends) -> None:

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -229,6 +230,15 @@ def test_unbounded_depth_loses_nothing(start: Start) -> None:
         publisher.publish(text(f"message {i}"))
     release.set()
     wait_for(lambda: len(received) == 200)
+
+
+def test_what_the_rmw_says_it_lost_is_counted(start: Start) -> None:
+    """The event as rclpy gives it: a loss cannot be had at will."""
+    here = start()
+    subscription = here.subscribe("/x", STRING, RELIABLE, print)
+    subscription._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    subscription._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    assert subscription.lost == here.counters["samples_lost:/x"] == 5
 
 
 def test_type_that_cannot_be_imported_names_type_and_remedy(start: Start) -> None:

@@ -100,7 +100,7 @@ def test_no_period_no_diagnostics(tmp_path: Path) -> None:
 
 STATS = {
     "source": {"topics": {}},
-    "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "topics": {}},
+    "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "publish_failed": 0, "topics": {}},
     "packets": {"out": 0, "backlog": 0, "damaged": 0},
     "phy": {"airtime_s": 0.0},
 }

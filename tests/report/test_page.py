@@ -124,6 +124,14 @@ def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
         read_runs([tmp_path / "a"])
 
 
+def test_what_the_sources_graph_lost_is_in_every_part(tmp_path: Path) -> None:
+    make_run(tmp_path, missed=51)
+    page, *_ = write_report(read_runs([tmp_path]), tmp_path)
+    assert "lost by the ROS graph of the source" in page.read_text()
+    summary = pa_csv.read_csv(tmp_path / "summary.csv").to_pylist()[0]
+    assert (summary["sent"], summary["ledger_lost_on_graph"]) == (ODOM + 51, 51)
+
+
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     run = make_run(tmp_path / "a")
     (tmp_path / "file").touch()
