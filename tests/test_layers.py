@@ -17,6 +17,7 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
+    {"names", "yaml_text"},
     {"config", "backends"},
     {"registry", "settings_file"},
     {"wire"},

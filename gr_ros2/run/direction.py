@@ -103,7 +103,7 @@ class Direction:
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""
         format_ = self.scenario.ros_sink.namespace_format
-        rows = [self.registry[topic_id] for topic_id in self.topics.values()]
+        rows = [self.sink.registry[topic_id] for topic_id in self.topics.values()]
         return {topic.republished(format_, self.src_id): topic.type_name for topic in rows}
 
     def empty(self, unresolved: bool) -> bool:

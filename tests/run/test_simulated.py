@@ -165,6 +165,13 @@ def test_what_is_delivered_is_kept_with_both_times(tmp_path: Path) -> None:
         run_scenario(load_scenario("paper-ofdm-paced", settings), tmp_path / "out")
 
 
+def test_what_is_delivered_is_kept_under_the_name_the_sinks_options_give_it(tmp_path: Path) -> None:
+    settings = ["time=packets", "ros_sink.topic_options={odom: {publish_as: '/fleet/r{src_id}/pose'}}"]
+    outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=1.0), tmp_path / "out")
+    assert [info.topic for info in bag_topics(tmp_path / "out" / DELIVERED_BAG)] == ["/fleet/r1/pose"]
+    assert list(outcome.result.counters["listener"]) == ["/fleet/r1/pose"]
+
+
 class Onlooker:
     """Notes what it hears and when."""
 
