@@ -102,7 +102,7 @@ class PacketLog:
     def sent(self, event: SentPacket) -> None:
         """A packet left the sender."""
         for entry in event.entries:
-            self._serial.append(entry.serial)
+            self._serial.append(-1 if entry.repeat else entry.serial)
             self._topic_id.append(entry.topic_id)
             self._entry_id.append(entry.entry_id)
             self._index.append(entry.index)

@@ -42,12 +42,13 @@ def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: 
 class Outgoing:
     """A message on its way out.
 
-    :param serial: number of the submitted message; -1 for a repeat of a transient-local one
+    :param serial: number of the submitted message
     :param payload: what goes on the air: the message, coded where the link compresses
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
     :param weight: what its age counts beside that of other topics
     :param expires: time after which it is of no use, s
+    :param repeat: it was sent before, and goes again for robots that come late (transient-local topics)
     :param entry_id: its name on the air, -1 until its first fragment leaves
     :param cut: most bytes that any fragment still to come needs to take, 0 until it is cut
     :param index: next fragment to send
@@ -61,6 +62,7 @@ class Outgoing:
     submitted: float
     weight: float = 1.0
     expires: float = float("inf")
+    repeat: bool = False
     entry_id: int = -1
     cut: int = 0
     total: int = 0

@@ -182,6 +182,7 @@ class Receiver:
                 self._release(result)
                 result = result.payload()
             events += self._deliver(source, packet, entry.topic_id, entry.entry_id, result)
+        source.epoch += placed.arrival is Arrival.LATE
         events += self._bound(source, packet.src_id)
         return events
 

@@ -91,7 +91,8 @@ class Sender:
         self._busy_since = inf
         """When the last packet left, if another was waiting for a credit then."""
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
-        self._latched: dict[int, bytes] = {}
+        self._latched: dict[int, tuple[int, bytes]] = {}
+        """Serial and coded bytes of the message that late robots are to get, per topic."""
         self._repeat_at: dict[int, float] = {}
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
@@ -121,7 +122,7 @@ class Sender:
             self._drop(dropped)
         self._changed(now)
         if topic.latched:
-            self._latched[topic_id] = payload
+            self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.config.repeat_s
 
     def next_packet(self, now: float) -> bytes | None:
@@ -265,8 +266,13 @@ class Sender:
 
     def _drop(self, dropped: Iterable[Dropped]) -> None:
         for item in dropped:
-            if item.message.serial >= 0:
-                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+            message = item.message
+            if message.repeat:
+                continue
+            self._refuse(message.serial, message.topic_id, item.row, item.detail)
+            if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
+                # It is of no use any more, or there is a newer one: refused is refused, for late robots too.
+                del self._latched[message.topic_id], self._repeat_at[message.topic_id]
 
     def _spend_credit(self, now: float) -> None:
         """A packet left for a credit; where each had to wait for its own, learn how far apart they come."""
@@ -294,10 +300,12 @@ class Sender:
                 self._queues[message.topic_id].started(now)
             entry = message.take(length)
             entries.append(entry)
-            record.append(SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total))
+            record.append(
+                SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total, message.repeat)
+            )
             if message.done:
                 self._queues[message.topic_id].popleft()
-                self.stats.sent[message.topic_id] += message.serial >= 0
+                self.stats.sent[message.topic_id] += not message.repeat
         packet = Packet(
             self.src_id,
             config.dst_id,
@@ -334,8 +342,10 @@ class Sender:
                 self._repeat_at[topic_id] = now + self.config.repeat_s
                 if not self._queues[topic_id]:
                     weight = self.registry[topic_id].options.weight
-                    repeat = Outgoing(-1, topic_id, self._latched[topic_id], QOS_BULK, now, weight)
-                    self._queues[topic_id].append(repeat)
+                    serial, payload = self._latched[topic_id]
+                    self._queues[topic_id].append(
+                        Outgoing(serial, topic_id, payload, QOS_BULK, now, weight, repeat=True)
+                    )
                     self.stats.repeats += 1
                     self._changed(now)
 

@@ -141,7 +141,7 @@ def test_now_means_the_last_seconds() -> None:
 
 
 @pytest.mark.parametrize("with_ledger", [True, False])
-def test_repeats_count_nowhere(with_ledger: bool) -> None:
+def test_a_repeat_counts_only_where_it_delivers_the_message_it_repeats(with_ledger: bool) -> None:
     recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
     state = make(recorder if with_ledger else None)
     latched = {"raw": TopicOptions(durability="transient_local")}
@@ -151,7 +151,13 @@ def test_repeats_count_nowhere(with_ledger: bool) -> None:
     feed.fly(12.5)
     assert feed.packets == 2
     topic = state.tick(13.0).topics[1]
-    assert (topic.sent, topic.delivered, sum(topic.ledger.values())) == (1, 0, 1)
+    assert (topic.sent, topic.delivered, topic.ledger) == (1, 1, {"delivered": 1})
+    assert topic.latency_s is not None
+    assert topic.latency_s.max == pytest.approx(2.55)
+    feed.forget()  # the other robot starts anew, and gets the map once more
+    feed.fly(15.0)
+    topic = state.tick(16.0).topics[1]
+    assert (feed.packets, topic.sent, topic.delivered, topic.ledger) == (3, 1, 1, {"delivered": 1})
 
 
 def test_packets_field_by_field() -> None:

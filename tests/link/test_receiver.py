@@ -53,6 +53,17 @@ def test_messages_of_one_topic_may_interleave_on_a_clean_link() -> None:
     assert delivered(events) == [b"\x0a\x0a", b"\x14\x14"]
 
 
+@pytest.mark.parametrize("step", range(256))
+def test_any_id_is_taken_whatever_came_before_it(step: int) -> None:
+    """A sender of random ids (the paper's) on a clean link: what is behind the newest id is older, or far ahead."""
+    sink = receiver(packet_len=64)
+    events = []
+    for number, entry_id in enumerate([100, 100 + step & 255]):
+        for index in range(3):
+            events += sink.receive(packet(number * 3 + index, Entry(0, entry_id, index, 3, bytes([number]))), 0.0)
+    assert delivered(events) == [bytes(3), b"\x01\x01\x01"]
+
+
 @pytest.mark.parametrize(
     "entry",
     [Entry(0, 5, 0, 3, b"new"), Entry(0, 5, 1, 2, b"new"), Entry(0, 5, 0, 1, b"new")],
