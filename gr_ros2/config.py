@@ -17,11 +17,10 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_vali
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
 
-BROADCAST = 255
-MIN_PACKET_LEN, MAX_PACKET_LEN = 14, 4095
-SINGLE_ENTRY_OVERHEAD = 13
-"""Bytes of a packet with one entry that are not payload: header 5, topic ids 1, entry header 5, CRC 2."""
+MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
+MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
 
 _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 _T = TypeVar("_T")
@@ -39,7 +38,7 @@ _KINDS = {
 """What a value is asked to be, by what pydantic calls it."""
 
 PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
-RobotId = Annotated[int, Field(ge=-1, le=254)]
+RobotId = Annotated[int, Field(ge=-1, lt=BROADCAST)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -121,7 +120,7 @@ class SourceConfig:
     topics: tuple[str, ...] = ()
     namespace: str = ""
     robot_id: RobotId = -1
-    dst_id: Annotated[int, Field(ge=0, le=255)] = BROADCAST
+    dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
@@ -143,12 +142,17 @@ class SourceConfig:
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:
-        if self.min_fragment > self.packet_len - SINGLE_ENTRY_OVERHEAD:
+        most = self.wire_format.single_entry_payload(self.packet_len)
+        if self.min_fragment > most:
             raise ValueError(
-                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; "
-                f"at most {self.packet_len - SINGLE_ENTRY_OVERHEAD}"
+                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; at most {most}"
             )
         return self
+
+    @property
+    def wire_format(self) -> Format:
+        """The version that packets are written in."""
+        return format_of(0)
 
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
@@ -199,7 +203,7 @@ class SinkConfig:
     publisher_depth: Count = 10
     reassembly_timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     robot_id: RobotId = -1
-    max_sources: Annotated[int, Field(ge=1, le=256)] = 16
+    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1)] = 16
     max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000
     max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
     compression: bool = False

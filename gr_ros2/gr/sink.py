@@ -83,7 +83,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
         # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered anew. At most 256 senders (the id has 8 bits) of as many topics as the registry has, 16 at most.
+        # discovered anew. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._delivered_at: dict[tuple[int, int], float] = {}

@@ -25,7 +25,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from gr_ros2.link.sequence import Pace
-from gr_ros2.wire import Entry
+from gr_ros2.wire import unwrap
+from gr_ros2.wire.v0 import V0, Entry
 
 OVERTAKEN = 64
 _PATIENT = 192
@@ -140,7 +141,7 @@ class TopicReassembler:
             self._history.clear()
             number += _RESTART_JUMP
             self._latest = self._settled = _NOWHERE
-        self._advance(number, entry.index, context.now)
+        self._advance(number, entry.entry_id, entry.index, context.now)
         self._history.append((context.position, number, entry.index, context.epoch))
         self._latest = max(self._latest, (number, entry.index))
         self._top = max(self._top, context.position)
@@ -182,8 +183,7 @@ class TopicReassembler:
         """An entry id unwrapped: less than 64 behind the newest it is an older message, otherwise a newer one."""
         if self._newest is None:
             return entry_id
-        oldest = self._newest - OVERTAKEN + 1  # further back a message is overtaken
-        return oldest + (entry_id - oldest & 255)
+        return unwrap(entry_id, self._newest - OVERTAKEN + 1, V0.id_bits)  # further back a message is overtaken
 
     def _out_of_order(self, number: int, index: int, context: Context) -> bool:
         """Whether an entry's place in its topic disagrees with its packet's, other than on a link without loss."""
@@ -199,7 +199,7 @@ class TopicReassembler:
                     return True
         return False
 
-    def _advance(self, number: int, index: int, now: float) -> None:
+    def _advance(self, number: int, entry_id: int, index: int, now: float) -> None:
         """Follow the newest message, and count those never seen."""
         if self._newest is None or number - self._newest >= _RESTART_JUMP // 2:
             self._newest = number
@@ -208,7 +208,7 @@ class TopicReassembler:
             self.missed_ids += number - self._newest - 1
             self._pace.observe(now, number - self._newest)
             self._newest = number
-        elif number < self._newest and index == 0 and self.missed_ids and number & 255 not in self.partials:
+        elif number < self._newest and index == 0 and self.missed_ids and entry_id not in self.partials:
             self.missed_ids -= 1
 
     def _overtaken(self, context: Context) -> Iterator[Partial]:

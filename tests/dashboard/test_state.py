@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import resource
 from pathlib import Path
 
@@ -170,10 +171,12 @@ def test_packets_field_by_field() -> None:
     assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
     first = packets[0]
     assert (first.version, first.src_id, first.dst_id, first.hop, first.qos) == (0, SRC, 255, 5, "default")
-    (entry,) = first.entries
-    assert (entry.topic, entry.colour, entry.index, entry.total, entry.size) == ("raw", 1, 0, 6, 51)
-    assert first.pad == 0
-    assert packets[-1].pad == 64 - 13 - packets[-1].entries[0].size
+    assert first.entries == 1
+    *_, entry, crc = first.spans
+    assert (entry.kind, entry.colour, entry.size, crc.kind) == ("entry", 1, 56, "crc")
+    assert re.fullmatch(r"raw #\d+\[0/6\] 51 B", entry.text)
+    assert [span.kind for span in packets[-1].spans] == ["head", "ids", "entry", "pad", "crc"]
+    assert all(sum(span.size for span in packet.spans) == 64 for packet in packets)
     assert refused.refused.startswith("length:")
     assert refused.t == pytest.approx(1.0)
 

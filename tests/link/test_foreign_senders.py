@@ -11,7 +11,7 @@ import pytest
 
 from gr_ros2.config import SinkConfig, build
 from gr_ros2.link import Delivered, Receiver
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.link.engines import delivered, receiver, registry
 from tests.link.test_receiver import packet
 
@@ -83,7 +83,7 @@ def carry(send: Sending, loss: float, seed: int) -> tuple[int, set[int]]:
     corrupt = 0
     for number, piece in enumerate(send(rng)):
         entry = Entry(0, piece.entry_id, piece.index, piece.total, piece.message.to_bytes(4, "big") * 10)
-        data = encode(Packet(1, 255, number & 255, 1, (entry,)), 64)
+        data = V0.encode(Packet(1, 255, number & 255, 1, (entry,)), 64)
         if rng.random() < loss:
             continue
         for event in sink.receive(data, number / PACKET_RATE):

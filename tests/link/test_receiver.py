@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from gr_ros2.config import TopicOptions
 from gr_ros2.link import Delivered, Lost, Rejected
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.link.engines import delivered, drain, receiver, sender
 
 
 def packet(
     seq: int, *entries: Entry, src_id: int = 1, dst_id: int = 255, length: int = 64, compressed: bool = False
 ) -> bytes:
-    return encode(Packet(src_id, dst_id, seq, 1, entries, compressed=compressed), length)
+    return V0.encode(Packet(src_id, dst_id, seq, 1, entries, compressed=compressed), length)
 
 
 def test_out_of_order_interleaved_and_duplicated() -> None:
