@@ -27,7 +27,7 @@ setup(
             "scenarios/*",
             "sweeps/*",
             "losses/*",
-            "experiment/templates/*",
+            "report/templates/*",
             "dashboard/templates/*",
             "compression/dictionaries/*",
         ]

@@ -15,12 +15,12 @@ import numpy as np
 
 from bench.report import Row
 from bench.runs import DOMAINS, HUSKY, HUSKY_TOPICS
-from gr_ros2.experiment.ablation import air_bytes
-from gr_ros2.experiment.outcome import Outcome
-from gr_ros2.experiment.plan import Planner
-from gr_ros2.experiment.result import TopicResult
-from gr_ros2.experiment.runner import run_scenario
-from gr_ros2.experiment.scenario import Scenario, load_scenario
+from gr_ros2.record.result import TopicResult
+from gr_ros2.run.outcome import Outcome
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.study.ablation import air_bytes
+from gr_ros2.study.forecast import Planner
 
 WHOLE_S, PART_S, PLAIN_S = 38.0, 15.0, 8.0
 PLAIN = ["ros_source.compression=false", "ros_sink.compression=false", "ros_source.scheduler=paper", "paced=false"]

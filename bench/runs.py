@@ -7,10 +7,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bench.report import Row
-from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.runner import DELIVERED_BAG, run_scenario
-from gr_ros2.experiment.scenario import load_scenario
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.record.result import Result
+from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
+from gr_ros2.run.scenario import load_scenario
 
 HUSKY = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
 HUSKY_TOPICS = {"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu", "fix": "sensor_msgs/NavSatFix"}

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from bench.report import Row
 from bench.runs import DOMAINS
-from gr_ros2.experiment.result import read_result
+from gr_ros2.record.result import read_result
 
 REPEATS, TARGET_S, PATIENCE_S = 3, 2.0, 60.0
 _DELIVERED = re.compile(rb"([1-9][0-9]*) delivered")

@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 import yaml
 
 from bench.report import Row
-from gr_ros2.experiment.losstable import PACKETS
-from gr_ros2.experiment.sweep.definition import load_sweep
-from gr_ros2.experiment.sweep.run import run_sweep
-from gr_ros2.experiment.sweep.table import ALL, Summary, rows_of, summaries
+from gr_ros2.run.losstable import PACKETS
+from gr_ros2.study.sweep.definition import load_sweep
+from gr_ros2.study.sweep.run import run_sweep
+from gr_ros2.study.sweep.table import ALL, Summary, rows_of, summaries
 
 WORKERS = 2
 CELLS = {

@@ -26,7 +26,9 @@ LAYERS = (
     {"phy", "sim", "grc_path"},
     {"gr"},
     {"radio"},
-    {"experiment"},
+    {"record"},
+    {"run", "report"},
+    {"study"},
     {"dashboard", "race"},
     {"cli"},
     {"ros"},
@@ -45,7 +47,7 @@ CONFINED = {
     "rclpy": ("middleware/rclpy.py", "ros/"),
     "rcl_interfaces": ("ros/",),
     "cyclonedds": ("middleware/cdr_dds.py", "middleware/dds"),
-    "distributed": ("experiment/sweep/cluster.py",),
+    "distributed": ("study/sweep/cluster.py",),
     "zenoh": ("middleware/zenoh.py", "race/"),
 }
 BLOCKED = tuple(CONFINED)
@@ -63,10 +65,10 @@ WITHOUT_BACKENDS = (
     "gr_ros2.radio",
     "gr_ros2.radio.config",
     "gr_ros2.sim",
-    "gr_ros2.experiment.ledger",
-    "gr_ros2.experiment.metrics",
-    "gr_ros2.experiment.result",
-    "gr_ros2.experiment.scenario",
+    "gr_ros2.record.ledger",
+    "gr_ros2.record.metrics",
+    "gr_ros2.record.result",
+    "gr_ros2.run.scenario",
     "gr_ros2.cli.main",
 )
 MAX_LINES = 500
@@ -74,7 +76,7 @@ MAX_LINES = 500
 KNOW_THEIR_VERSION = ("wire/", "link/sender.py", "link/receiver.py", "link/reassemble.py", "link/sequence.py")
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
 COMPARES_WITH_VERSION_0 = ("race/settings.py",)
-SPEAKS_OF_PACKETS = {"link", "gr", "experiment", "dashboard", "config", "registry"}
+SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "config", "registry"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
 _GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}

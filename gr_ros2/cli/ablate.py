@@ -9,10 +9,10 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.experiment.ablation import Variant, run_variants, worth_grid
-from gr_ros2.experiment.compare import write_comparison
-from gr_ros2.experiment.scenario import Scenario
-from gr_ros2.experiment.table import as_table
+from gr_ros2.report.compare import write_comparison
+from gr_ros2.report.table import as_table
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.study.ablation import Variant, run_variants, worth_grid
 
 
 @click.command()

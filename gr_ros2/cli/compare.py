@@ -9,9 +9,9 @@ import click
 
 from gr_ros2.cli.console import console
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.compare import compare_grid, write_comparison
-from gr_ros2.experiment.report import read_runs
-from gr_ros2.experiment.table import as_table
+from gr_ros2.report.compare import compare_grid, write_comparison
+from gr_ros2.report.page import read_runs
+from gr_ros2.report.table import as_table
 
 
 @click.command()

@@ -19,7 +19,7 @@ from gr_ros2.errors import BackendMissingError, ConfigError, RunError
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard
-    from gr_ros2.experiment.watch import Audience
+    from gr_ros2.run.watch import Audience
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
@@ -40,11 +40,11 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for those who look for it
-    :param instruments: see :class:`gr_ros2.experiment.watch.Watcher`
+    :param instruments: see :class:`gr_ros2.run.watch.Watcher`
     :raises ConfigError: for a place where nothing can be served
     :raises BackendMissingError: when the package that draws it is not installed
     """
-    from gr_ros2.experiment.watch import Audience
+    from gr_ros2.run.watch import Audience
 
     seen = Audience(instruments or where is not None)
     urls: list[str] = []

@@ -21,8 +21,8 @@ from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.radio.config import LinkConfig, load_link
 
 if TYPE_CHECKING:
-    from gr_ros2.experiment.watch import LiveRun
     from gr_ros2.radio.link import RobotLink
+    from gr_ros2.run.watch import LiveRun
 
 _SHOW_S = 0.5
 
@@ -40,8 +40,8 @@ def link(
     settings = load_link(config, overrides)
     # These need GNU Radio, which a wrong setting must not wait for.
     with uninterrupted():
-        from gr_ros2.experiment.watch import EventSink, Fanout
         from gr_ros2.radio.link import RobotLink
+        from gr_ros2.run.watch import EventSink, Fanout
 
     console = make_console()
     with audience(dashboard, console, settings.name) as onlookers, capture(pcap) as captures, ExitStack() as stack:
@@ -60,7 +60,7 @@ def link(
 
 def _live(running: RobotLink) -> LiveRun:
     """What onlookers see: this end alone, so no ledger."""
-    from gr_ros2.experiment.watch import LiveRun
+    from gr_ros2.run.watch import LiveRun
 
     source = running.source
     return LiveRun(

@@ -22,8 +22,8 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 
 if TYPE_CHECKING:
-    from gr_ros2.experiment.result import Result
-    from gr_ros2.experiment.watch import LiveRun
+    from gr_ros2.record.result import Result
+    from gr_ros2.run.watch import LiveRun
 
 LINK_TYPE = 147
 """DLT_USER0: ours to give a meaning; the dissector does."""
@@ -37,7 +37,7 @@ _NANOSECONDS = 9
 
 
 class PacketCapture:
-    """A capture under way: a :class:`gr_ros2.experiment.watch.Watcher`, and for a link without runs its ears.
+    """A capture under way: a :class:`gr_ros2.run.watch.Watcher`, and for a link without runs its ears.
 
     :param path: file to write, replaced if it is there
     :param clock: s, the clock of the events, until a run brings its own

@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.experiment.plan import Advice, Forecast, Planner
-from gr_ros2.experiment.scenario import Scenario, load_scenario
+from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.study.forecast import Advice, Forecast, Planner
 
 _WIDTH = 110
 _ADVICE = 3

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.positions import humble_types
 from gr_ros2.middleware import MIDDLEWARE, Middleware, TopicInfo
+from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
 
 _INFRASTRUCTURE = ("/rosout", "/parameter_events")

@@ -8,9 +8,9 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.experiment.replay import replay as replay_bag
-from gr_ros2.experiment.scenario import Scenario, load_scenario
-from gr_ros2.experiment.table import ledger_table, notes, summary_table
+from gr_ros2.report.table import ledger_table, notes, summary_table
+from gr_ros2.run.replay import replay as replay_bag
+from gr_ros2.run.scenario import Scenario, load_scenario
 
 
 @click.command()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from gr_ros2.experiment.report import read_runs, write_report
+from gr_ros2.report.page import read_runs, write_report
 
 
 @click.command()

@@ -19,15 +19,16 @@ from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
-from gr_ros2.experiment import runner
-from gr_ros2.experiment.explain import explanation
-from gr_ros2.experiment.outcome import Outcome
-from gr_ros2.experiment.repeat import REPETITIONS_FILE, repetition_folder, repetition_grid
-from gr_ros2.experiment.report import Run, read_runs, write_report
-from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.scenario import Scenario, load_scenario
-from gr_ros2.experiment.table import as_table, ledger_table, notes, paper_grid, summary_table
-from gr_ros2.experiment.watch import Watcher
+from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
+from gr_ros2.record.result import Result
+from gr_ros2.report.explain import explanation
+from gr_ros2.report.page import Run, read_runs, write_report
+from gr_ros2.report.repetitions import repetition_grid
+from gr_ros2.report.table import as_table, ledger_table, notes, paper_grid, summary_table
+from gr_ros2.run import runner
+from gr_ros2.run.outcome import Outcome
+from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.run.watch import Watcher
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from gr_ros2.experiment.scenario import builtin_scenarios
+from gr_ros2.run.scenario import builtin_scenarios
 
 
 @click.command()

@@ -14,12 +14,12 @@ from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import INTERRUPTED
 from gr_ros2.cli.params import set_option
 from gr_ros2.errors import BackendMissingError, RunError
-from gr_ros2.experiment.scenario import Scenario
-from gr_ros2.experiment.sweep.definition import builtin_sweeps, load_sweep, read_sweep
-from gr_ros2.experiment.table import as_table
+from gr_ros2.report.table import as_table
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.study.sweep.definition import builtin_sweeps, load_sweep, read_sweep
 
 if TYPE_CHECKING:
-    from gr_ros2.experiment.sweep.run import SweepProgress
+    from gr_ros2.study.sweep.run import SweepProgress
 
 _ESTIMATE_S = 3600.0
 """Runs of the last so many seconds tell the time left: a single one may take minutes."""
@@ -51,12 +51,12 @@ def sweep(
     plan = load_sweep(sweep, overrides)
     try:
         with uninterrupted():
-            from gr_ros2.experiment.sweep.run import run_sweep
+            from gr_ros2.study.sweep.run import run_sweep
     except ModuleNotFoundError as error:
         package = (error.name or "distributed").split(".")[0]
         raise BackendMissingError(f"sweep needs {package}: pip install 'gr-ros2[sweep]'") from error
-    from gr_ros2.experiment.sweep.page import summary_grid
-    from gr_ros2.experiment.sweep.table import rows_of, summaries
+    from gr_ros2.study.sweep.page import summary_grid
+    from gr_ros2.study.sweep.table import rows_of, summaries
 
     console = make_console()
     out = out or Path("results") / f"sweep-{plan.name}"

@@ -19,9 +19,9 @@ from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import Floats
 from gr_ros2.errors import GrRos2Error
-from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.watch import LiveLink, LiveRun
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.record.result import Result
+from gr_ros2.run.watch import LiveLink, LiveRun
 
 TICK_S = 0.5
 """s between two snapshots."""
@@ -49,7 +49,7 @@ class Radio:
 
 
 class Desk:
-    """A :class:`gr_ros2.experiment.watch.Watcher` that keeps a snapshot for others to draw."""
+    """A :class:`gr_ros2.run.watch.Watcher` that keeps a snapshot for others to draw."""
 
     instruments = True
 

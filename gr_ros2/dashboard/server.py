@@ -27,7 +27,7 @@ from tornado.web import RequestHandler
 from gr_ros2.dashboard.desk import TICK_S, Desk
 from gr_ros2.dashboard.page import Page
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.result import Result
+from gr_ros2.record.result import Result
 
 _LOOK_S = 0.1
 _LAST_PICTURE_S = 2.0

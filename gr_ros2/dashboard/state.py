@@ -19,11 +19,11 @@ import numpy as np
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
-from gr_ros2.experiment.ledger import DELIVERED, IN_FLIGHT
-from gr_ros2.experiment.metrics import Latency, latency, latency_cdf
-from gr_ros2.experiment.positions import PositionReader, position_reader
-from gr_ros2.experiment.result import Result, TopicResult
 from gr_ros2.link.events import Accepted, Delivered, Lost, ReceiverEvent, Refused, Rejected, SenderEvent, SentPacket
+from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT
+from gr_ros2.record.metrics import Latency, latency, latency_cdf
+from gr_ros2.record.positions import PositionReader, position_reader
+from gr_ros2.record.result import Result, TopicResult
 from gr_ros2.registry import Registry
 
 Key = tuple[int, int]

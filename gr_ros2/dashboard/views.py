@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.dashboard.windows import Floats, Point
-from gr_ros2.experiment.metrics import Latency
+from gr_ros2.record.metrics import Latency
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.errors import ConfigError
-from gr_ros2.experiment.metrics import age, latency
 from gr_ros2.race.air import AirLog, AirReport
 from gr_ros2.race.settings import Recording
+from gr_ros2.record.metrics import age, latency
 from gr_ros2.registry import Registry
 
 Floats = npt.NDArray[np.float64]

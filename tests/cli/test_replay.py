@@ -10,7 +10,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli.main import run
 from gr_ros2.middleware.bag_files import read_bag
-from tests.experiment.test_replay import COUNT, make_bag
+from tests.run.test_replay import COUNT, make_bag
 
 
 @pytest.fixture(autouse=True)

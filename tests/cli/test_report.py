@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.cli import main as command
-from tests.experiment.runs import make_run
+from tests.record.runs import make_run
 
 
 def test_one_folder_gets_its_own_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.cli.main import run
-from gr_ros2.experiment.scenario import builtin_scenarios
+from gr_ros2.run.scenario import builtin_scenarios
 
 
 def test_one_line_each(capsys: pytest.CaptureFixture[str]) -> None:

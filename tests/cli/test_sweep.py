@@ -14,10 +14,10 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[sweep]'")
 
 from gr_ros2.cli.main import BAD_INPUT, FAILED, INTERRUPTED, run
-from gr_ros2.experiment.sweep.definition import builtin_sweeps
+from gr_ros2.study.sweep.definition import builtin_sweeps
 from tests.e2e.support import COMMAND
-from tests.experiment.sweeps import write_sweep_file
 from tests.middleware.support import wait_for
+from tests.study.sweeps import write_sweep_file
 
 
 def test_without_a_name_it_lists_the_built_in_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,12 +60,12 @@ def test_a_sweep_from_end_to_end_on_two_processes(
 def test_failed_runs_are_told_and_are_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gr_ros2.experiment.sweep import run as running
+    from gr_ros2.study.sweep import run as running
 
     path = write_sweep_file(tmp_path)
 
     def without_registry(plan: object, *words: object, **options: object) -> object:
-        monkeypatch.setattr("gr_ros2.experiment.sweep.cluster._portable", lambda _: {"registry": "gone"})
+        monkeypatch.setattr("gr_ros2.study.sweep.cluster._portable", lambda _: {"registry": "gone"})
         return run_sweep(plan, *words, **options)  # type: ignore[arg-type]
 
     run_sweep = running.run_sweep

@@ -16,9 +16,9 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.errors import ConfigError, WireError
-from gr_ros2.experiment.scenario import load_scenario
 from gr_ros2.link.events import SentPacket
 from gr_ros2.registry import Registry
+from gr_ros2.run.scenario import load_scenario
 from gr_ros2.wire.v0 import V0
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
@@ -140,7 +140,7 @@ def test_our_own_decoder_reads_the_capture(tmp_path: Path, capsys: pytest.Captur
 def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     memory = ["--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory"]
-    from gr_ros2.experiment.runner import REGISTRY_FILE
+    from gr_ros2.run.runner import REGISTRY_FILE
 
     path = tmp_path / "run.pcapng"
     command = ["run", "paper-direct", "--duration", "0.5", "--out", str(tmp_path / "out"), "--pcap", str(path)]

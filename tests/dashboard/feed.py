@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.experiment.positions import humble_types
 from gr_ros2.link import Receiver, Sender
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import Registry
 
 REGISTRY = Registry.from_rows({"at": "geometry_msgs/PointStamped", "raw": "my_msgs/Thing"})

@@ -11,8 +11,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.dashboard.desk import Desk
 from gr_ros2.errors import RunError
-from gr_ros2.experiment.runner import run_scenario
-from gr_ros2.experiment.scenario import load_scenario
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
 from tests.gr.probe import wait_for
 
 ENDS = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
@@ -83,7 +83,7 @@ def test_the_next_run_starts_from_nothing() -> None:
 
 def test_a_run_that_fails_is_said_to_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr("gr_ros2.experiment.runner._MATCH_S", -1.0)
+    monkeypatch.setattr("gr_ros2.run.runner._MATCH_S", -1.0)
     scenario = load_scenario("paper-direct", ENDS, duration_s=0.5)
     with pytest.raises(RunError, match="did not find each other"):
         run_scenario(scenario, watchers=[desk])

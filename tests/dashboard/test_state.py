@@ -13,8 +13,8 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
-from gr_ros2.experiment.recorder import Recorder
-from gr_ros2.experiment.result import Result
+from gr_ros2.record.recorder import Recorder
+from gr_ros2.record.result import Result
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.experiment.result import Result
-from gr_ros2.experiment.runner import DELIVERED_BAG
-from gr_ros2.experiment.scenario import Scenario, load_scenario
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.record.result import Result
+from gr_ros2.run.runner import DELIVERED_BAG
+from gr_ros2.run.scenario import Scenario, load_scenario
 from tests.middleware.support import same
 
 DDS_PADDING = 3

@@ -12,11 +12,11 @@ import pytest
 from gnuradio import gr
 
 from gr_ros2.cli import main as command
-from gr_ros2.experiment.runner import run_scenario
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.registry import Registry
+from gr_ros2.run.runner import run_scenario
 from tests.e2e.support import check_books, free_domains, on_free_domains, scenario, set_options
 from tests.gr.probe import Probe, pdu
 from tests.middleware.support import RELIABLE, STRING, message, same, wait_for

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from gnuradio import gr
 
-from gr_ros2.experiment.result import read_result
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.record.result import read_result
 from gr_ros2.registry import Registry
 from tests.e2e.support import COMMAND, check_books, delivered_bag, free_domains, set_options
 from tests.middleware.support import LATCHED, Peer, message, same, wait_for

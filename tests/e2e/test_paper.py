@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
-from gr_ros2.experiment.result import read_result
-from gr_ros2.experiment.runner import DELIVERED_BAG, run_scenario
-from gr_ros2.experiment.scenario import load_scenario
 from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.record.result import read_result
+from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
+from gr_ros2.run.scenario import load_scenario
 from tests.e2e.support import check_books, check_complete, check_identical, delivered_bag, free_domains, scenario
 from tests.middleware.support import RELIABLE, wait_for
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.experiment.runner import run_scenario
-from gr_ros2.experiment.scenario import load_scenario
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher
 from gr_ros2.middleware.bag_files import BagMessage, read_bag
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
 from tests.e2e.support import HUSKY, check_complete, check_identical, delivered_bag, needs_husky, on_free_domains
 
 TOPICS = {"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu", "fix": "sensor_msgs/NavSatFix"}

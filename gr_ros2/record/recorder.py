@@ -1,0 +1,189 @@
+"""Watches one run and turns what it saw into results: the loss ledger, the paths and the numbers of every topic.
+
+Law: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
+lock and the reading of one position; what it keeps of a message or packet are numbers in arrays.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from math import nan
+from typing import Any
+
+from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.record.ledger import Ledger, TopicLedger
+from gr_ros2.record.metrics import TopicMetrics, topic_metrics
+from gr_ros2.record.path import path_error, rms_error
+from gr_ros2.record.positions import PositionReader, position_reader
+from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
+from gr_ros2.record.trace import PacketLog, Trace, Track, make_trace
+from gr_ros2.registry import Registry, Topic
+
+
+class Recorder:
+    """Everything both ends of a run report, joined.
+
+    :param registry: names and types of the topic ids
+    :param namespaces: namespace of each source id on the ROS graph, for the names of its topics
+    :param topic_ids: topics of each source id to report even if nothing was sent on them, None = the whole registry
+    :param latency_clock: time base of the submission times: submit, stamp_wall or stamp_sim
+    :param on_delivery: called with every delivery, when it came, and when the message was submitted, s on the run's
+        clock; None for a repeat, and where no such message is known
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        namespaces: Mapping[int, str],
+        topic_ids: Mapping[int, Iterable[int]] | None = None,
+        latency_clock: str = "submit",
+        on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
+    ) -> None:
+        self.ledger = Ledger()
+        self.sent: dict[tuple[int, int], Track] = {}
+        self.received: dict[tuple[int, int], Track] = {}
+        self.counters: Counter[str] = Counter()
+        self._packets = {src_id: PacketLog() for src_id in namespaces}
+        self._books: list[TopicLedger] = []
+        self._registry = registry
+        self._namespaces = dict(namespaces)
+        reported = dict.fromkeys(namespaces, range(len(registry))) if topic_ids is None else topic_ids
+        self._keys = [(src_id, topic_id) for src_id, ids in reported.items() for topic_id in ids]
+        self._delivered, self._delivered_bytes = 0, 0
+        self._latency_clock = latency_clock
+        self._on_delivery = on_delivery
+        readers = {topic.topic_id: position_reader(topic.type_name) for topic in registry}
+        self._readers: dict[int, PositionReader] = {key: read for key, read in readers.items() if read is not None}
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """What the sender with this source id reports."""
+        if isinstance(event, SentPacket):
+            self._packets.setdefault(src_id, PacketLog()).sent(event)
+        self.ledger.sender_event(src_id, event)
+        if isinstance(event, Accepted):
+            self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
+
+    def packet_received(self, data: bytes, now: float = nan) -> None:
+        """Bytes the PHY handed to the sink, before the sink reads them, at ``now`` on the sender's clock."""
+        packet = self.ledger.packet_received(data)
+        if packet is not None:
+            src_id, number = packet
+            self._packets[src_id].received(number, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What the receiver reports; of a delivery once it is republished, at ``now`` on the sender's clock."""
+        submitted = self.ledger.receiver_event(event, now)
+        if isinstance(event, Delivered):
+            if self._on_delivery is not None:
+                self._on_delivery(event, now, submitted)
+            self._follow(self.received, event.src_id, event.topic_id, event.payload, now)
+
+    def progress(self) -> tuple[int, int]:
+        """Messages sent and delivered so far, over all topics."""
+        return self.ledger.totals()
+
+    def finish(self, duration_s: float, t_end: float, drained: bool = False) -> tuple[TopicResult, ...]:
+        """Close the books.
+
+        :param duration_s: s during which messages were submitted
+        :param t_end: s on the run's clock, end of submission
+        :param drained: nothing is left in the PHY: what was sent and did not arrive is lost
+        :return: one result per topic of the registry and source, and per source that was heard besides
+        :raises RunError: when the ledger does not add up
+        """
+        books = {(book.src_id, book.topic_id): book for book in self.ledger.finish(drained)}
+        for key in self._keys:
+            books.setdefault(key, TopicLedger(*key))
+        self._books = [books[key] for key in sorted(books)]
+        numbers = {key: topic_metrics(books[key], duration_s, t_end) for key in sorted(books)}
+        self._delivered = sum(metrics.delivered for metrics in numbers.values())
+        self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
+        return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
+
+    def airtime(self, airtime_s: float | None) -> dict[str, float | None]:
+        """Seconds of the PHY: of one packet, and of all packets sent per message and per byte delivered.
+
+        To be asked after :meth:`finish`.
+
+        :param airtime_s: of one packet, None for a PHY without samples
+        """
+        total = None if airtime_s is None else airtime_s * self.ledger.packets()["sent"]
+        return {
+            "airtime_s": airtime_s,
+            "airtime_per_message_s": total / self._delivered if total is not None and self._delivered else None,
+            "airtime_per_byte_s": total / self._delivered_bytes
+            if total is not None and self._delivered_bytes
+            else None,
+        }
+
+    def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
+        """Every message, packet and position. To be asked after :meth:`finish`.
+
+        :param t0: s on the run's clock, when submission began
+        :param t_end: s on the run's clock, when it ended
+        :param published_as: name of a topic at the sink by its name at the source
+        """
+        keys = sorted(self.sent.keys() | self.received.keys())
+        tracks = {key: (self.sent.get(key, Track()), self.received.get(key, Track())) for key in keys}
+        return make_trace(
+            self._books,
+            logs=self._packets,
+            tracks=tracks,
+            name_of=self._name,
+            published_as=published_as,
+            t0=t0,
+            t_end=t_end,
+        )
+
+    def _follow(
+        self, tracks: dict[tuple[int, int], Track], src_id: int, topic_id: int, payload: bytes, t: float
+    ) -> None:
+        read = self._readers.get(topic_id)
+        if read is None:
+            return
+        position = read(payload)
+        if position is None:
+            self.counters["unreadable_positions"] += 1
+            return
+        track = tracks.setdefault((src_id, topic_id), Track())
+        track.t.append(t)
+        track.x.append(position[0])
+        track.y.append(position[1])
+
+    def _topic(self, topic_id: int) -> Topic | None:
+        return self._registry[topic_id] if topic_id < len(self._registry) else None
+
+    def _name(self, src_id: int, topic_id: int) -> str:
+        topic = self._topic(topic_id)
+        namespace = self._namespaces.get(src_id, f"source_{src_id}")
+        return topic.on_graph(namespace) if topic is not None else f"/{namespace.strip('/')}/topic_{topic_id}"
+
+    def _topic_result(self, book: TopicLedger, numbers: TopicMetrics) -> TopicResult:
+        topic = self._topic(book.topic_id)
+        key = (book.src_id, book.topic_id)
+        sent, received = self.sent.get(key, Track()), self.received.get(key, Track())
+        return TopicResult(
+            topic=self._name(*key),
+            type=topic.type_name if topic is not None else "",
+            src_id=book.src_id,
+            sent=numbers.sent,
+            delivered=numbers.delivered,
+            pdr=numbers.pdr,
+            goodput_Bps=numbers.goodput_Bps,
+            latency_s=LatencyResult(**_values(numbers.latency_s)),
+            latency_clock=self._latency_clock if numbers.latency_s is not None else None,
+            age_s=AgeResult(**_values(numbers.age_s)),
+            path_error_m=path_error(sent.xy, received.xy),
+            rms_error_m=rms_error(sent.t, sent.xy, received.t, received.xy),
+            ledger=dict(sorted(book.rows.items())),
+            corrupt=book.corrupt,
+            repeats_delivered=book.repeats_delivered,
+            negative_latencies=numbers.negative_latencies,
+            latency_cdf_s=numbers.latency_cdf_s,
+        )
+
+
+def _values(numbers: Any) -> dict[str, float]:
+    return asdict(numbers) if numbers is not None else {}

@@ -1,0 +1,176 @@
+"""`result.json`: what an experiment found, as values and as a file.
+
+Laws: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
+reading gives back what was written, and refuses anything else with one line that says why. Keys this version does
+not know are ignored when reading, so that results of later versions can still be tabulated.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.errors import ConfigError
+
+RESULT_FILE = "result.json"
+
+_READ = ConfigDict(extra="ignore")
+_Count = Annotated[int, Field(ge=0)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, config=_READ)
+class LatencyResult:
+    """s; see :class:`gr_ros2.record.metrics.Latency`."""
+
+    p50: _Number | None = None
+    p95: _Number | None = None
+    p99: _Number | None = None
+    max: _Number | None = None
+
+
+@dataclass(frozen=True, config=_READ)
+class AgeResult:
+    """s; see :class:`gr_ros2.record.metrics.Age`."""
+
+    mean: _Number | None = None
+    peak: _Number | None = None
+
+
+@dataclass(frozen=True, config=_READ)
+class TopicResult:
+    """One topic of one source.
+
+    :param topic: absolute name at the source
+    :param latency_clock: submit, stamp_wall or stamp_sim; None where there is no latency
+    :param path_error_m: mean distance of the paths along their length, None where the type has no position
+    :param rms_error_m: RMS distance at equal times, likewise
+    :param ledger: row -> messages; the rows add up to ``sent``
+    :param corrupt: deliveries that match no message sent; 0 unless something is badly wrong
+    :param repeats_delivered: deliveries of repeats, which count nowhere else
+    :param latency_cdf_s: the latencies at 0 %, 1 %, … 100 %, empty where nothing was delivered
+    """
+
+    topic: str
+    type: str
+    src_id: int
+    sent: _Count
+    delivered: _Count
+    pdr: _Number | None
+    goodput_Bps: _Number | None
+    latency_s: LatencyResult
+    latency_clock: str | None
+    age_s: AgeResult
+    path_error_m: _Number | None
+    ledger: dict[str, _Count]
+    rms_error_m: _Number | None = None
+    corrupt: _Count = 0
+    repeats_delivered: _Count = 0
+    negative_latencies: _Count = 0
+    latency_cdf_s: tuple[_Number, ...] = ()
+
+    @model_validator(mode="after")
+    def _adds_up(self) -> TopicResult:
+        if sum(self.ledger.values()) != self.sent:
+            raise ValueError(f"ledger rows add up to {sum(self.ledger.values())}, sent are {self.sent}")
+        return self
+
+
+@dataclass(frozen=True, config=_READ)
+class Result:
+    """One experiment.
+
+    :param duration_s: s during which messages were submitted
+    :param config: every setting of the scenario
+    :param packets: counts by name: sent, received, crc_failed, malformed, …
+    :param phy: name, channels (one per direction), sample_rate, airtime_s (of one packet), airtime_per_message_s and
+        airtime_per_byte_s (of all packets sent, per delivered message and byte), …
+    :param wall_s: s the run took by the wall clock, drain included
+    :param interrupted: the run was stopped before its end
+    :param counters: of the blocks, by name: what was dropped and why
+    """
+
+    scenario: str
+    seed: int
+    duration_s: _Number
+    config: dict[str, Any]
+    topics: tuple[TopicResult, ...]
+    packets: dict[str, Any]
+    phy: dict[str, Any]
+    wall_s: _Number | None = None
+    interrupted: bool = False
+    counters: dict[str, Any] = field(default_factory=dict)
+
+
+def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:
+    """Every number of a topic as a column of a table.
+
+    :param rows: ledger rows that get a column each
+    """
+    values = asdict(topic)
+    for name in ("latency_s", "age_s"):
+        values.update({f"{name[:-2]}_{key}_s": value for key, value in values.pop(name).items()})
+    ledger = values.pop("ledger")
+    del values["latency_cdf_s"]
+    return {**values, **{f"ledger_{row}": ledger.get(row, 0) for row in rows}}
+
+
+def write_result(result: Result, path: str | Path) -> Path:
+    """Write the file, or ``result.json`` in a folder.
+
+    :raises ConfigError: when it cannot be written
+    """
+    path = Path(path)
+    if path.is_dir():
+        path /= RESULT_FILE
+    values = _finite(TypeAdapter(Result).dump_python(result, mode="python", warnings=False))
+    text = json.dumps(values, indent=2, allow_nan=False, default=str) + "\n"
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
+    return path
+
+
+def read_result(path: str | Path) -> Result:
+    """Read the file, or the ``result.json`` of a folder.
+
+    :raises ConfigError: when it is missing, damaged, half-written or no result; says where
+    """
+    path = Path(path)
+    if path.is_dir():
+        path /= RESULT_FILE
+    try:
+        values = json.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: damaged or half-written, no JSON ({error}); run the experiment again") from error
+    try:
+        return TypeAdapter(Result).validate_python(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the whole file"
+        message = first["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{path}: no result of an experiment ({where}: {message})") from error
+
+
+def _finite(value: Any) -> Any:
+    """The same with every number that is not finite as null, and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if hasattr(value, "item") and callable(value.item):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,190 @@
+"""Why a run came out as it did, in sentences computed from its ledger and its trace.
+
+Law: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
+apply is left out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS
+from gr_ros2.record.result import Result
+from gr_ros2.record.trace import Ints, Packets, Trace
+from gr_ros2.report.figures import row_order
+from gr_ros2.report.table import milliseconds
+
+_TREND = 1.5
+"""A latency that changed by less than this factor from the first to the last deliveries is called steady."""
+
+_ROWS = {
+    IN_FLIGHT: "still in flight at the end",
+    LOST_FRAGMENTS: "lost for want of a fragment",
+    "queue_bound": "dropped at the bound of the source's queue",
+    "too_large": "too large for the packet length",
+    "expired": "given up incomplete after the reassembly timeout",
+    "not_taken": "received whole but not taken by the sink",
+}
+
+
+def explanation(result: Result, trace: Trace) -> list[str]:
+    """Sentences: where messages went, what the air could carry, what became of packets, how latency moved."""
+    packets = trace.packets()
+    return [
+        *_outcome(result),
+        *_capacity(result, trace, packets),
+        *_packets(result, packets),
+        *_in_flight(trace, packets),
+        *_trend(trace),
+    ]
+
+
+def _outcome(result: Result) -> Iterator[str]:
+    ledger: Counter[str] = Counter()
+    for topic in result.topics:
+        ledger.update(topic.ledger)
+    sent = ledger.total()
+    if not sent:
+        yield "No message was sent."
+        return
+    parts = [
+        f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {_ROWS.get(row, row.replace('_', ' '))}"
+        for row in dict.fromkeys([DELIVERED, *row_order([ledger])])
+    ]
+    yield f"Of {sent:,} messages sent: {', '.join(parts)}."
+
+
+def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
+    """What carrying everything would have needed, against what the air has."""
+    airtime = result.phy.get("airtime_s")
+    if not airtime or not result.duration_s or result.config.get("pace") == "flow" or not len(packets.packet):
+        return
+    needed = sum((m.row != "too_large").sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
+    needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
+    channels = result.phy.get("channels", 1)
+    share = needed * airtime / result.duration_s / channels
+    each = "" if channels == 1 else f" on its {channels} channels"
+    yield (
+        f"A packet takes {milliseconds(airtime)} ms of air, so the link carries at most {channels / airtime:,.1f} "
+        f"packets/s{each}. "
+        f"All messages sent, cut and packed as they were, come to {needed / result.duration_s:,.1f} packets/s: "
+        + (f"{share:.1f} times what the link has." if share > 1 else f"{_percent(share)} of what the link has.")
+    )
+
+
+def _packets(result: Result, packets: Packets) -> Iterator[str]:
+    t_sent, t_received = packets.times()
+    if not len(t_sent):
+        return
+    here = np.flatnonzero(~np.isnan(t_received))
+    arrived = len(here)
+    passed = int(here[-1]) + 1 if arrived else 0  # what left later may still be on its way
+    text = (
+        f"Of {len(t_sent):,} packets that left the source, {arrived:,} ({_percent(arrived / len(t_sent))}) reached the "
+        f"sink intact, {passed - arrived:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
+        "PHY by the end"
+    )
+    if result.phy.get("airtime_s") and result.config.get("pace") != "flow" and arrived:
+        span = max(result.duration_s, float(np.nanmax(t_received)))
+        used = arrived * result.phy["airtime_s"] / span / result.phy.get("channels", 1)
+        text += f"; those that arrived took {_percent(used)} of the air"
+    yield text + "."
+    wanted, complete, whole = _fragments(packets, passed)
+    if whole and arrived < passed:
+        yield (
+            f"A message had {wanted:.1f} fragments on average and needs every one: of {whole:,} messages that left "
+            f"whole {complete:,} ({_percent(complete / whole)}) arrived complete; had the same share of packets been "
+            f"lost at random, {_percent((arrived / passed) ** wanted)} would have."
+        )
+
+
+def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
+    """Where those in flight were."""
+    left: dict[tuple[int, int], int] = {}
+    for src_id, serial, total in _messages_sent(packets)[0]:
+        left[src_id, serial] = total
+    waiting = under_way = gone = 0
+    counts = Counter(zip(packets.src_id.tolist(), packets.serial.tolist(), strict=True))
+    for messages in trace.messages():
+        for serial in messages.serial[messages.row == IN_FLIGHT].tolist():
+            key = (messages.src_id, serial)
+            sent = counts.get(key, 0)
+            if not sent:
+                waiting += 1
+            elif sent < left[key]:
+                under_way += 1
+            else:
+                gone += 1
+    if waiting + under_way + gone:
+        yield (
+            f"Of the messages in flight at the end, {gone:,} had left the source whole and waited in the PHY or on the "
+            f"air, {under_way:,} had left in part, and {waiting:,} had not left the source's queue."
+        )
+
+
+def _trend(trace: Trace) -> Iterator[str]:
+    """Whether messages waited longer and longer."""
+    t_sent = np.concatenate([m.t_sent[m.delivered] for m in trace.messages()] or [np.empty(0)])
+    t_delivered = np.concatenate([m.t_delivered[m.delivered] for m in trace.messages()] or [np.empty(0)])
+    if len(t_sent) < 10:
+        return
+    latency = (t_delivered - t_sent)[np.argsort(t_delivered, kind="stable")]
+    tenth = len(latency) // 10
+    first, last = float(np.median(latency[:tenth])), float(np.median(latency[-tenth:]))
+    text = (
+        f"The median latency was {_seconds(first)} among the first tenth of the deliveries and {_seconds(last)} among "
+        "the last: "
+    )
+    if first > 0 and last / first > _TREND:
+        yield text + "messages waited longer and longer."
+    elif last > 0 and first / last > _TREND:
+        yield text + "the wait became shorter."
+    else:
+        yield text + "it stayed the same."
+
+
+def _entries_per_message(packets: Packets, topic: str) -> float:
+    totals = packets.total[(packets.topic == topic) & (packets.index == 0)]
+    return float(totals.mean()) if len(totals) else 1.0
+
+
+def _messages_sent(packets: Packets) -> tuple[list[tuple[int, int, int]], Ints, Ints]:
+    """Of every message of which an entry left: (source, serial, total), entries that left, entries that arrived."""
+    real = packets.serial >= 0
+    keys = np.column_stack([packets.src_id[real], packets.serial[real], packets.total[real]])
+    unique, place = np.unique(keys, axis=0, return_inverse=True)
+    place = place.ravel()
+    sent: Ints = np.bincount(place, minlength=len(unique))
+    arrived: Ints = np.bincount(place[~np.isnan(packets.t_received[real])], minlength=len(unique))
+    return [(int(a), int(b), int(c)) for a, b, c in unique], sent, arrived
+
+
+def _fragments(packets: Packets, passed: int) -> tuple[float, int, int]:
+    """Of the messages that left whole within the first packets, so many: mean fragments, how many arrived complete,
+    how many there were."""
+    early = packets.packet < passed
+    keys, sent, arrived = _messages_sent(
+        replace(packets, **{name: values[early] for name, values in vars(packets).items()})
+    )
+    total = np.array([total for _, _, total in keys], dtype=np.int64)
+    whole = sent >= total
+    if not whole.any():
+        return 0.0, 0, 0
+    return float(total[whole].mean()), int((arrived >= total)[whole].sum()), int(whole.sum())
+
+
+def _percent(share: float) -> str:
+    """With as many digits as tell it from 0 and from 100 %."""
+    for digits in range(3):
+        text = f"{share:.{digits}%}"
+        if share in (0, 1) or float(text[:-1]) not in (0, 100):
+            return text
+    return f"{share:.1e}" if share < 0.5 else text
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.1f} s" if abs(value) >= 1 else f"{milliseconds(value)} ms"

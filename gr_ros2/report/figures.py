@@ -1,0 +1,177 @@
+"""The pictures of an experiment: the paper's figure 7 (paths) and figure 6 (latency), the loss ledger; as PNG and SVG.
+
+Laws: figures are objects of their own; nothing of matplotlib's global state is changed, so they can be drawn in any
+thread, with or without a display; a ledger row has the same colour in every picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS, NOT_TAKEN
+
+SENT_EVERY = 50
+"""The paper marks every 50th transmitted message."""
+
+_SENT, _RECEIVED = "#1f5fbf", "#d62728"
+
+COLOURS = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
+    *("#88ccee", "#882255", "#44aa99", "#ddcc77", "#332288", "#aa4499", "#999933", "#661100"),
+)
+"""Of topics and runs in their order; told apart by colour-blind readers as far as sixteen can be."""
+
+_ROW_COLOURS = {
+    DELIVERED: "#2a9d5c",
+    IN_FLIGHT: "#9db8d9",
+    LOST_FRAGMENTS: "#d62728",
+    NOT_TAKEN: "#8c564b",
+    "queue_bound": "#f0a330",
+    "too_large": "#c9a08a",
+    "expired": "#b565a7",
+    "memory": "#7f7f7f",
+    "unsupported": "#17becf",
+    "stale": "#e7cf4f",
+}
+_RASTER_ABOVE = 20_000
+"""Points above which a line is a picture inside the SVG, which otherwise grows without bound."""
+
+
+def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, received_name: str) -> Figure:
+    """Figure 7: the transmitted path in blue with a mark every 50 messages, the received one in red with a mark at
+    every message.
+
+    :param sent: positions (x, y), m, shape (n, 2)
+    :param received: likewise, in the order of reception
+    :param sent_name: topic it was sent on
+    :param received_name: topic it came out on
+    """
+    figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    axes = figure.add_subplot(
+        title="Transmitted and received path", xlabel="x [m]", ylabel="y [m]", aspect="equal", adjustable="datalim"
+    )
+    one, other = (np.asarray(path, dtype=float).reshape(-1, 2) for path in (sent, received))
+    raster = max(len(one), len(other)) > _RASTER_ABOVE
+    axes.plot(*one.T, color=_SENT, linewidth=5, alpha=0.55, label=f"sent {sent_name} ({len(one)})", rasterized=raster)
+    axes.plot(
+        *other.T, color=_RECEIVED, linewidth=0.9, label=f"received {received_name} ({len(other)})", rasterized=raster
+    )
+    # The red line is thin and its marks shrink with their number, so that the blue below stays visible.
+    axes.plot(
+        *other.T,
+        marker="o",
+        linestyle="none",
+        color=_RECEIVED,
+        markersize=4.0 if len(other) < 200 else 1.5,
+        label="each message received",
+        rasterized=raster,
+    )
+    axes.plot(
+        *one[::SENT_EVERY].T,
+        marker="o",
+        linestyle="none",
+        color=_SENT,
+        markersize=6.5,
+        markerfacecolor="none",
+        markeredgewidth=1.5,
+        label=f"every {SENT_EVERY}th message sent",
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="best")
+    return figure
+
+
+def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
+    """Figure 6: the share of delivered messages that took at most so long.
+
+    :param curves: name -> latencies in s, all samples or evenly spaced quantiles; empty ones are left out
+    """
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot(
+        title="End-to-end latency", xlabel="latency [ms]", ylabel="share of delivered messages", ylim=(0, 1.02)
+    )
+    drawn = {name: np.sort(np.asarray(values, dtype=float)) * 1000 for name, values in curves.items() if len(values)}
+    for (name, values), colour in zip(drawn.items(), cycle(COLOURS)):
+        axes.plot(
+            values,
+            np.linspace(0, 1, len(values)) if len(values) > 1 else [1.0],
+            drawstyle="steps-post",
+            marker="o" if len(values) == 1 else "",
+            label=name,
+            color=colour,
+            rasterized=len(values) > _RASTER_ABOVE,
+        )
+    lowest = min((values[0] for values in drawn.values()), default=0.0)
+    highest = max((values[-1] for values in drawn.values()), default=0.0)
+    if lowest > 0 and highest / lowest > 50:
+        axes.set_xscale("log")
+    axes.grid(alpha=0.3)
+    if drawn:
+        axes.legend(fontsize="small", loc="lower right")
+    else:
+        axes.text(0.5, 0.5, "nothing was delivered", ha="center", transform=axes.transAxes)
+    return figure
+
+
+def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
+    """Where the sent messages went, one bar of 100 % per name, one colour per ledger row, with the counts.
+
+    :param ledgers: name -> ledger row -> messages; names without messages are left out
+    """
+    shown = {name: ledger for name, ledger in ledgers.items() if sum(ledger.values())}
+    rows = row_order(shown.values())
+    figure = Figure(figsize=(8.0, 1.5 + 0.42 * max(len(shown), 1)), layout="constrained")
+    axes = figure.add_subplot(title="Where every sent message went", xlabel="share of messages sent [%]", xlim=(0, 100))
+    left = np.zeros(len(shown))
+    places = np.arange(len(shown))
+    sent = np.array([sum(ledger.values()) for ledger in shown.values()], dtype=float)
+    for row in rows:
+        counts = np.array([ledger.get(row, 0) for ledger in shown.values()])
+        width = counts / sent * 100 if shown else left
+        axes.barh(places, width, left=left, height=0.7, color=row_colour(row), label=row.replace("_", " "))
+        for place, start, share, count in zip(places, left, width, counts, strict=True):
+            if share > 1.5 + 1.2 * len(str(count)):  # where the number fits into the bar
+                axes.text(start + share / 2, place, str(count), ha="center", va="center", fontsize=8)
+        left += width
+    axes.set_yticks(places, [f"{name} ({count:.0f})" for name, count in zip(shown, sent, strict=True)], fontsize=8)
+    axes.invert_yaxis()
+    if shown:
+        figure.legend(loc="outside lower center", ncols=min(len(rows), 5), fontsize="small", frameon=False)
+    else:
+        axes.text(50, 0, "nothing was sent", ha="center")
+    return figure
+
+
+def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
+    """The ledger rows that occurred: delivered first, in_flight last, the others by name between them."""
+    found = {row for ledger in ledgers for row, count in ledger.items() if count}
+    return sorted(found, key=lambda row: (row != DELIVERED, row == IN_FLIGHT, row))
+
+
+def row_colour(row: str) -> str:
+    """The colour of a ledger row; of one this version does not know, always the same one."""
+    return _ROW_COLOURS.get(row) or COLOURS[sum(row.encode()) % len(COLOURS)]
+
+
+def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
+    """Write NAME.png and NAME.svg.
+
+    :raises ConfigError: when they cannot be written
+    """
+    paths = [Path(directory) / f"{name}.png", Path(directory) / f"{name}.svg"]
+    try:
+        Path(directory).mkdir(parents=True, exist_ok=True)
+        FigureCanvasAgg(figure).print_figure(paths[0], dpi=150)
+        FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
+    except OSError as error:
+        raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error
+    return paths

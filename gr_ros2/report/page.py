@@ -1,0 +1,315 @@
+"""The report of one or several runs: one HTML file that needs no network, its figures as PNG and SVG, and a table of
+all numbers as CSV and Parquet.
+
+Law: everything comes out of the runs' own files (`result.json` and the tables of :mod:`gr_ros2.record.trace`), so
+that it can be made again at any time; files that contradict each other are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pa_parquet
+import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from gr_ros2 import __version__
+from gr_ros2.errors import ConfigError
+from gr_ros2.record.repetitions import run_folders
+from gr_ros2.record.result import Result, read_result, topic_numbers
+from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv, write_text, write_whole
+from gr_ros2.report.explain import explanation
+from gr_ros2.report.figures import latency_figure, ledger_figure, path_figure, save_figure
+from gr_ros2.report.table import PAPER, Grid, ledger_grid, notes, paper_grid, summary_grid
+from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
+
+REPORT_FILE = "report.html"
+SUMMARY = "summary"
+"""Stem of the table with one line per run and topic."""
+
+_TEMPLATES = Path(__file__).resolve().parent / "templates"
+_LARGEST_SVG = 1_000_000
+"""Bytes; a larger drawing goes into the HTML as PNG."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: where it lies, what to call it, and its files."""
+
+    directory: Path
+    label: str
+    result: Result
+    trace: Trace
+
+    def messages(self) -> list[Messages]:
+        """The messages of every topic on which something was sent, in the order of the result."""
+        order = {(topic.topic, topic.src_id): place for place, topic in enumerate(self.result.topics)}
+        return sorted(self.trace.messages(), key=lambda m: order.get((m.topic, m.src_id), len(order)))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that was written."""
+
+    caption: str
+    png: Path
+    svg: Path
+    wide: bool = False
+
+    def data_uri(self) -> str:
+        """The picture itself, to stand in HTML."""
+        svg = self.svg.stat().st_size <= _LARGEST_SVG
+        kind, path = ("svg+xml", self.svg) if svg else ("png", self.png)
+        return f"data:image/{kind};base64,{b64encode(path.read_bytes()).decode('ascii')}"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page."""
+
+    heading: str = ""
+    lead: str = ""
+    sentences: Sequence[str] = ()
+    grids: Sequence[Grid] = ()
+    pictures: Sequence[Picture] = ()
+    details: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_runs(directories: Iterable[str | Path]) -> list[Run]:
+    """Read run folders; one that holds repetitions counts as those. A run is called after its scenario, or after its
+    folder where that is ambiguous.
+
+    :raises ConfigError: when a folder is missing, or a file of it is missing, damaged or half-written; names it
+    """
+    paths = [folder for directory in directories for folder in run_folders(Path(directory))]
+    found = []
+    for path in paths:
+        if not path.is_dir():
+            raise ConfigError(f"{path}: no such folder; give the folder of a run, with result.json in it")
+        found.append((path, read_result(path), read_trace(path)))
+    twice = [str(path) for path in paths if sum(path.resolve() == other.resolve() for other in paths) > 1]
+    if twice:
+        raise ConfigError(f"{twice[0]}: given twice; give each run once")
+    labels = _labels([(path, result.scenario) for path, result, _ in found])
+    runs = [Run(path, label, result, trace) for (path, result, trace), label in zip(found, labels, strict=True)]
+    for run in runs:
+        _check(run)
+    return runs
+
+
+def write_report(runs: Sequence[Run], out: Path) -> list[Path]:
+    """Write ``report.html``, its figures and the table of all numbers.
+
+    :param out: folder, made if missing; the folder of a single run itself will do
+    :return: the files written, the report first
+    :raises ConfigError: when they cannot be written
+    """
+    several = len(runs) > 1
+    results = [replace(run.result, scenario=run.label) for run in runs]
+    joint = [save(latency_figure(latencies(runs)), out, "latency", _LATENCY)] if several else []
+    sections = [Section(grids=[paper_grid(results), summary_grid(results)], pictures=joint)]
+    sections += [_run_section(run, out, f"{stem(run.label)}_" if several else "", several) for run in runs]
+    title = ", ".join(run.label for run in runs)
+    lead = f"{len(runs)} runs" if several else lead_of(runs[0])
+    return write_page(out / REPORT_FILE, title, lead, sections, runs)
+
+
+def write_page(path: Path, title: str, lead: str, sections: Sequence[Section], runs: Sequence[Run]) -> list[Path]:
+    """Write an HTML page, and the table of all numbers beside it; all files, the page first.
+
+    :raises ConfigError: when it cannot be written
+    """
+    return render_page(path, title, lead, sections, _write_summary(runs, path.parent))
+
+
+def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], tables: Sequence[Path]) -> list[Path]:
+    """Write an HTML page with its pictures inside; all files, the page first.
+
+    :param tables: files with the numbers, already written beside it
+    :raises ConfigError: when it cannot be written
+    """
+    environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = True
+    text = environment.get_template("report.html.j2").render(
+        title=title,
+        lead=lead,
+        sections=sections,
+        paper=PAPER,
+        version=__version__,
+        files=f"Beside it: {', '.join(table.name for table in tables)} with every number.",
+    )
+    write_whole(path, text, write_text)
+    pictures = [file for section in sections for picture in section.pictures for file in (picture.png, picture.svg)]
+    return [path, *tables, *pictures]
+
+
+def save(figure: Figure, out: Path, name: str, caption: str, wide: bool = False) -> Picture:
+    """Write a figure as PNG and SVG.
+
+    :raises ConfigError: when it cannot be written
+    """
+    png, svg = save_figure(figure, out, name)
+    return Picture(caption, png, svg, wide)
+
+
+def latencies(runs: Sequence[Run]) -> dict[str, Sequence[float]]:
+    """Every latency, s, by run and topic; by whichever of them tells the curves apart."""
+    curves = {}
+    for run in runs:
+        topics = run.messages()
+        for m in topics:
+            name = m.topic if len(runs) == 1 else run.label if len(topics) == 1 else f"{run.label} {m.topic}"
+            curves[name] = (m.t_delivered - m.t_sent)[m.delivered]
+    return curves  # type: ignore[return-value]  # arrays are sequences enough
+
+
+def stem(label: str) -> str:
+    """A label as part of a file name."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", label).strip("_.") or "run"
+
+
+def lead_of(run: Run) -> str:
+    """What was run, in one line."""
+    result = run.result
+    parts = [
+        str(result.config.get("description") or result.scenario),
+        f"{result.duration_s:.1f} s",
+        f"seed {result.seed}",
+    ]
+    rate = result.phy.get("sample_rate")
+    parts.append(f"PHY {result.phy.get('name')}" + (f" at {rate:,.0f} samples/s" if rate else ""))
+    if result.interrupted:
+        parts.append("stopped before its end")
+    return " · ".join(parts)
+
+
+_LATENCY = "Figure 6 of the paper: end-to-end latency, share of the delivered messages that took at most so long"
+
+
+def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
+    result = run.result
+    settings = {
+        "All settings": yaml.safe_dump(result.config, sort_keys=False, allow_unicode=True),
+        "All counters": yaml.safe_dump(
+            {"packets": result.packets, "phy": result.phy, **result.counters}, sort_keys=False, allow_unicode=True
+        ),
+    }
+    return Section(
+        heading=run.label if several else "What happened",
+        lead=lead_of(run) if several else "",
+        sentences=[*explanation(result, run.trace), *notes(result)],
+        grids=[ledger_grid(result)],
+        pictures=_draw(run, out, prefix),
+        details=settings,
+    )
+
+
+def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
+    result, trace = run.result, run.trace
+    topics = run.messages()
+    packets = trace.packets()
+    pictures = []
+    for place, path in enumerate(trace.paths()):
+        figure = path_figure(path.sent, path.received, path.topic, path.published_as)
+        stem = "path" if not place else f"path{path.topic.replace('/', '_')}"
+        caption = f"Figure 7 of the paper: the path of {path.topic}, sent and received"
+        pictures.append(save(figure, out, prefix + stem, caption))
+    pictures.append(save(latency_figure(latencies([run])), out, f"{prefix}latency", _LATENCY))
+    pictures.append(
+        save(
+            delivery_figure({m.topic: Deliveries.of([m]) for m in topics}, result.duration_s),
+            out,
+            f"{prefix}delivery",
+            "Share delivered of the messages submitted in an interval, and bytes delivered in it",
+        )
+    )
+    pictures.append(
+        save(
+            age_figure({m.topic: {run.label: m} for m in topics}, {run.label: trace.t_end}),
+            out,
+            f"{prefix}age",
+            "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
+        )
+    )
+    airtime = result.phy.get("airtime_s")
+    if airtime and result.config.get("pace") != "flow":
+        pictures.append(
+            save(
+                airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),
+                out,
+                f"{prefix}airtime",
+                "Airtime of the packets that left the source and of those that arrived",
+            )
+        )
+    pictures.append(
+        save(
+            ledger_figure({topic.topic: topic.ledger for topic in result.topics}),
+            out,
+            f"{prefix}ledger",
+            "The loss ledger: every sent message ends in exactly one row; in brackets how many were sent",
+        )
+    )
+    pictures.append(
+        save(
+            packets_figure(packets, [m.topic for m in topics]),
+            out,
+            f"{prefix}packets",
+            "The first packets: which topics' entries each carries (every other message lighter), when it left, and "
+            "when or whether it arrived",
+            wide=True,
+        )
+    )
+    return pictures
+
+
+def _write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
+    """One line per run and topic with every number of ``result.json``, as CSV and Parquet."""
+    lines: list[dict[str, Any]] = []
+    rows = sorted({row for run in runs for topic in run.result.topics for row in topic.ledger})
+    for run in runs:
+        result = run.result
+        for topic in result.topics:
+            lines.append(
+                {
+                    **{"run": run.label, "scenario": result.scenario, "seed": result.seed},
+                    **{
+                        "duration_s": result.duration_s,
+                        "interrupted": result.interrupted,
+                        "phy": result.phy.get("name"),
+                    },
+                    **topic_numbers(topic, rows),
+                }
+            )
+    table = pa.Table.from_pylist(lines)
+    return [
+        write_whole(out / f"{SUMMARY}.csv", table, write_csv),
+        write_whole(out / f"{SUMMARY}.parquet", table, pa_parquet.write_table),
+    ]
+
+
+def _check(run: Run) -> None:
+    """The trace and the result tell of the same run."""
+    counts: dict[tuple[str, int], Messages] = {(m.topic, m.src_id): m for m in run.trace.messages()}
+    for topic in run.result.topics:
+        messages = counts.get((topic.topic, topic.src_id))
+        sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
+        if (sent, delivered) != (topic.sent, topic.delivered):
+            raise ConfigError(
+                f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "
+                f"result.json says {topic.sent} and {topic.delivered}: not of the same run"
+            )
+
+
+def _labels(runs: Sequence[tuple[Path, str]]) -> list[str]:
+    scenarios = [scenario for _, scenario in runs]
+    if len(set(scenarios)) == len(runs):
+        return scenarios
+    names = [path.resolve().name for path, _ in runs]
+    return names if len(set(names)) == len(runs) else [str(path) for path, _ in runs]

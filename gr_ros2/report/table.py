@@ -1,0 +1,149 @@
+"""Results as tables: the paper's table 6, delivery and latency, and the loss ledger. Returned, never printed.
+
+Law: a number that does not apply shows as a dash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from gr_ros2.record.ledger import DELIVERED
+from gr_ros2.record.result import Result, TopicResult
+
+_DASH = "–"
+PAPER = "the paper"
+"""How the tables call the authors' own run."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table as text, for the terminal and for HTML alike.
+
+    :param texts: so many columns from the left are text, the others numbers
+    :param sections: lines by section
+    """
+
+    title: str
+    headings: tuple[str, ...]
+    sections: tuple[tuple[tuple[str, ...], ...], ...]
+    texts: int = 1
+
+
+PAPER_TABLE_6 = {"ofdm": ("OFDM", 38.0, 1328, 12, 0.01, 228.6), "direct": ("Direct", 15.0, 452, 452, 1.00, 21767.9)}
+"""The paper's table 6 by PHY: config, duration [s], sent, received, PDR, goodput [B/s]."""
+
+_TABLE_6 = ("Duration [s]", "Sent", "Recv", "PDR", "Goodput [B/s]")
+
+
+def summary_grid(results: Sequence[Result]) -> Grid:
+    """One line per topic: config, duration, sent, received, PDR and goodput as in the paper's table 6, and latency."""
+    return Grid(
+        "Delivery and latency",
+        ("Config", "Topic", *_TABLE_6, "p50 [ms]", "p95 [ms]", "p99 [ms]"),
+        tuple(
+            tuple(
+                (
+                    result.scenario,
+                    topic.topic,
+                    *_table_6(result, topic),
+                    *(milliseconds(value) for value in (topic.latency_s.p50, topic.latency_s.p95, topic.latency_s.p99)),
+                )
+                for topic in result.topics
+            )
+            for result in results
+        ),
+        texts=2,
+    )
+
+
+def paper_grid(results: Sequence[Result]) -> Grid:
+    """The paper's table 6 and below each of its lines the odometry of the runs over the same kind of PHY."""
+    sections = []
+    for phy, (config, duration, sent, received, pdr, goodput) in PAPER_TABLE_6.items():
+        theirs = (config, PAPER, f"{duration:.1f}", str(sent), str(received), f"{pdr:.2f}", f"{goodput:.1f}")
+        ours = [
+            (config, result.scenario, *_table_6(result, topic))
+            for result in results
+            for topic in result.topics
+            if result.phy["name"] == phy and topic.type == "nav_msgs/msg/Odometry"
+        ]
+        sections.append((theirs, *ours))
+    return Grid("Table 6 of the paper, and odometry here", ("Config", "Run", *_TABLE_6), tuple(sections), texts=2)
+
+
+def ledger_grid(result: Result) -> Grid:
+    """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
+    rows = [DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
+    rows = list(dict.fromkeys(rows))
+    lines = (
+        (topic.topic, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for topic in result.topics
+    )
+    return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))
+
+
+def as_table(grid: Grid) -> Table:
+    """A grid for the terminal."""
+    # Narrow, so that ten columns fit a terminal of 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, title=grid.title, title_justify="left", pad_edge=False, collapse_padding=True)
+    for place, heading in enumerate(grid.headings):
+        if place < grid.texts:
+            table.add_column(escape(heading), no_wrap=place == 0, overflow="fold")
+        else:
+            table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
+    for section in grid.sections:
+        for line in section:
+            table.add_row(*map(escape, line))
+        table.add_section()
+    return table
+
+
+def summary_table(results: Sequence[Result]) -> Table:
+    """:func:`summary_grid` for the terminal."""
+    return as_table(summary_grid(results))
+
+
+def ledger_table(result: Result) -> Table:
+    """:func:`ledger_grid` for the terminal."""
+    return as_table(ledger_grid(result))
+
+
+def notes(result: Result) -> list[str]:
+    """What a reader of the tables must not miss, one line each: often nothing."""
+    lines = [f"{topic.topic}: {topic.corrupt} messages arrived altered" for topic in result.topics if topic.corrupt]
+    lines += [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
+    if result.interrupted:
+        lines.append(f"stopped after {result.duration_s:.1f} s")
+    return lines
+
+
+def _path_note(topic: TopicResult) -> str:
+    rms = number(topic.rms_error_m, "{:.3f} m")
+    return f"{topic.topic}: path error {topic.path_error_m:.3f} m along the path, RMS {rms} at equal times"
+
+
+def _table_6(result: Result, topic: TopicResult) -> tuple[str, ...]:
+    return (
+        f"{result.duration_s:.1f}",
+        str(topic.sent),
+        str(topic.delivered),
+        number(topic.pdr, "{:.2f}"),
+        number(topic.goodput_Bps, "{:.1f}"),
+    )
+
+
+def milliseconds(seconds: float | None) -> str:
+    """ms with three digits."""
+    if seconds is None:
+        return _DASH
+    value = seconds * 1000
+    return f"{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f}"
+
+
+def number(value: float | None, form: str) -> str:
+    """The value, or a dash where there is none."""
+    return _DASH if value is None else form.format(value)

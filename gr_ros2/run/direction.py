@@ -1,0 +1,135 @@
+"""One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph.
+
+Laws: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
+stack it was entered on.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.ends import own_settings
+from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.middleware.bag_files import bag_topics
+from gr_ros2.phy import Phy
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.registry import Registry
+from gr_ros2.run.load import source_names
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.watch import EventSink
+
+_QUIET_S = 0.3
+"""A PHY that has given no packet for so long, with nothing waiting, is empty."""
+
+
+def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) -> Middleware:
+    """A participant of its own on the graph of one end of the link.
+
+    :param node: what it is called there, after ``gr_ros2_``
+    """
+    settings: dict[str, Any] = {"domain_id": end.domain_id, "node_name": f"gr_ros2_{node}"}
+    if end.middleware == "dds":
+        settings["localhost_only"] = scenario.localhost_only
+    graph: Middleware = MIDDLEWARE.load(end.middleware)(**settings)
+    return graph
+
+
+class Direction:
+    """Both blocks and the link between them, ready to start.
+
+    :param scenario: a one-way scenario, see :meth:`Scenario.directions`
+    :param ears: hears the events of both blocks
+    :param stack: closes what is opened here
+    :param instrumented: see :class:`LoopbackLink`
+    :ivar topics: topic id of every topic the source subscribes, by absolute name
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        registry: Registry,
+        phy: Phy,
+        *,
+        ears: EventSink,
+        stack: ExitStack,
+        instrumented: bool = False,
+    ) -> None:
+        self.scenario = scenario
+        self.registry = registry
+        self.src_id = scenario.ros_source.src_id()
+        self.topics = source_names(scenario, registry)
+        self.input = stack.enter_context(self._input_graph())
+        self.output = stack.enter_context(open_graph(scenario, scenario.ros_sink, "sink"))
+        # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
+        backpressure = scenario.ros_source.backpressure or (
+            isinstance(self.input, BagMiddleware) and self.input.speed == 0
+        )
+        self.source = RosSource(
+            registry,
+            middleware=self.input,
+            observer=partial(ears.sender_event, self.src_id),
+            seed=scenario.seed,
+            **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
+        )
+        stack.callback(self.source.close)
+        self.sink = RosSink(
+            registry,
+            middleware=self.output,
+            observer=lambda event: ears.receiver_event(event, time.monotonic()),
+            packet_observer=lambda data: ears.packet_received(data, time.monotonic()),
+            **own_settings(scenario.ros_sink),
+        )
+        stack.callback(self.sink.close)
+        self.sink.announce(self.src_id, self.topics.values())
+        self.link = LoopbackLink(
+            phy,
+            self.source,
+            self.sink,
+            channel=scenario.channel,
+            pace=scenario.pace,
+            paced=scenario.paced,
+            instrumented=instrumented,
+        )
+        stack.callback(self.link.stop)
+
+    def output_topics(self) -> dict[str, str]:
+        """Name and type of every topic at the sink, in the order of ``topics``."""
+        format_ = self.scenario.ros_sink.namespace_format
+        rows = [self.registry[topic_id] for topic_id in self.topics.values()]
+        return {topic.republished(format_, self.src_id): topic.type_name for topic in rows}
+
+    def empty(self, unresolved: bool) -> bool:
+        """Whether nothing is left at the source, at the gate or in the PHY.
+
+        :param unresolved: there are messages whose fate is open, so it is worth waiting a moment for the PHY
+        """
+        counts = self.link.counts()
+        if not self.source.idle or counts.backlog or counts.transmitted < counts.passed:
+            return False
+        time.sleep(_QUIET_S if unresolved else 0)
+        return self.link.counts() == counts
+
+    def counters(self) -> dict[str, Any]:
+        """What each part counted; ``channel``: packets it lost on purpose, by setting."""
+        return {
+            "source": self.source.stats(),
+            "sink": self.sink.stats(),
+            "channel": dict(self.link.counts().losses),
+        }
+
+    def _input_graph(self) -> Middleware:
+        path = self.scenario.bag_path
+        if path is None:
+            return open_graph(self.scenario, self.scenario.ros_source, "source")
+        found = [info.topic for info in bag_topics(path)]
+        if not set(found) & set(self.topics):
+            raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
+        return BagMiddleware(path=path, speed=self.scenario.bag_speed)

@@ -1,0 +1,99 @@
+"""How much a scenario offers to its link, and the sample rate that carries it.
+
+Law: the offered load counts every message as if it travelled alone, so it is never below what the link will see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gr_ros2.config import replaced
+from gr_ros2.errors import ConfigError
+from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.registry import Registry
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.wire import Format
+
+_SAMPLE_S = 2.0
+"""Simulated seconds that are generated to learn message sizes; sizes hardly vary."""
+
+
+def make_phy(scenario: Scenario, registry: Registry) -> Phy:
+    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
+
+    :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
+    """
+    cls = PHY.load(scenario.phy.name)
+    rate = scenario.phy.sample_rate
+    if not rate and cls.has_samples:
+        at_1_hz: Phy = cls(scenario.packet_len, 1.0, **scenario.phy.options)
+        rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
+    phy: Phy = cls(scenario.packet_len, rate, **scenario.phy.options)
+    phy.check_channel(scenario.channel)
+    return phy
+
+
+def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
+    """The PHY of every direction of a scenario, all at one sample rate: the highest that any of them asks for.
+
+    :raises ConfigError: see :func:`make_phy`
+    """
+    phys = [make_phy(way, registry) for way in directions]
+    rate = max(phy.sample_rate for phy in phys)
+    at_rate = (replace(way, phy=replaced(way.phy, sample_rate=rate)) for way in directions)
+    return [phy if phy.sample_rate == rate else make_phy(way, registry) for phy, way in zip(phys, at_rate, strict=True)]
+
+
+def offered_packets(scenario: Scenario, registry: Registry) -> float:
+    """Packets/s the source needs if every message travels alone.
+
+    :raises ConfigError: when the source offers nothing on the registered topics
+    """
+    packets, seconds = _bag_load(scenario, registry) if scenario.bag_path is not None else _sim_load(scenario, registry)
+    if packets == 0:
+        raise ConfigError(f"{scenario.source}: nothing on the registered topics; set phy.sample_rate, or other topics")
+    return packets / seconds
+
+
+def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
+    """Topic ids of the topics the source subscribes, by their absolute names."""
+    chosen = [registry.named(name) for name in scenario.ros_source.topics] or list(registry)
+    return {topic.on_graph(scenario.ros_source.namespace): topic.topic_id for topic in chosen}
+
+
+def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
+    names = source_names(scenario, registry)
+    duration = min(_SAMPLE_S, scenario.duration_s)
+    sizes = {
+        message.topic: len(message.payload)
+        for message in Fleet(scenario.sim).messages(duration)
+        if message.topic in names
+    }
+    rates = Fleet(scenario.sim).rates()
+    packets = 0.0
+    for topic, size in sizes.items():
+        rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
+        alone = _packets_alone(size, scenario.packet_len, scenario.ros_source.wire_format)
+        packets += alone * (rate or 1 / scenario.duration_s)
+    return packets, 1.0
+
+
+def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
+    assert scenario.bag_path is not None
+    packets, first, last = 0, 0, 0
+    for message in read_bag(scenario.bag_path, source_names(scenario, registry)):
+        packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
+        first = first or message.stamp_ns
+        last = message.stamp_ns
+        if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
+            break
+    seconds = (last - first) * 1e-9 / (scenario.bag_speed or 1)
+    return packets, seconds or 1.0
+
+
+def _packets_alone(size: int, packet_len: int, wire: Format) -> int:
+    """Packets that a message of this size needs alone; one too large for the link needs none."""
+    return max(-(-size // wire.single_entry_payload(packet_len)), 1) if size <= wire.largest_message(packet_len) else 0

@@ -1,0 +1,49 @@
+"""What a run gives back and tells on its way, however its time passes.
+
+Law: nothing here depends on how a run is made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from gr_ros2.phy import Phy
+from gr_ros2.record.recorder import Recorder
+from gr_ros2.record.result import Result
+from gr_ros2.record.trace import Trace
+
+DELIVERED_BAG = "delivered"
+"""Folder of the bag with what came out on the receiving graphs."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is: s since it began, s it takes (0 = until the bag ends), messages sent and delivered."""
+
+    elapsed_s: float
+    duration_s: float
+    sent: int
+    delivered: int
+
+
+@dataclass
+class Outcome:
+    """The result, and what happened message by message."""
+
+    result: Result
+    trace: Trace
+
+
+def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:
+    """``phy`` of a result, once the recorder has finished.
+
+    :param channels: one per direction
+    """
+    return {
+        "name": phy.name,
+        "channels": channels,
+        "sample_rate": phy.sample_rate if phy.has_samples else None,
+        "airtime_samples": phy.airtime_samples() if phy.has_samples else None,
+        **recorder.airtime(phy.airtime() if phy.has_samples else None),
+    }

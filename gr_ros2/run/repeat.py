@@ -1,0 +1,26 @@
+"""One scenario several times, with other seeds each time: repetition k, from 0, has every seed k higher."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from gr_ros2.config import ChannelConfig, replaced
+from gr_ros2.run.scenario import Scenario
+
+
+def repetitions(scenario: Scenario) -> Iterator[Scenario]:
+    """The scenario once per repetition, each with its own seeds."""
+    for k in range(scenario.repetitions):
+        yield replace(_reseeded(scenario, k), repetitions=1)
+
+
+def _reseeded(scenario: Scenario, k: int) -> Scenario:
+    """The same with every seed so much higher."""
+    sim, channel = replaced(scenario.sim, seed=scenario.sim.seed + k), _reseeded_channel(scenario.channel, k)
+    back = scenario.back and replace(scenario.back, channel=_reseeded_channel(scenario.back.channel, k))
+    return replace(scenario, seed=scenario.seed + k, sim=sim, channel=channel, back=back)
+
+
+def _reseeded_channel(channel: ChannelConfig, k: int) -> ChannelConfig:
+    return replaced(channel, seed=channel.seed + k)

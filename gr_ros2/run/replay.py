@@ -1,0 +1,140 @@
+"""A recording through a link and a channel into a recording: what it would have looked like at the other end.
+
+Laws: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types, type
+definitions, offered QoS and payloads (with them header stamps) are those of the original; the file appears whole or
+not at all.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from gr_ros2.config import TopicOptions, replaced
+from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.middleware.bag_files import bag_definitions, bag_topics
+from gr_ros2.middleware.base import TopicInfo
+from gr_ros2.registry import MAX_TOPICS, Registry
+from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
+from gr_ros2.run.load import source_names
+from gr_ros2.run.outcome import Outcome, Progress
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.simulated import run_simulated
+
+_STORAGES: dict[str, Literal["mcap", "sqlite3"]] = {".mcap": "mcap", ".db3": "sqlite3"}
+"""Of a bare file, by its suffix; anything else is a bag folder."""
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What a replay did.
+
+    :param carried, left_out: topics of the original
+    """
+
+    outcome: Outcome
+    carried: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def replay(
+    source: Path,
+    target: Path,
+    scenario: Scenario,
+    topics: Sequence[str] = (),
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Replayed:
+    """Send a recording through a scenario's link and keep what comes out.
+
+    The scenario's registry says which topics are carried. Where it has none of the recording's, or ``topics`` are
+    named, the registry is made of the recording.
+
+    :param source: bag folder, ``.mcap`` or ``.db3`` file
+    :param target: ``.mcap`` or ``.db3`` file, otherwise a bag folder (MCAP); must not exist
+    :param scenario: its own source plays no part; ``time`` real becomes samples
+    :param topics: absolute names; () = as the registry says
+    :raises BagError: when ``source`` cannot be read, or ``target`` exists or cannot be written
+    :raises ConfigError: for a topic the recording has not, for too many of them, or a wrong scenario
+    """
+    if target.exists():
+        raise BagError(f"{target}: exists already; choose another name or remove it")
+    recorded = {info.topic: info for info in bag_topics(source)}
+    scenario = replace(
+        scenario, source=f"bag:{source}", bag_speed=1.0, time="samples" if scenario.time == "real" else scenario.time
+    )
+    registry = scenario.load_registry()
+    names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in recorded}
+    if topics or not names:
+        scenario, registry = _made_for(scenario, registry, recorded, topics, source)
+        names = source_names(scenario, registry)
+    else:
+        carried = tuple(registry[topic_id].name for topic_id in names.values())
+        scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
+    _check_types(names, registry, recorded, source)
+    src_id = scenario.ros_source.src_id()
+    with _bag_at(target, bag_origin_ns(scenario, names), bag_definitions(source)) as bag:
+        bag.add_source(
+            src_id,
+            registry,
+            {topic_id: name for name, topic_id in names.items()},
+            {topic_id: recorded[name].publishers[0] for name, topic_id in names.items()},
+        )
+        outcome = run_simulated(scenario, None, on_progress, registry=registry, bag=bag)
+    return Replayed(outcome, tuple(names), tuple(name for name in recorded if name not in names))
+
+
+def _made_for(
+    scenario: Scenario, registry: Registry, recorded: Mapping[str, TopicInfo], topics: Sequence[str], source: Path
+) -> tuple[Scenario, Registry]:
+    """The scenario with a registry made of the recording; options of topics that both have are kept."""
+    unknown = [name for name in topics if name not in recorded]
+    if unknown:
+        raise ConfigError(f"topics = {unknown[0]!r}: {source} has {', '.join(recorded) or 'no topics'}")
+    rows = {name: recorded[name].type_name for name in topics or recorded}
+    if not rows:
+        raise ConfigError(f"{source}: has no topics")
+    if len(rows) > MAX_TOPICS:
+        raise ConfigError(
+            f"{source}: has {len(rows)} topics, and a link carries {MAX_TOPICS}; choose with --topics from "
+            f"{', '.join(recorded)}"
+        )
+    names = {name: registry[topic_id].name for name, topic_id in source_names(scenario, registry).items()}
+
+    def options(given: Mapping[str, TopicOptions]) -> dict[str, TopicOptions]:
+        by_name = {name.lstrip("/"): value for name, value in given.items()}
+        return {name: by_name[row.lstrip("/")] for name, row in names.items() if name in rows and row in by_name}
+
+    there, back = scenario.ros_source, scenario.ros_sink
+    scenario = replace(
+        scenario,
+        ros_source=replaced(there, topics=(), topic_options=options(there.topic_options)),
+        ros_sink=replaced(back, topic_options=options(back.topic_options)),
+    )
+    return scenario, Registry.from_rows(rows)
+
+
+def _check_types(names: Mapping[str, int], registry: Registry, recorded: Mapping[str, TopicInfo], source: Path) -> None:
+    for name, topic_id in names.items():
+        if recorded[name].type_name != registry[topic_id].type_name:
+            raise ConfigError(
+                f"{source}: {name} is {recorded[name].type_name}, in the registry {registry[topic_id].type_name}; "
+                "choose with --topics, which takes the recording's"
+            )
+
+
+@contextmanager
+def _bag_at(target: Path, origin_ns: int, definitions: Mapping[str, str]) -> Iterator[DeliveredBag]:
+    """A bag that is at ``target`` when the block ends well, and nowhere otherwise."""
+    storage = _STORAGES.get(target.suffix)
+    folder = target if storage is None else target.with_name(f".{target.name}.part")
+    if folder != target:
+        shutil.rmtree(folder, ignore_errors=True)
+    with DeliveredBag(folder, origin_ns, storage or "mcap", definitions) as bag:
+        yield bag
+    if storage is not None:
+        next(folder.glob(f"*{target.suffix}")).replace(target)
+        shutil.rmtree(folder)

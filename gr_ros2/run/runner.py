@@ -1,0 +1,302 @@
+"""Runs one scenario: one direction or two, watched by a Recorder.
+
+Laws: everything started is stopped in reverse order whatever happens; a run that is interrupted still closes its books
+and writes its result.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
+from gr_ros2.middleware import Middleware, Qos
+from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.record.recorder import Recorder
+from gr_ros2.record.repetitions import repetition_folder, write_repetitions
+from gr_ros2.record.result import RESULT_FILE, Result, write_result
+from gr_ros2.record.trace import write_trace, write_whole
+from gr_ros2.run.direction import Direction, open_graph
+from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.repeat import repetitions
+from gr_ros2.run.scenario import Scenario, dump
+from gr_ros2.run.simulated import run_simulated
+from gr_ros2.run.watch import Fanout, LiveRun, Watcher
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.publisher import SimPublisher
+
+__all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
+
+REGISTRY_FILE = "registry.csv"
+"""The run's registry as it was, for who looks at its packets."""
+
+_MATCH_S = 20.0
+_POLL_S = 0.05
+
+
+class Listener:
+    """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
+
+    :param graphs: name and type of the topics to hear, by graph
+    """
+
+    def __init__(self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path) -> None:
+        self.received: Counter[str] = Counter()
+        self._bag = BagMiddleware(path=bag, mode="write")
+        self._publishers = {
+            name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
+        }
+        self._subscriptions = [
+            graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
+            for graph, topics in graphs.items()
+            for name, kind in topics.items()
+        ]
+
+    def _take(self, name: str, payload: bytes) -> None:
+        self._publishers[name].publish(payload)
+        self.received[name] += 1
+
+    def matched(self) -> bool:
+        """Whether every topic has found its publisher."""
+        return all(subscription.matched() for subscription in self._subscriptions)
+
+    def close(self) -> None:
+        """Stop listening and finish the bag."""
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._bag.close()
+
+
+def run_scenario(
+    scenario: Scenario,
+    out: Path | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    watchers: Sequence[Watcher] = (),
+) -> Outcome:
+    """Run a scenario to its end, or until KeyboardInterrupt.
+
+    :param out: folder for ``result.json``, the tables of the trace, the registry and the bag of delivered messages,
+        made if missing; None writes nothing
+    :param on_progress: called about 20 times a second
+    :param watchers: onlookers; where one has ``instruments``, the link is built so that its channel can be changed and
+        its signal seen
+    :raises ConfigError: when the scenario cannot be set up
+    :raises RunError: when it fails under way
+    """
+    if out is not None and (out / DELIVERED_BAG).exists():
+        raise ConfigError(f"{out}: holds a run already; choose another folder")
+    outcome: Outcome | None = None
+    try:
+        if scenario.time == "real":
+            with ExitStack() as stack:
+                outcome = _Run(scenario, out, stack, watchers).execute(on_progress)
+        else:
+            outcome = run_simulated(scenario, out, on_progress, watchers)
+    finally:
+        for watcher in watchers:
+            watcher.run_ended(None if outcome is None else outcome.result)
+    if out is not None:
+        write_trace(outcome.trace, out)
+        write_whole(out / REGISTRY_FILE, scenario.registry, copyfile)
+        write_result(outcome.result, out / RESULT_FILE)
+    return outcome
+
+
+def run_repetitions(
+    scenario: Scenario,
+    out: Path,
+    on_start: Callable[[], Callable[[Progress], None] | None] = lambda: None,
+    watchers: Sequence[Watcher] = (),
+) -> list[Result]:
+    """Run every repetition of a scenario, until KeyboardInterrupt at the latest, each into a folder of its own.
+
+    :param out: folder for ``rep-0``, ``rep-1``, ... and ``repetitions.json``, made if missing
+    :param on_start: called before each run for its ``on_progress``
+    :param watchers: see :func:`run_scenario`
+    :return: the results of the runs that came to their end
+    :raises ConfigError: when the scenario cannot be set up, or a run is there already
+    :raises RunError: when a run fails under way
+    """
+    results: list[Result] = []
+    for k, one in enumerate(repetitions(scenario)):
+        try:
+            result = run_scenario(one, repetition_folder(out, k), on_start(), watchers).result
+        except KeyboardInterrupt:  # between two runs: the same as during one
+            break
+        if result.interrupted:
+            break
+        results.append(result)
+        write_repetitions(results, out)  # each time, so that runs are kept together whatever happens to the next
+    return results
+
+
+class _Run:
+    def __init__(
+        self, scenario: Scenario, out: Path | None, stack: ExitStack, watchers: Sequence[Watcher] = ()
+    ) -> None:
+        self.scenario = scenario
+        self.registry = scenario.load_registry()
+        ways = scenario.directions()
+        phys = make_phys(ways, self.registry)
+        self.phy = phys[0]
+        namespaces = {way.ros_source.src_id(): way.ros_source.namespace for way in ways}
+        topics = {way.ros_source.src_id(): source_names(way, self.registry).values() for way in ways}
+        self.recorder = Recorder(self.registry, namespaces, topics)
+        self.interrupted = False
+        self.listener: Listener | None = None
+        self.sim: SimPublisher | None = None
+        try:
+            ears = Fanout([self.recorder, *watchers])
+            instrumented = any(watcher.instruments for watcher in watchers)
+            self.directions = [
+                Direction(way, self.registry, phy, ears=ears, stack=stack, instrumented=instrumented)
+                for way, phy in zip(ways, phys, strict=True)
+            ]
+            if out is not None:
+                out.mkdir(parents=True, exist_ok=True)
+                self.listener = self._listen(out, stack)
+            for watcher in watchers:
+                watcher.run_started(self._live())
+            if scenario.bag_path is None:
+                self.sim = SimPublisher(Fleet(scenario.sim), self._robots(stack), scenario.duration_s)
+                stack.callback(self.sim.close)
+        except MiddlewareError as error:
+            raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
+
+    def _live(self) -> LiveRun:
+        return LiveRun(
+            name=self.scenario.name,
+            duration_s=self.scenario.duration_s,
+            packet_len=self.scenario.packet_len,
+            registry=self.registry,
+            topics={(way.src_id, topic_id): name for way in self.directions for name, topic_id in way.topics.items()},
+            sources={way.src_id: way.source for way in self.directions},
+            links=[way.link for way in self.directions],
+            ledger=self.recorder.ledger,
+        )
+
+    def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
+        """The graph of every simulated robot: its source's, or else the one at the other end of the link."""
+        ids = range(1, self.scenario.sim.robots + 1)
+        robots = dict.fromkeys(ids, self.directions[0].output)
+        for way in self.directions:
+            if way.src_id in robots:
+                end = way.scenario.ros_source
+                robots[way.src_id] = stack.enter_context(open_graph(self.scenario, end, f"robot_{way.src_id}"))
+        return robots
+
+    def _listen(self, out: Path, stack: ExitStack) -> Listener:
+        graphs = {
+            stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
+            for way in self.directions
+        }
+        listener = Listener(graphs, out / DELIVERED_BAG)
+        stack.callback(listener.close)
+        return listener
+
+    def execute(self, on_progress: Callable[[Progress], None] | None) -> Outcome:
+        scenario = self.scenario
+        wall = begin = end = time.monotonic()
+        try:
+            for way in self.directions:
+                way.link.start()
+            self._wait_matched()
+            begin = end = time.monotonic()
+            for way in self.directions:
+                way.link.run_began(begin)
+            (self.sim or self.directions[0].input).start()
+            while not self._submitted(begin):
+                time.sleep(_POLL_S)
+                self._report(on_progress, begin)
+            end = time.monotonic()
+            if self.sim is not None:
+                self.sim.stop()
+            self._drain(on_progress, begin)
+        except KeyboardInterrupt:
+            self.interrupted = True
+            end = time.monotonic()
+        except MiddlewareError as error:
+            raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
+        drained = not self.interrupted and self._empty()
+        for way in self.directions:
+            way.link.stop()
+        played = end - begin
+        if scenario.duration_s and not self.interrupted:
+            played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
+        topics = self.recorder.finish(played, end, drained)
+        result = Result(
+            scenario=scenario.name,
+            seed=scenario.seed,
+            duration_s=played,
+            config=dump(scenario),
+            topics=topics,
+            packets=self.recorder.ledger.packets(),
+            phy=phy_numbers(self.phy, len(self.directions), self.recorder),
+            wall_s=time.monotonic() - wall,
+            interrupted=self.interrupted,
+            counters=self._counters(),
+        )
+        names = {
+            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
+        }
+        return Outcome(result, self.recorder.trace(begin, end, names))
+
+    def _wait_matched(self) -> None:
+        """Wait until every end of both graphs has found the other, so that no message goes unheard."""
+        limit = time.monotonic() + _MATCH_S
+        while time.monotonic() < limit:
+            heard = self.listener is None or self.listener.matched()
+            if heard and (self.sim is None or self._sim_matched(self.sim)):
+                return
+            time.sleep(_POLL_S)
+        raise RunError(
+            f"{self.scenario.name}: publishers and subscribers did not find each other within {_MATCH_S:g} s; "
+            "is the loopback interface up, and the domain free?"
+        )
+
+    def _sim_matched(self, sim: SimPublisher) -> bool:
+        wanted = [name for way in self.directions for name in way.topics if name in sim.publishers]
+        return all(sim.publishers[name].matched() for name in wanted) and all(
+            way.source.matched for way in self.directions
+        )
+
+    def _submitted(self, begin: float) -> bool:
+        if self.sim is not None:
+            return self.sim.finished
+        bag = self.directions[0].input
+        assert isinstance(bag, BagMiddleware)
+        if bag.error is not None:
+            raise bag.error
+        over = bool(self.scenario.duration_s) and time.monotonic() - begin >= self.scenario.duration_s
+        return bag.finished or over
+
+    def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
+        """Let the link deliver what it holds, for at most ``drain_s`` without news in pace `flow`."""
+        limit = time.monotonic() + self.scenario.drain_s
+        before = (0, 0)
+        while time.monotonic() < limit and self.recorder.ledger.unresolved():
+            time.sleep(_POLL_S)
+            self._report(on_progress, begin)
+            if self.scenario.pace == "flow" and (now := self.recorder.progress()) != before:
+                before, limit = now, time.monotonic() + self.scenario.drain_s
+
+    def _empty(self) -> bool:
+        """Whether nothing is left in any direction."""
+        return all(way.empty(bool(self.recorder.ledger.unresolved())) for way in self.directions)
+
+    def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
+        if on_progress is not None:
+            sent, delivered = self.recorder.progress()
+            on_progress(Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered))
+
+    def _counters(self) -> dict[str, Any]:
+        there, *back = (way.counters() for way in self.directions)
+        heard = {} if self.listener is None else dict(self.listener.received)
+        return {**there, **({"back": back[0]} if back else {}), "listener": heard}

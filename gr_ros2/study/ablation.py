@@ -1,0 +1,112 @@
+"""What each part of a link is worth: a scenario as it is, and again with one part switched off at a time.
+
+Laws: a variant differs from the scenario in the settings of one part and in nothing else, so the same messages meet the
+same radio; a part that is off in the scenario has no variant; the settings are those that `--set` takes, so any variant
+can be run by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.link.queues import queue_for
+from gr_ros2.record.result import Result
+from gr_ros2.report.page import Run, read_runs
+from gr_ros2.report.table import Grid, milliseconds, number
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import Scenario, load_scenario
+
+WHOLE = "whole"
+"""Folder, and name in tables, of the scenario as it is."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The scenario with one part off.
+
+    :param name: folder, and name in tables
+    :param settings: `key=value`, as `--set` takes them
+    """
+
+    name: str
+    settings: tuple[str, ...] = ()
+
+
+def variants(scenario: Scenario) -> list[Variant]:
+    """The scenario itself, then without each part that it has.
+
+    :raises ConfigError: for a scenario that has none of them on
+    """
+    source = scenario.ros_source
+    found = [Variant(WHOLE)]
+    if source.compression:
+        found.append(Variant("no-compression", ("ros_source.compression=false", "ros_sink.compression=false")))
+    if scenario.paced:
+        found.append(Variant("no-pull", ("paced=false",)))
+    if source.scheduler == "freshness":
+        found.append(Variant("no-freshness", ("ros_source.scheduler=paper",)))
+    registry = scenario.load_registry().with_options(source.topic_options)
+    latest = [topic.name for topic in registry if queue_for(topic.options)[0] == "latest"]
+    if latest:
+        found.append(Variant("no-latest", tuple(f"ros_source.topic_options.{name}.queue=fifo" for name in latest)))
+    if len(found) == 1:
+        raise ConfigError(
+            f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, freshness or queue latest"
+        )
+    return found
+
+
+def run_variants(
+    name: str,
+    out: Path,
+    overrides: Sequence[str] = (),
+    on_run: Callable[[Variant], None] = lambda _: None,
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+) -> list[Run]:
+    """Run a scenario and its variants one after the other, each into its own folder.
+
+    :param name: as `load_scenario` takes it, likewise ``overrides``, ``seed`` and ``duration_s``
+    :param out: folder of the folders
+    :param on_run: called before each run
+    :raises ConfigError: when a scenario cannot be set up, or has nothing to switch off
+    :raises RunError: when a run fails
+    :raises KeyboardInterrupt: when one is interrupted; what ran before stays
+    """
+    chosen = variants(load_scenario(name, overrides, seed=seed, duration_s=duration_s))
+    for variant in chosen:
+        on_run(variant)
+        settings = [*overrides, *variant.settings]
+        scenario = load_scenario(name, settings, seed=seed, duration_s=duration_s)
+        if run_scenario(scenario, out / variant.name).result.interrupted:
+            raise KeyboardInterrupt
+    return [replace(run, label=run.directory.name) for run in read_runs([out / variant.name for variant in chosen])]
+
+
+def worth_grid(runs: Sequence[Run]) -> Grid:
+    """Per topic what reaches the far end and how old it is there, a column per run; at last what a message costs."""
+    sections = []
+    for index, topic in enumerate(runs[0].result.topics):
+        found = [(run.result, run.result.topics[index]) for run in runs]
+        lines = {
+            "messages/s": [f"{one.delivered / result.duration_s:.2f}" for result, one in found],
+            "PDR": [number(one.pdr, "{:.2f}") for _, one in found],
+            "mean age [ms]": [milliseconds(one.age_s.mean) for _, one in found],
+            "latency p99 [ms]": [milliseconds(one.latency_s.p99) for _, one in found],
+        }
+        sections.append(tuple((topic.topic, what, *values) for what, values in lines.items()))
+    cost = tuple(number(air_bytes(run.result), "{:.0f}") for run in runs)
+    sections.append((("link", "air bytes per message", *cost),))
+    headings = ("Topic", "Number", *(run.label for run in runs))
+    return Grid("What each part is worth", headings, tuple(sections), texts=2)
+
+
+def air_bytes(result: Result) -> float | None:
+    """Packet bytes that left the source, PAD and headers included, per message delivered; None without any."""
+    delivered = sum(topic.delivered for topic in result.topics)
+    packet_len: int = result.config["packet_len"]
+    return result.packets["sent"] * packet_len / delivered if delivered else None

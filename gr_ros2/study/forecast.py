@@ -1,0 +1,296 @@
+"""Does this traffic fit this radio? A forecast from a simulation of the link, and what would make it better.
+
+Laws: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its entries
+by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is based on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gr_ros2.config import replaced
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr.ends import message_codec
+from gr_ros2.link import SentPacket
+from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.freshness import TURN
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.record.result import TopicResult
+from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.simulate import offered, simulate
+from gr_ros2.wire import decode
+
+TRIAL_S = 10.0
+"""s of traffic on which changes are tried."""
+OVERHEAD_S = 0.0025
+"""s that middleware, Python and the OFDM receiver add to the airtime of a message, as measured on two idle cores."""
+_WALL_S = 1.7e9
+"""s since 1970, of some day: a plan is the same on every day."""
+_MARGIN = 1.5
+"""A proposed ``reassembly_timeout`` beside the longest pause: what a lost packet and a busy computer add."""
+_PARTS = (1, 2, 3)
+"""Packets per message that packet lengths are tried for."""
+_BETTER = 0.97
+"""Weighted age, beside what it is now, from which a change is worth proposing."""
+_LIGHTER = 0.95
+"""The same for the airtime used, where the age stays as it is."""
+
+
+@dataclass(frozen=True)
+class TopicForecast:
+    """One topic.
+
+    :param offered_hz: messages/s given to the source
+    :param message_bytes: mean, serialized
+    :param air_bytes: mean per message on the air, coded where the link compresses, without headers
+    :param load: airtime that all of its messages would take at what those sent have cost, 1 = all there is
+    :param share: airtime of what left the source, likewise; unpaced, more may leave than the air takes
+    :param rate_hz: messages/s delivered
+    """
+
+    topic: str
+    offered_hz: float
+    message_bytes: float
+    air_bytes: float
+    load: float
+    share: float
+    rate_hz: float
+    result: TopicResult
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a scenario will do.
+
+    :param airtime_s: of one packet
+    :param capacity: packets/s the radio carries
+    :param used: part of the airtime that is used, 0..1
+    :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
+    :param pad: part of the packets' bytes that is PAD
+    :param pause_s: s that may lie between two fragments of a message while others go first; 0 where each has only one
+    """
+
+    packet_len: int
+    airtime_s: float
+    capacity: float
+    used: float
+    air_bytes_per_message: float | None
+    pad: float
+    pause_s: float
+    topics: tuple[TopicForecast, ...]
+
+    @property
+    def load(self) -> float:
+        """Airtime that all messages would take, 1 = all there is; above 1 they do not fit."""
+        return sum(topic.load for topic in self.topics)
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A change of settings, as one would write it, and what it would bring."""
+
+    setting: str
+    forecast: Forecast
+
+
+class Planner:
+    """Forecasts for one scenario and variants of it, on the same messages.
+
+    :raises ConfigError: for a PHY that takes no airtime, or a scenario that cannot be set up
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        if not PHY.load(scenario.phy.name).has_samples:
+            raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
+        if scenario.time == "real":
+            # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
+            scenario = replace(scenario, sim=replaced(scenario.sim, start_time=_WALL_S))
+        self.scenario = scenario
+        self.registry = scenario.load_registry()
+        self.phy = make_phy(scenario, self.registry)
+        self._messages = list(offered(scenario, self.registry))
+        if not self._messages:
+            raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
+        self._remembering: _Remembering | None = None
+
+    def forecast(self) -> Forecast:
+        """The scenario as it is."""
+        return self._forecast(self.scenario)
+
+    def reassembly_timeout(self, forecast: Forecast) -> float | None:
+        """The sink's ``reassembly_timeout`` that this traffic needs, s, where the configured one is too short for
+        messages of several fragments to wait for their turns; None where it is not."""
+        if self.scenario.ros_sink.reassembly_timeout > forecast.pause_s:
+            return None
+        return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
+
+    def advice(self) -> list[Advice]:
+        """Single changes that make the topics younger, or the link freer at the same age; the best first.
+
+        Each is tried on the first seconds of the traffic, and so is what it is compared with.
+        """
+        base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
+        now = self._forecast(base)
+        age = _age(now)
+        tried = [Advice(setting, self._forecast(variant)) for setting, variant in self._variants(base)]
+        better = [
+            advice
+            for advice in tried
+            if _age(advice.forecast) < _BETTER * age
+            or (_age(advice.forecast) < age / _BETTER and advice.forecast.used < _LIGHTER * now.used)
+        ]
+        return sorted(better, key=lambda advice: (_age(advice.forecast), advice.forecast.used))
+
+    def _variants(self, base: Scenario) -> Iterator[tuple[str, Scenario]]:
+        source, sink = base.ros_source, base.ros_sink
+        if not source.compression:
+            yield (
+                "ros_source.compression=true ros_sink.compression=true",
+                replace(base, ros_source=replace(source, compression=True), ros_sink=replace(sink, compression=True)),
+            )
+        if source.scheduler != "freshness":
+            yield "ros_source.scheduler=freshness", replace(base, ros_source=replace(source, scheduler="freshness"))
+        if not base.paced:
+            yield "paced=true", replace(base, paced=True)
+        for packet_len in self._packet_lens():
+            yield (
+                f"packet_len={packet_len}",
+                replace(
+                    base,
+                    packet_len=packet_len,
+                    ros_source=replace(source, packet_len=packet_len),
+                    ros_sink=replace(sink, packet_len=packet_len),
+                ),
+            )
+
+    def _packet_lens(self) -> list[int]:
+        """Packet lengths into which the messages of some topic fit whole, or in a few equal parts."""
+        source = self.scenario.ros_source
+        wire = source.wire_format
+        sizes: dict[int, list[int]] = {}
+        for message in self._messages:
+            sizes.setdefault(message.topic_id, []).append(self._size(message.topic_id, message.payload))
+        largest = max(max(values) for values in sizes.values())
+        lens = set()
+        for values in sizes.values():
+            most = sorted(values)[int(0.99 * (len(values) - 1))]
+            lens |= {wire.packed_len([-(-most // parts)]) for parts in _PARTS}
+        lens.discard(self.scenario.packet_len)
+        usable = range(wire.packed_len([source.min_fragment]), wire.max_packet_len + 1)
+        return sorted(
+            packet_len for packet_len in lens if packet_len in usable and largest <= wire.largest_message(packet_len)
+        )
+
+    def _codec(self, compression: bool) -> _Remembering | None:
+        if not compression:
+            return None
+        if self._remembering is None:
+            codec = message_codec(replace(self.scenario.ros_source, compression=True), self.registry)
+            assert codec is not None
+            self._remembering = _Remembering(codec)
+        return self._remembering
+
+    def _size(self, topic_id: int, payload: bytes) -> int:
+        """Bytes of a message on the air, without headers."""
+        codec = self._codec(self.scenario.ros_source.compression)
+        return len(payload) if codec is None else len(codec.encode(topic_id, payload))
+
+    def _forecast(self, scenario: Scenario) -> Forecast:
+        phy: Phy = PHY.load(scenario.phy.name)(scenario.packet_len, self.phy.sample_rate, **scenario.phy.options)
+        airtime = phy.airtime()
+        codec = self._codec(scenario.ros_source.compression)
+        duration = scenario.duration_s or self._messages[-1].t
+        messages = [message for message in self._messages if message.t <= duration]
+        shares: Counter[int] = Counter()
+        padded = 0
+        cut = False
+
+        wire = scenario.ros_source.wire_format
+
+        def share(sent: SentPacket) -> None:
+            nonlocal padded, cut
+            cut = cut or any(entry.total > 1 for entry in sent.entries)
+            layout = wire.layout(decode(sent.data, scenario.packet_len), scenario.packet_len)
+            padded += sum(span.size for span in layout if span.kind == "pad")
+            whole = sum(span.size for span in layout if span.entry is not None)
+            for span in layout:
+                if span.entry is not None:
+                    shares[span.entry.topic_id] += airtime * span.size / whole  # type: ignore[assignment]
+
+        run = simulate(scenario, phy=phy, messages=iter(messages), codec=codec, on_packet=share, overhead_s=OVERHEAD_S)
+        names = source_names(scenario, self.registry)
+        topics = []
+        for result in run.topics:
+            topic_id = names[result.topic]
+            mine = [message.payload for message in messages if message.topic_id == topic_id]
+            cost = shares[topic_id] / max(run.stats.sent[topic_id], 1)
+            sizes = [len(payload) if codec is None else len(codec.encode(topic_id, payload)) for payload in mine]
+            topics.append(
+                TopicForecast(
+                    topic=result.topic,
+                    offered_hz=len(mine) / duration,
+                    message_bytes=float(np.mean([len(payload) for payload in mine])) if mine else 0.0,
+                    air_bytes=float(np.mean(sizes)) if mine else 0.0,
+                    load=cost * len(mine) / duration,
+                    share=shares[topic_id] / duration,
+                    rate_hz=result.delivered / duration,
+                    result=result,
+                )
+            )
+        packets = run.stats.packets
+        delivered = sum(topic.result.delivered for topic in topics)
+        return Forecast(
+            packet_len=scenario.packet_len,
+            airtime_s=airtime,
+            capacity=1 / airtime,
+            used=min(packets * airtime / duration, 1.0),
+            air_bytes_per_message=packets * scenario.packet_len / delivered if delivered else None,
+            pad=padded / (packets * scenario.packet_len) if packets else 0.0,
+            pause_s=cut * airtime * _turn(scenario) * len(topics),
+            topics=tuple(topics),
+        )
+
+
+class _Remembering:
+    """A codec that codes each message once, however often it is tried."""
+
+    def __init__(self, codec: MessageCodec) -> None:
+        self._codec = codec
+        self._coded: dict[tuple[int, bytes], bytes] = {}
+        self._decoded: dict[tuple[int, bytes], bytes] = {}
+
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:
+        return self._codec.canonical(topic_id, payload)
+
+    def encode(self, topic_id: int, payload: bytes) -> bytes:
+        coded = self._coded.get((topic_id, payload))
+        if coded is None:
+            coded = self._coded[topic_id, payload] = self._codec.encode(topic_id, payload)
+        return coded
+
+    def decode(self, topic_id: int, coded: bytes) -> bytes:
+        payload = self._decoded.get((topic_id, coded))
+        if payload is None:
+            payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)
+        return payload
+
+
+def _turn(scenario: Scenario) -> int:
+    """Packets per topic until a topic that waits has its turn again."""
+    return TURN if scenario.ros_source.scheduler == "freshness" else 1
+
+
+def _age(forecast: Forecast) -> float:
+    """Mean age over the topics, s; of a topic that sends once, its latency; what never arrives counts TRIAL_S."""
+    ages = []
+    for topic in forecast.topics:
+        result = topic.result
+        if result.sent:
+            age = result.age_s.mean if result.sent > 1 else result.latency_s.max
+            ages.append(TRIAL_S if age is None else age)
+    return float(np.mean(ages)) if ages else TRIAL_S

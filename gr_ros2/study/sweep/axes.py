@@ -1,0 +1,125 @@
+"""Which swept key goes where in the figures, and the summaries sorted into panels, curves and fields.
+
+Laws: summaries of different settings are never averaged: what is neither along an axis nor a curve has a panel of its
+own; an axis is numeric only where every value is a number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+from gr_ros2.record.statistics import Estimate
+from gr_ros2.study.sweep.definition import Cell, Plan, label
+from gr_ros2.study.sweep.table import ALL, Summary
+
+NAMES = {
+    "channel.snr_db": "SNR [dB]",
+    "packet_len": "packet length [B]",
+    "phy.name": "PHY",
+    "phy.sample_rate": "sample rate [1/s]",
+    "channel.packet_loss": "packet loss",
+    "channel.frequency_offset": "carrier offset [sample rates]",
+    "channel.epsilon": "sample clock ratio",
+    "channel.doppler_hz": "Doppler shift [Hz]",
+    "ros_source.scheduler": "scheduler",
+    "sim.odom_rate": "odometry [1/s]",
+    "duration_s": "duration [s]",
+}
+"""How axes call keys that need a unit or are long; the others are called as they are."""
+
+_SNR = "channel.snr_db"
+Place = float | str | None
+"""A value along an axis."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """:param y: None where there is nothing to make a heat map of"""
+
+    x: str
+    by: tuple[str, ...]
+    y: str | None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """The summaries that share what no axis shows.
+
+    :param title: what they share; '' where that is nothing
+    :param curves: name -> points (place, estimate) in the order of places
+    """
+
+    title: str
+    curves: dict[str, list[tuple[Place, Estimate]]]
+
+
+def choose_axes(plan: Plan) -> Axes:
+    """The axes the sweep asks for, or those its keys suggest."""
+    sweep = plan.sweep
+    keys = [key for key in plan.keys if len(places(plan, key)) > 1] or list(plan.keys[:1])
+    numeric = [key for key in keys if _numeric(plan, key)]
+    candidates = [*(key for key in numeric if key == _SNR), *numeric, *keys]
+    x = sweep.x or next(key for key in candidates if key != sweep.y or len(keys) == 1)
+    rest = [key for key in keys if key != x]
+    y = sweep.y or next((key for key in numeric if key != x and key not in sweep.by), None)
+    by = sweep.by or tuple(key for key in rest if key not in numeric and key != sweep.y) or tuple(rest[:1])
+    return Axes(x, by, y)
+
+
+def curve_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[Panel]:
+    """One panel per combination of what is neither x nor by, one curve per combination of by."""
+    rest = [key for key in plan.keys if key != axes.x and key not in axes.by]
+    panels: dict[Hashable, Panel] = {}
+    for summary, estimate in _shown(plan, found):
+        values = summary.cell.values
+        title = _title(plan, summary.cell, rest)
+        panel = panels.setdefault(title, Panel(title, {}))
+        panel.curves.setdefault(_title(plan, summary.cell, axes.by), []).append((values[axes.x], estimate))
+    order = places(plan, axes.x)
+    for panel in panels.values():
+        for points in panel.curves.values():
+            points.sort(key=lambda point: order.index(point[0]))
+    return list(panels.values())
+
+
+def heat_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[tuple[str, dict[tuple[Place, Place], float]]]:
+    """Per combination of what is neither x nor y its title, and (x, y) -> value."""
+    assert axes.y is not None
+    rest = [key for key in plan.keys if key not in (axes.x, axes.y)]
+    panels: dict[str, dict[tuple[Place, Place], float]] = {}
+    for summary, estimate in _shown(plan, found):
+        values = summary.cell.values
+        panels.setdefault(_title(plan, summary.cell, rest), {})[values[axes.x], values[axes.y]] = estimate.value
+    return list(panels.items())
+
+
+def places(plan: Plan, key: str) -> list[Place]:
+    """Every value of a key, numbers in ascending order, others as they come."""
+    found = list(dict.fromkeys(cell.values[key] for cell in plan.cells))
+    return sorted(found) if all(_is_number(value) for value in found) else found
+
+
+def _numeric(plan: Plan, key: str) -> bool:
+    return all(_is_number(value) for value in places(plan, key))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _shown(plan: Plan, found: Sequence[Summary]) -> list[tuple[Summary, Estimate]]:
+    """The summaries of the topic that is drawn, where its number exists."""
+    topic = plan.sweep.topic or ALL
+    pairs = [(summary, summary.numbers[plan.sweep.value]) for summary in found if summary.topic == topic]
+    return [(summary, estimate) for summary, estimate in pairs if estimate is not None]
+
+
+def _title(plan: Plan, cell: Cell, keys: Sequence[str]) -> str:
+    """What a cell has of some keys: texts as they are, other values with their key."""
+    parts = []
+    for key in keys:
+        value = cell.values[key]
+        if len(places(plan, key)) > 1 and (value is not None or key in cell.point):
+            parts.append(value if isinstance(value, str) else label({NAMES.get(key, key): value}))
+    return ", ".join(parts)

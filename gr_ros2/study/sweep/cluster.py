@@ -1,0 +1,216 @@
+"""Runs on Dask: worker processes of this machine, or an existing cluster.
+
+Laws: a run that ends in an error, or takes its process down with it, costs itself only; runs of a worker that is lost
+are given to another; Ctrl-C reaches this process and never the workers, who end because they are told to.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import signal
+import tempfile
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any
+
+from distributed import Client, LocalCluster, as_completed, get_worker, wait
+from distributed.client import FuturesCancelledError
+from distributed.scheduler import KilledWorker
+
+from gr_ros2 import __version__
+from gr_ros2.errors import ConfigError, GrRos2Error, RunError
+from gr_ros2.record.result import Result
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import Scenario, dump, scenario_from
+from gr_ros2.settings_file import BUILTIN_DIR, find_registry
+from gr_ros2.study.sweep.store import without_registry
+
+RUNS_PER_PROCESS = 200
+"""A safeguard: of shared memory a system has 4096 segments, and flowgraphs that are over once kept theirs."""
+
+_CONNECT_S = 15.0
+_WORKERS_S = 60.0
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A run that gave no result, and why, in one line."""
+
+    reason: str
+
+
+@contextmanager
+def local_cluster(processes: int) -> Iterator[LocalCluster]:
+    """Worker processes of one thread each, on this machine, reachable from this machine only.
+
+    A worker that is lost is replaced.
+    """
+    with _deaf_to_ctrl_c():
+        cluster = LocalCluster(
+            n_workers=processes,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            # There is an HTTP server nevertheless; it is not to take the port a Dask dashboard is known by.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            silence_logs=logging.CRITICAL,  # what goes wrong comes back as a result
+        )
+    try:
+        yield cluster
+    finally:
+        cluster.close()
+
+
+@contextmanager
+def local_workers(processes: int) -> Iterator[Client]:
+    """As many processes of this machine."""
+    with local_cluster(processes) as cluster, Client(cluster) as client:
+        yield client
+
+
+@contextmanager
+def remote_workers(address: str) -> Iterator[Client]:
+    """The workers of an existing cluster.
+
+    :param address: of its scheduler, such as tcp://10.0.0.1:8786
+    :raises ConfigError: when none answers there, or a worker has not this gr-ros2
+    """
+    try:
+        client = Client(address, timeout=_CONNECT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConfigError(
+            f"--scheduler {address}: no Dask scheduler answers ({str(error) or 'timeout'}); "
+            "start one with: dask scheduler"
+        ) from error
+    with client:
+        _check_workers(client, address)
+        yield client
+
+
+def run_all(client: Client, scenarios: Mapping[str, Scenario]) -> Generator[tuple[str, Result | Failed]]:
+    """Run scenarios in any order; yields each as it ends. Those that are left when the caller stops are cancelled.
+
+    :param scenarios: by the key their result is called after
+    :raises RunError: when the cluster goes away
+    """
+    client.forward_logging("gr_ros2")  # what a worker has to say is said here
+    futures = {
+        client.submit(run_one, _portable(scenario), __version__, key=f"gr-ros2-{key}", pure=False): key
+        for key, scenario in scenarios.items()
+    }
+    try:
+        for future in as_completed(list(futures)):
+            if future.status == "lost" and client.status == "running":
+                # The worker that had the result has gone, and another runs it again.
+                with suppress(FuturesCancelledError):
+                    wait(future)
+            yield futures[future], _outcome(future)
+            future.release()
+    finally:
+        if client.status == "running":
+            client.cancel(list(futures), force=True)
+
+
+def run_one(values: Mapping[str, Any], version: str) -> Result | Failed:
+    """What a worker does: one run, by itself on the machine if it is in real time."""
+    try:
+        if version != __version__:
+            raise ConfigError(f"a worker has gr-ros2 {__version__}, the sweep {version}; install the same")
+        scenario = scenario_from({**values, "registry": find_registry(values["registry"], Path())})
+        _make_room(scenario)
+        with alone_on_this_machine(scenario):
+            return run_scenario(scenario).result
+    except GrRos2Error as error:
+        return Failed(str(error))
+
+
+_flowgraphs = count(1)
+
+
+def _make_room(scenario: Scenario) -> None:
+    """End a worker that has run many flowgraphs: Dask starts another in its place, and gives that the run."""
+    if scenario.time == "packets" or next(_flowgraphs) <= RUNS_PER_PROCESS:
+        return
+    with suppress(ValueError):  # not in a worker
+        get_worker()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _portable(scenario: Scenario) -> dict[str, Any]:
+    """A scenario for a machine on which gr-ros2 may lie elsewhere."""
+    path = Path(scenario.registry)
+    return {**without_registry(dump(scenario)), "registry": path.name if path.parent == BUILTIN_DIR else str(path)}
+
+
+def _outcome(future: Any) -> Result | Failed:
+    if future.status == "finished":
+        outcome: Result | Failed = future.result()
+        return outcome
+    if future.status in ("cancelled", "lost"):
+        raise RunError("the Dask cluster went away; the same command continues with what is left")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return Failed("the process that ran it ended, again and again: out of memory, or a crash in the flowgraph")
+    return Failed(f"{type(error).__name__}: {error}")
+
+
+def _check_workers(client: Client, address: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_WORKERS_S)
+    except TimeoutError as error:
+        raise ConfigError(
+            f"--scheduler {address}: has no workers; start one with: dask worker {address} --nthreads 1"
+        ) from error
+    threads = client.nthreads()
+    crowded = next((worker for worker, number in threads.items() if number > 1), None)
+    if crowded is not None:
+        raise ConfigError(
+            f"--scheduler {address}: worker {crowded} has {threads[crowded]} threads, and a flowgraph wants a process "
+            "to itself; start workers with --nthreads 1"
+        )
+
+    def version_there() -> str:
+        try:
+            import gr_ros2
+        except ImportError:
+            return ""
+        return gr_ros2.__version__
+
+    # A function inside a function travels as code, which a worker without gr_ros2 can run.
+    for worker, version in client.run(version_there).items():
+        if version != __version__:
+            raise ConfigError(
+                f"--scheduler {address}: worker {worker} has {version or 'no gr-ros2'}, here is {__version__}; "
+                "install the same there"
+            )
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes and threads started inside do not hear Ctrl-C, which a terminal sends to a whole group of processes."""
+    # multiprocessing lets signals through again when it starts its tracker, so that must be running.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def alone_on_this_machine(scenario: Scenario) -> Iterator[None]:
+    """Real time means the whole computer, and the scenario's DDS domains: such runs take turns."""
+    if scenario.time != "real":
+        yield
+        return
+    path = Path(tempfile.gettempdir()) / f"gr-ros2-{os.getuid()}.lock"
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # given back when the file is closed, also by the end of the process
+        yield

@@ -1,0 +1,122 @@
+"""Runs a sweep: what is missing in its folder, on workers, each run kept as it ends.
+
+Laws: whatever ends a sweep early, all runs that ended before are kept, and the next call does the others only; the
+tables, figures and page are written of what there is.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.study.sweep.cluster import Failed, local_workers, remote_workers, run_all
+from gr_ros2.study.sweep.definition import Plan
+from gr_ros2.study.sweep.page import write_sweep
+from gr_ros2.study.sweep.store import Store, run_key
+from gr_ros2.study.sweep.table import Results
+
+
+@dataclass(frozen=True)
+class SweepProgress:
+    """Where a sweep is: runs in all, those with a result, those of them that were found, and those that failed."""
+
+    total: int
+    done: int
+    found: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """What a sweep gave.
+
+    :param results: by cell number and repetition
+    :param failures: runs without a result, one line each
+    :param files: what was written, the page first
+    :param interrupted: by KeyboardInterrupt
+    """
+
+    results: Results
+    failures: tuple[str, ...]
+    files: tuple[Path, ...]
+    interrupted: bool
+
+
+def run_sweep(
+    plan: Plan,
+    out: Path,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    fresh: bool = False,
+    on_progress: Callable[[SweepProgress], None] | None = None,
+) -> SweepOutcome:
+    """Run what is missing of a sweep, until KeyboardInterrupt at the latest.
+
+    :param out: folder of the sweep, made if missing; one that was stopped is continued
+    :param scheduler: address of a Dask cluster; None starts processes on this machine
+    :param workers: how many of these; None starts one per core, or a single one for runs in real time
+    :param fresh: run everything again
+    :param on_progress: called at the start and after every run
+    :raises ConfigError: when the folder cannot be used, nothing answers at ``scheduler``, or ``workers`` does not fit
+    :raises RunError: when the cluster goes away
+    """
+    count = _workers(plan, scheduler, workers)
+    store = Store(out)
+    places: dict[str, list[tuple[int, int]]] = {}
+    scenarios: dict[str, Scenario] = {}
+    for cell in plan.cells:
+        for repetition, scenario in enumerate(cell.runs):
+            key = run_key(scenario)
+            scenarios[key] = scenario  # two cells may come to the same settings; these run once
+            places.setdefault(key, []).append((cell.number, repetition))
+    found = {} if fresh else {key: kept for key in scenarios if (kept := store.find(key)) is not None}
+    done, failed, interrupted = dict(found), dict[str, str](), False
+
+    def report() -> None:
+        if on_progress is not None:
+            on_progress(SweepProgress(len(scenarios), len(done), len(found), len(failed)))
+
+    report()
+    # Mixed: the time left is then told by all kinds of cells, and neighbours do not wait for one table of losses.
+    order = random.Random(0).sample(list(scenarios), len(scenarios))
+    missing = {key: scenarios[key] for key in order if key not in done}
+    try:
+        if missing:
+            crew = local_workers(min(count, len(missing))) if scheduler is None else remote_workers(scheduler)
+            with crew as client, closing(run_all(client, missing)) as ended:
+                for key, outcome in ended:
+                    if isinstance(outcome, Failed):
+                        failed[key] = outcome.reason
+                    elif not outcome.interrupted:
+                        store.keep(key, outcome)
+                        done[key] = outcome
+                    report()
+    except KeyboardInterrupt:
+        interrupted = True
+    results = {place: done[key] for key, at in places.items() for place in at if key in done}
+    labels = {cell.number: cell.label for cell in plan.cells}
+    failures = [
+        f"cell {number} ({labels[number]}), repetition {repetition}: {reason}"
+        for key, reason in failed.items()
+        for number, repetition in places[key]
+    ]
+    # Who pressed Ctrl-C wants the prompt back, not seconds of drawing.
+    files = [] if interrupted or not results else write_sweep(plan, results, failures, out)
+    return SweepOutcome(results, tuple(failures), tuple(files), interrupted)
+
+
+def _workers(plan: Plan, scheduler: str | None, workers: int | None) -> int:
+    if scheduler is not None and workers is not None:
+        raise ConfigError(f"workers = {workers}: the cluster at {scheduler} has its own; leave it out")
+    if plan.real_time:
+        if (workers or 1) > 1:
+            raise ConfigError(f"workers = {workers}: runs in real time need the machine for themselves; leave it out")
+        return 1
+    return workers or len(os.sched_getaffinity(0))

@@ -1,0 +1,52 @@
+"""Why a run came out as it did."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gr_ros2.report.explain import explanation
+from tests.record.results import RESULT
+from tests.record.runs import empty_trace, make_run
+
+
+def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    outcome, capacity, packets, fragments, in_flight, trend = explanation(run.result, run.trace)
+    assert outcome == (
+        "Of 49 messages sent: 33 (67%) delivered, 8 (16%) lost for want of a fragment, 2 (4%) too large for the packet "
+        "length, 6 (12%) still in flight at the end."
+    )
+    assert "10.0 ms of air, so the link carries at most 100.0 packets/s" in capacity
+    # 38 messages of two fragments and 9 of one share packets as those did that left: 83 entries in 74 packets
+    assert f"come to {(38 * 2 + 9) * 74 / 83 / 4:.1f} packets/s: 19% of what the link has" in capacity
+    assert packets.startswith("Of 74 packets that left the source, 58 (78%) reached the sink intact, 8 were lost")
+    assert "8 had not come out of the PHY by the end; those that arrived took 14% of the air" in packets
+    assert "of 41 messages that left whole 33 (80%) arrived complete" in fragments
+    assert "5 had left the source whole and waited in the PHY or on the air, 0 had left in part, and 1 had" in in_flight
+    assert trend.endswith("it stayed the same.")
+
+
+def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5})
+    assert f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times what the link has" in explanation(slow, run.trace)[1]
+
+
+@pytest.mark.parametrize("airtime", [None, 0.0])
+def test_without_airtime_nothing_is_said_of_the_air(tmp_path: Path, airtime: float | None) -> None:
+    run = make_run(tmp_path)
+    text = " ".join(explanation(replace(run.result, phy={"name": "direct", "airtime_s": airtime}), run.trace))
+    assert "air," not in text.replace("on the air,", "")
+    assert "took" not in text
+
+
+def test_as_fast_as_the_flowgraph_runs_the_clock_says_nothing_of_the_air(tmp_path: Path) -> None:
+    run = make_run(tmp_path, paced=False)
+    assert "packets/s" not in " ".join(explanation(run.result, run.trace))
+
+
+def test_nothing_sent() -> None:
+    assert explanation(replace(RESULT, topics=()), empty_trace()) == ["No message was sent."]

@@ -1,0 +1,162 @@
+"""The simulated link: honest about the air, repeatable, and as good as the scenarios promise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.record.trace import Floats, Trace
+from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.run.simulate import Offered, Simulated, simulate
+
+
+class Sized:
+    """A codec of the sizes that are promised of the real one: messages become tokens of so many bytes."""
+
+    def __init__(self, *sizes: int) -> None:
+        self._sizes = sizes
+        self._messages: list[bytes] = []
+
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002
+        return payload
+
+    def encode(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002 - all topics are alike
+        number = len(self._messages)
+        self._messages.append(payload)
+        return number.to_bytes(4, "big") + bytes(self._sizes[number % len(self._sizes)] - 4)
+
+    def decode(self, topic_id: int, coded: bytes) -> bytes:  # noqa: ARG002
+        return self._messages[int.from_bytes(coded[:4], "big")]
+
+
+def scenario(name: str, *overrides: str, duration: float = 10.0) -> Scenario:
+    return load_scenario(name, overrides, duration_s=duration)
+
+
+def run(name: str, *overrides: str, duration: float = 10.0, **settings: Any) -> Simulated:
+    return simulate(scenario(name, *overrides, duration=duration), **settings)
+
+
+def books(done: Simulated) -> dict[str, Any]:
+    """The results by topic."""
+    return {topic.topic.rsplit("/", 1)[-1]: topic for topic in done.topics}
+
+
+def longest_silence(done: Simulated, topic: str) -> float:
+    """s between two deliveries of a topic, from the start to the end of submission."""
+    (messages,) = (m for m in trace(done).messages() if m.topic.endswith(topic))
+    times = np.sort(messages.t_delivered[messages.delivered])
+    return float(np.diff([0.0, *times, done.duration_s]).max())
+
+
+def only(done: Simulated) -> Any:
+    """The result of the only topic."""
+    (topic,) = done.topics
+    return topic
+
+
+def trace(done: Simulated) -> Trace:
+    return done.recorder.trace(0.0, done.duration_s, {})
+
+
+def arrived(done: Simulated) -> tuple[Floats, Floats]:
+    """When each packet that arrived left and arrived."""
+    sent, received = trace(done).packets().times()
+    there = ~np.isnan(received)
+    return sent[there], received[there]
+
+
+@pytest.mark.parametrize("name", ["paper-ofdm", "paper-ofdm-paced", "six-topics-paced"])
+def test_no_message_completes_before_its_packets_have_been_on_the_air(name: str) -> None:
+    done = run(name, duration=5.0)
+    sent, received = arrived(done)
+    assert (received - sent).min() >= done.airtime_s - 1e-9
+    assert np.diff(np.sort(received)).min() >= done.airtime_s - 1e-9
+
+
+def test_a_packet_is_composed_just_before_the_air_is_free() -> None:
+    done = run("narrow-ofdm-paced", duration=5.0)
+    sent, received = arrived(done)
+    assert (received - sent).max() <= done.airtime_s + LEAD_S + 1e-9
+    assert max(((sent <= now) & (now < received)).sum() for now in sent) <= 2
+
+
+def test_the_same_scenario_gives_the_same_numbers() -> None:
+    assert run("six-topics-paced", duration=3.0).topics == run("six-topics-paced", duration=3.0).topics
+
+
+def test_plain_and_unpaced_is_as_bad_as_it_was() -> None:
+    odom = only(run("paper-ofdm", duration=38.0))
+    assert odom.pdr < 0.2
+
+
+@pytest.mark.parametrize("codec", [None, Sized(102), Sized(*[85] * 99, 150)], ids=["real", "102", "a few larger"])
+def test_every_message_of_the_paper_arrives_and_is_fresh(codec: Sized | None) -> None:
+    odom = only(run("paper-ofdm-paced", duration=38.0, codec=codec))
+    assert odom.pdr >= 0.99
+    assert odom.latency_s.p99 <= 0.060
+    assert odom.goodput_Bps >= 25_000
+
+
+@pytest.mark.parametrize("codec", [None, Sized(102)], ids=["real", "102"])
+def test_a_third_of_the_rate_is_evenly_spaced_and_fresh(codec: Sized | None) -> None:
+    done = run("narrow-ofdm-paced", duration=38.0, codec=codec)
+    odom = only(done)
+    assert odom.delivered / done.duration_s >= 11
+    assert odom.age_s.mean <= 0.160
+    assert longest_silence(done, "odom") < 3 * done.airtime_s + 1 / 35
+
+
+def test_six_topics_share_a_link_that_carries_a_third_of_them() -> None:
+    done = run("six-topics-paced", duration=38.0)
+    topics = books(done)
+    assert topics["odom"].delivered / done.duration_s >= 15
+    assert topics["cmd_vel"].latency_s.p99 <= 0.100
+    assert topics["map"].delivered == 1
+    assert all(longest_silence(done, name) < 5 for name in topics if name != "map"), "which is sent once"
+
+
+def test_a_link_that_carries_everything_carries_everything() -> None:
+    plain = books(run("demo"))
+    paced = books(
+        run("demo", "ros_source.scheduler=freshness", "ros_source.compression=true", "ros_sink.compression=true")
+    )
+    for name, topic in paced.items():
+        assert topic.pdr == 1.0
+        assert topic.latency_s.p50 <= plain[name].latency_s.p50 + 1e-9
+
+
+def test_messages_abandoned_midway_have_their_own_row_and_the_ledger_adds_up() -> None:
+    deadline = "ros_source.topic_options={odom: {queue: deadline, deadline_ms: 400}}"
+    odom = only(run("narrow-ofdm-paced", deadline, "ros_source.compression=false", "ros_sink.compression=false"))
+    assert {"cannot_complete", "stale"} & odom.ledger.keys()
+    assert sum(odom.ledger.values()) == odom.sent
+    # At 41 ms a packet five fit 250 ms; a first message of five begins, and others make it late.
+    two = [Offered(0.0, 0, bytes(5 * 51)), Offered(0.001, 0, bytes(51))]
+    late = simulate(
+        scenario("narrow-ofdm-paced", deadline.replace("400", "130"), "ros_source.compression=false"),
+        messages=iter(two),
+    )
+    assert late.topics[0].ledger["abandoned"] == 1
+
+
+def test_lost_packets_are_lost() -> None:
+    odom = only(run("paper-ofdm-paced", "channel.packet_loss=0.2"))
+    assert 0.7 < odom.pdr < 0.9
+    assert odom.ledger["lost_fragments"] == odom.sent - odom.delivered
+
+
+def test_the_time_of_the_computer_is_added_to_every_latency() -> None:
+    bare, with_it = (only(run("paper-ofdm-paced", overhead_s=s, duration=2.0)) for s in (0.0, 0.004))
+    assert with_it.latency_s.p50 == pytest.approx(bare.latency_s.p50 + 0.004)
+
+
+def test_what_has_no_times_is_refused() -> None:
+    with pytest.raises(ConfigError, match="pace = 'flow'"):
+        run("paper-ofdm-paced", "pace=flow")

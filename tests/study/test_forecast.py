@@ -1,0 +1,110 @@
+"""The plan: forecasts that add up, and advice that holds when it is followed."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr.ends import message_codec
+from gr_ros2.link.freshness import TURN
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
+from gr_ros2.run.simulate import simulate
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.study.forecast import Planner
+
+
+def planner(name: str, *overrides: str, duration: float = 5.0) -> Planner:
+    return Planner(load_scenario(name, overrides, duration_s=duration))
+
+
+@pytest.mark.parametrize("name", ["paper-ofdm", "paper-ofdm-paced", "six-topics-paced", "demo"])
+def test_the_shares_of_the_topics_are_the_airtime_used(name: str) -> None:
+    forecast = planner(name).forecast()
+    assert min(1.0, sum(topic.share for topic in forecast.topics)) == pytest.approx(forecast.used, rel=0.02)
+    assert forecast.capacity == pytest.approx(1 / forecast.airtime_s)
+    assert 0 <= forecast.pad < (0.10 if name == "six-topics-paced" else 1), "packets are filled"
+
+
+def test_what_fits_is_said_to_fit() -> None:
+    fits = planner("paper-ofdm-paced").forecast()
+    assert fits.load == pytest.approx(fits.used, rel=0.02)
+    assert fits.load < 1
+    assert fits.topics[0].rate_hz == pytest.approx(fits.topics[0].offered_hz)
+    assert planner("narrow-ofdm-paced").forecast().load > 1
+    assert planner("paper-ofdm").forecast().load == pytest.approx(7.14, rel=0.05), "seven times, as the paper has it"
+
+
+def test_a_forecast_is_what_the_link_does() -> None:
+    scenario = load_scenario("six-topics-paced", ["time=packets"], duration_s=5.0)
+    done = {topic.topic: topic for topic in simulate(scenario).topics}
+    for topic in Planner(scenario).forecast().topics:
+        assert topic.result.delivered == done[topic.topic].delivered
+
+
+def test_a_forecast_of_six_topics_is_what_the_flowgraph_does() -> None:
+    """On the clock of its samples; in real time it is a row of the benchmark."""
+    scenario = load_scenario("six-topics-paced", ["time=samples"], duration_s=5.0)
+    real = {topic.topic: topic for topic in run_scenario(scenario).result.topics}
+    for topic in Planner(scenario).forecast().topics:
+        delivered = topic.result.delivered
+        assert real[topic.topic].delivered == pytest.approx(delivered, rel=0.10, abs=1), topic.topic
+        if delivered > 1:
+            assert real[topic.topic].age_s.mean == pytest.approx(topic.result.age_s.mean, rel=0.10), topic.topic
+
+
+def test_a_reassembly_timeout_too_short_for_turns_is_found_and_its_remedy_holds() -> None:
+    assert planner("paper-ofdm-paced", "ros_sink.reassembly_timeout=0.01").forecast().pause_s == 0, "one packet each"
+    short = planner("six-topics-paced", "ros_sink.reassembly_timeout=0.3")
+    forecast = short.forecast()
+    assert forecast.pause_s == pytest.approx(TURN * 6 * forecast.airtime_s)
+    assert [topic.result.ledger.get("expired", 0) for topic in forecast.topics if topic.topic.endswith("map")] == [1]
+    needed = short.reassembly_timeout(forecast)
+    assert needed is not None
+    remedied = planner("six-topics-paced", f"ros_sink.reassembly_timeout={needed}")
+    after = remedied.forecast()
+    assert remedied.reassembly_timeout(after) is None
+    assert not any(topic.result.ledger.get("expired") for topic in after.topics)
+
+
+def test_advice_holds_when_it_is_followed() -> None:
+    plan = planner("paper-ofdm")
+    best = plan.advice()[0]
+    assert best.setting == "ros_source.compression=true ros_sink.compression=true"
+    followed = planner("paper-ofdm", *best.setting.split())
+    assert followed.forecast().load < 1
+    lens = [advice for advice in followed.advice() if advice.setting.startswith("packet_len=")]
+    assert lens, "a packet length that fits the message"
+    per_message = planner("paper-ofdm", *best.setting.split(), lens[0].setting).forecast().air_bytes_per_message
+    assert per_message is not None
+    assert per_message <= 115
+
+
+def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> None:
+    plan = planner("paper-ofdm-paced")
+    codec = message_codec(plan.scenario.ros_source, plan.registry)
+    assert codec is not None
+    sent = [m.payload for m in Fleet(plan.scenario.sim).messages(5.0, time.time()) if m.topic == "/robot_1/odom"]
+    sizes = sorted(len(codec.encode(0, payload)) for payload in sent)
+    assert plan.forecast().topics[0].air_bytes == pytest.approx(np.mean(sizes), abs=0.5)
+    whole = min(plan._packet_lens(), key=lambda packet_len: abs(packet_len - 13 - sizes[-1]))
+    assert sum(size <= whole - 13 for size in sizes) >= 0.95 * len(sizes), "one packet each"
+
+
+def test_packet_lengths_too_small_for_the_largest_message_are_not_proposed() -> None:
+    plan = planner("demo")
+    assert all(255 * (packet_len - 13) >= 10104 for packet_len in plan._packet_lens())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [(["phy.name=direct"], "takes no airtime"), (["sim.robots=1", "ros_source.namespace=/robot_7"], "has nothing on")],
+)
+def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        planner("paper-ofdm-paced", *overrides)
