@@ -53,6 +53,8 @@ class TopicResult:
     :param path_error_m: mean distance of the paths along their length, None where the type has no position
     :param rms_error_m: RMS distance at equal times, likewise
     :param ledger: row -> messages; the rows add up to ``sent``
+    :param left_out_sent, left_out_received: messages sent, and messages received, that are in no path and in no error
+        of it: their position is not finite or beyond 1e9 m, or cannot be read
     :param corrupt: deliveries that match no message sent; 0 unless something is badly wrong
     :param repeats_delivered: deliveries of repeats, which count nowhere else
     :param latency_cdf_s: the latencies at 0 %, 1 %, … 100 %, empty where nothing was delivered
@@ -71,6 +73,8 @@ class TopicResult:
     path_error_m: _Number | None
     ledger: dict[str, _Count]
     rms_error_m: _Number | None = None
+    left_out_sent: _Count = 0
+    left_out_received: _Count = 0
     corrupt: _Count = 0
     repeats_delivered: _Count = 0
     negative_latencies: _Count = 0

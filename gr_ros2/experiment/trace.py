@@ -77,11 +77,12 @@ SCHEMAS = {
 
 @dataclass(slots=True)
 class Track:
-    """A path: times, s on the run's clock, and positions, m."""
+    """A path: times, s on the run's clock, and positions, m; ``left_out`` counts messages without a position."""
 
     t: array[float] = field(default_factory=lambda: array("d"))
     x: array[float] = field(default_factory=lambda: array("d"))
     y: array[float] = field(default_factory=lambda: array("d"))
+    left_out: int = 0
 
     @property
     def xy(self) -> Floats:
