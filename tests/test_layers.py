@@ -17,7 +17,8 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
-    {"config", "backends"},
+    {"yaml_bounds"},
+    {"config", "backends", "backlog", "guard"},
     {"registry", "settings_file"},
     {"wire"},
     {"link"},

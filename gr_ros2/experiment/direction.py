@@ -16,9 +16,9 @@ from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.experiment.load import source_names
 from gr_ros2.experiment.scenario import Scenario
-from gr_ros2.experiment.watch import EventSink
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_topics
@@ -58,7 +58,7 @@ class Direction:
         registry: Registry,
         phy: Phy,
         *,
-        ears: EventSink,
+        ears: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -99,6 +100,8 @@ class Result:
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
+    :param incomplete: what was written or shown beside this result and is not whole, such as a capture on a full disk:
+        one line each, with why and how much is missing. The numbers here are whole all the same.
     """
 
     scenario: str
@@ -111,6 +114,7 @@ class Result:
     wall_s: _Number | None = None
     interrupted: bool = False
     counters: dict[str, Any] = field(default_factory=dict)
+    incomplete: tuple[str, ...] = ()
 
 
 def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:
@@ -142,6 +146,8 @@ def write_result(result: Result, path: str | Path) -> Path:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink()
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
     return path
 

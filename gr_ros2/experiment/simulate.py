@@ -21,12 +21,12 @@ from gr_ros2.experiment.load import make_phy, source_names
 from gr_ros2.experiment.recorder import Recorder
 from gr_ros2.experiment.result import TopicResult
 from gr_ros2.experiment.scenario import Scenario
-from gr_ros2.experiment.watch import EventSink
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Receiver, Sender, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.losses import PduLosses
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.receiver import ReceiverStats
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
@@ -266,7 +266,7 @@ class Reception:
         self,
         scenario: Scenario,
         registry: Registry,
-        ears: EventSink,
+        ears: LinkObserver,
         codec: MessageCodec | None = None,
         overhead_s: float = 0.0,
     ) -> None:

@@ -122,6 +122,7 @@ def notes(result: Result) -> list[str]:
         for topic in result.topics
         if topic.left_out_sent or topic.left_out_received
     ]
+    lines += result.incomplete
     if result.interrupted:
         lines.append(f"stopped after {result.duration_s:.1f} s")
     return lines
