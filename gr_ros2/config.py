@@ -18,6 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
+from gr_ros2.yaml_bounds import check_bounds, read_bounded
 
 MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
 MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
@@ -441,10 +442,13 @@ def _class_at(cls: Any, loc: tuple[Any, ...]) -> Any:
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """One YAML file as a mapping.
 
-    :raises ConfigError: when it cannot be read or is no mapping; names file and line
+    :raises ConfigError: when it cannot be read, is no mapping, or is past what :mod:`gr_ros2.yaml_bounds` allows; names
+        file and line
     """
     try:
-        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        text = read_bounded(Path(path))
+        check_bounds(text, str(path))
+        values = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
     except yaml.YAMLError as error:

@@ -15,6 +15,7 @@ import yaml
 
 from gr_ros2.config import read_yaml
 from gr_ros2.errors import ConfigError
+from gr_ros2.yaml_bounds import check_bounds
 
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Where the built-in scenarios and registries lie."""
@@ -90,6 +91,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     if _NUMBER.fullmatch(value):  # YAML 1.1 takes 2e5 for a string
         return keys, float(value)
     try:
+        check_bounds(value, f"--set {'.'.join(keys)}")
         parsed = yaml.safe_load(value) if value else ""
     except yaml.YAMLError as error:
         raise ConfigError(f"--set {text}: the value is no YAML ({' '.join(str(error).split())})") from error

@@ -18,8 +18,8 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
-    {"wire"},
-    {"config", "backends"},
+    {"wire", "yaml_bounds"},
+    {"config", "backends", "backlog", "guard"},
     {"registry", "settings_file"},
     {"link"},
     {"middleware", "compression"},

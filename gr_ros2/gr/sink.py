@@ -23,6 +23,7 @@ from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
@@ -48,7 +49,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     :param registry: CSV path or Registry, the same as at the source
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
     :param observer: called with every ReceiverEvent, in order; with Delivered after it was published
-    :param packet_observer: called with the bytes of every PDU before they are read
+    :param packet_observer: called with the bytes of every PDU before they are read; when one of the two raises, neither
+        is told anything more
     :param clock: s, monotonic
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
     :raises ConfigError: naming key, value and what is allowed
@@ -71,6 +73,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self.registry = self._receiver.registry
         self._observer = observer
         self._packet_observer = packet_observer
+        self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
         self._lock = threading.Lock()
@@ -165,6 +168,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
                 **{name: self._counters[name] for name in _COUNTED},
+                "observer_missed": self._guard.missed,
                 "repeats": stats.repeats,
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
@@ -234,7 +238,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
             return
         if self._packet_observer is not None:
-            self._packet_observer(data)
+            self._guard(self._packet_observer, data)
         if self.config.debug:
             self._log.debug("rx %s", describe_bytes(data, self.config.packet_len, self.registry))
         with self._lock:
@@ -249,7 +253,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             try:
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
-                    self._observer(result)
+                    self._guard(self._observer, result)
             except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
                 self._failed(error)
 

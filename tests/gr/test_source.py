@@ -236,9 +236,11 @@ def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
     source = rig.make(packet_len=64, observer=fail)
     rig.start()
     rig.publish(bytes(40))
-    wait_for(lambda: source.stats()["pump_failed"] == 1)
+    wait_for(lambda: source.stats()["observer_missed"] == 1)
     rig.publish(bytes(40))
-    wait_for(lambda: rig.probe.handled >= 1)
+    wait_for(lambda: rig.probe.handled == 2)
+    assert source.stats()["observer_missed"] == 3  # nor the second message, nor its packet
+    assert source.stats()["pump_failed"] == 0
 
 
 def test_debug_lines(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
