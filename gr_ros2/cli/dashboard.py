@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
+_log = logging.getLogger(__name__)
 
 dashboard_option = click.option(
     "--dashboard",
@@ -53,14 +54,20 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
         def serve(address: str, port: int) -> str:
             if not urls:
                 dashboard = dashboards.enter_context(_make(address, port))
-                seen.add(dashboard)
+                seen.invite(dashboard)
                 urls.append(dashboard.url)
             return urls[0]
 
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
         # Closed before the dashboards are, so that nobody can ask for one more by then.
-        with Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))}):
+        with ExitStack() as doorbell:
+            try:
+                doorbell.enter_context(
+                    Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))})
+                )
+            except (OSError, RunError) as error:
+                _log.warning("`gr-ros2 dashboard` cannot find this program (%s)", error)
             yield seen
 
 

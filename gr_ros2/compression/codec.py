@@ -23,11 +23,12 @@ from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Types
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")
 """Values of a topic's option ``codec``; auto takes fields where the type is known, zstd where not or where shorter."""
-MAX_MESSAGE = 255 * 4082
-"""Bytes; what version 0 can carry uncompressed."""
+MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in FORMATS.values())
+"""Bytes; what a link can carry uncompressed."""
 
 STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
 

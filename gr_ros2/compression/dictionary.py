@@ -120,7 +120,7 @@ def load(path: str | Path, number: int = OWN) -> Dictionary:
         return _parse(json.loads(Path(path).read_text(encoding="utf-8")), number)
     except OSError as error:
         raise ConfigError(f"dictionary {path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"dictionary {path}: no dictionary of format {FORMAT} ({reason})") from error
 

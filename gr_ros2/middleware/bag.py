@@ -95,6 +95,8 @@ class BagMiddleware(Middleware):
     :param mode: ``read`` or ``write``
     :param storage: of a bag being written: ``mcap`` or ``sqlite3``
     :param definitions: ``.msg`` texts of types that ROS does not ship, by type name, written into the bag
+    :param lossless: of a bag being written: publishing waits for a slow disk; else what it cannot take is counted as
+        ``not_recorded:/topic``
     :param domain_id: a bag has no domain: taken, so that all back-ends can be asked alike, and not used; likewise
         node_name and namespace
     :raises ConfigError: a setting is out of range
@@ -111,6 +113,7 @@ class BagMiddleware(Middleware):
         mode: Literal["read", "write"] = "read",
         storage: Literal["mcap", "sqlite3"] = "mcap",
         definitions: Mapping[str, str] | None = None,
+        lossless: bool = True,
         domain_id: int = -1,  # noqa: ARG002
         node_name: str = "gr_ros2",  # noqa: ARG002
         namespace: str = "/",  # noqa: ARG002
@@ -128,7 +131,11 @@ class BagMiddleware(Middleware):
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._subscriptions: dict[str, list[BagSubscription]] = {}
-        self._recorder = BagRecorder(self.path, storage, definitions or {}, self.count) if mode == "write" else None
+        self._recorder = (
+            BagRecorder(self.path, storage, definitions or {}, self.count, lossless=lossless)
+            if mode == "write"
+            else None
+        )
         self._topics = {info.topic: info for info in bag_topics(self.path)} if mode == "read" else {}
 
     # Reading

@@ -1,7 +1,8 @@
 """Writes one ROS 2 bag.
 
-Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk only when ``BACKLOG``
-messages are behind; after an error nothing more is written, what comes is counted, and every call tells the error.
+Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk, or leaves out a message and
+counts it, only when ``BACKLOG`` messages are behind; after an error nothing more is written, what comes is counted,
+and every call tells the error.
 """
 
 from __future__ import annotations
@@ -59,12 +60,19 @@ class BagRecorder:
     :param storage: ``mcap`` or ``sqlite3``
     :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
     :param count: ``Middleware.count``
+    :param lossless: publishing waits while ``BACKLOG`` messages are behind; else those that come then are counted
     :raises ConfigError: no such storage
     :raises BagError: exists already, or cannot be made
     """
 
     def __init__(
-        self, path: Path, storage: str, definitions: Mapping[str, str], count: Callable[[str, str], None]
+        self,
+        path: Path,
+        storage: str,
+        definitions: Mapping[str, str],
+        count: Callable[[str, str], None],
+        *,
+        lossless: bool = True,
     ) -> None:
         if storage not in _STORAGES:
             raise ConfigError(f"storage = {storage!r}: {' or '.join(_STORAGES)}")
@@ -74,6 +82,7 @@ class BagRecorder:
         self.error: BagError | None = None
         self._definitions = dict(definitions)
         self._count = count
+        self._lossless = lossless
         self._writer = BagWriter(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
         # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
         self._writer.set_custom_data("recorded_by", "gr_ros2")
@@ -124,7 +133,10 @@ class BagRecorder:
             raise MiddlewareError(f"publish on {channel.topic}: bag {self.path} is closed")
         if self.error is not None:
             raise self.error
-        self._queue.put(_Message(channel, stamp_ns, payload, sent_ns))
+        try:
+            self._queue.put(_Message(channel, stamp_ns, payload, sent_ns), block=self._lossless)
+        except queue.Full:
+            self._count(f"not_recorded:{channel.topic}", f"the disk is {BACKLOG} messages behind")
 
     def close(self) -> None:
         """Write what is queued and the index; the second call does nothing.

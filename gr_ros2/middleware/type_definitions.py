@@ -6,14 +6,19 @@ Law: a type that is not known is no error anywhere; it has no definition, and it
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Mapping
 from functools import cache
 
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 UNKNOWN = "# The definition of this type was not known where it was recorded; the bytes are complete.\n"
 """Stands in a bag for a definition nobody had. It parses as a type without members."""
+
+DAMAGED = (SerdeError, struct.error, ValueError, IndexError, AssertionError, OverflowError, MemoryError)
+"""What deserializing arbitrary bytes as a type may raise."""
 
 
 @cache

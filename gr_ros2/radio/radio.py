@@ -107,6 +107,14 @@ class Radio(PacketPath, HierBlock):
             self._recorder.close()
         self.front_end.close()
 
+    def recorded(self) -> dict[str, int]:
+        """Samples. ``unrecorded``: not in the recording, as on a full disk; nothing where none is made."""
+        return {} if self._recorder is None else {"unrecorded": self._recorder.failed}
+
+    def incomplete(self) -> list[str]:
+        """What the recording lacks and why, as one line; none where it is whole, or none is made."""
+        return [] if self._recorder is None else self._recorder.told()
+
     @property
     def refused(self) -> int:
         """PDUs the transmitter could not take."""

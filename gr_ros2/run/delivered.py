@@ -20,6 +20,7 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import Qos
+from gr_ros2.record.trace import make_folder
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 
@@ -32,6 +33,7 @@ class DeliveredBag:
     :param storage: ``sqlite3`` keeps the time of arrival alone
     :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
     :raises BagError: when it exists already or cannot be made
+    :raises ConfigError: when the folder around it cannot be made
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class DeliveredBag:
         self.not_recorded: Counter[str] = Counter()
         """Messages the disk did not take, by reason; :meth:`close` raises it."""
         self._origin_ns = origin_ns
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         self._recorder = BagRecorder(path, storage, definitions or {}, self._count)
         self._channels: dict[tuple[int, int], BagChannel] = {}
 

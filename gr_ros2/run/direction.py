@@ -16,6 +16,7 @@ from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_topics
@@ -24,7 +25,6 @@ from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.watch import EventSink
 
 _QUIET_S = 0.3
 """A PHY that has given no packet for so long, with nothing waiting, is empty."""
@@ -58,7 +58,7 @@ class Direction:
         registry: Registry,
         phy: Phy,
         *,
-        ears: EventSink,
+        ears: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:

@@ -10,13 +10,12 @@ from dataclasses import replace
 
 from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.fragment import largest_message
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet
-from gr_ros2.wire import single_entry_payload
+from gr_ros2.wire import Format
 
 _SAMPLE_S = 2.0
 """Simulated seconds that are generated to learn message sizes; sizes hardly vary."""
@@ -77,7 +76,8 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     packets = 0.0
     for topic, size in sizes.items():
         rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
-        packets += _packets_alone(size, scenario.packet_len) * (rate or 1 / scenario.duration_s)
+        alone = _packets_alone(size, scenario.packet_len, scenario.ros_source.wire_format)
+        packets += alone * (rate or 1 / scenario.duration_s)
     return packets, 1.0
 
 
@@ -85,7 +85,7 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
     packets, first, last = 0, 0, 0
     for message in read_bag(scenario.bag_path, source_names(scenario, registry)):
-        packets += _packets_alone(len(message.payload), scenario.packet_len)
+        packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
         first = first or message.stamp_ns
         last = message.stamp_ns
         if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
@@ -94,6 +94,6 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     return packets, seconds or 1.0
 
 
-def _packets_alone(size: int, packet_len: int) -> int:
+def _packets_alone(size: int, packet_len: int, wire: Format) -> int:
     """Packets that a message of this size needs alone; one too large for the link needs none."""
-    return max(-(-size // single_entry_payload(packet_len)), 1) if size <= largest_message(packet_len) else 0
+    return max(-(-size // wire.single_entry_payload(packet_len)), 1) if size <= wire.largest_message(packet_len) else 0

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from gr_ros2.cli.capture import packets_in
 from gr_ros2.cli.main import run
 from gr_ros2.errors import ConfigError
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 PACKETS = [
-    encode(Packet(1, 255, seq, 1, (Entry(1, seq, 0, 1, b"payload %d" % seq), Entry(2, 9, 3, 8, b""))), 64)
+    V0.encode(Packet(1, 255, seq, 1, (Entry(1, seq, 0, 1, b"payload %d" % seq), Entry(2, 9, 3, 8, b""))), 64)
     for seq in range(3)
 ]
 

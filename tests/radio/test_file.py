@@ -84,7 +84,7 @@ def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
 def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
     recorder = SigmfRecorder(tmp_path / "cut", Recording(RATE, 433e6), 4)
     recorder.work([np.arange(8, dtype=np.complex64)], [])
-    recorder._file.flush()
+    recorder.stop()
     with Path(tmp_path / "cut.sigmf-data").open("ab") as data:
         data.write(b"torn")
     about, samples = read_recording(tmp_path / "cut")
