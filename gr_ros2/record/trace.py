@@ -343,7 +343,7 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be made ({error.strerror or error}); choose another folder") from error
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
     return path
 
 

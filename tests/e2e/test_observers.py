@@ -151,6 +151,21 @@ def test_one_that_raises_when_a_run_begins_and_ends(passing: str) -> None:
     assert result.incomplete[0].startswith("onlooker: ended (ValueError: onlooker); ")
 
 
+def test_a_late_one_that_raises_is_left_out_alone() -> None:
+    audience, late = watch.Audience(), Fails()
+    invited: list[bool] = []
+
+    def invite() -> None:
+        if not invited:
+            invited.append(True)
+            audience.invite(late)
+
+    result = run_scenario(scenario(0.5), watchers=[Onlooker(invite), audience]).result
+    check_complete(result)
+    (line,) = result.incomplete
+    assert line.startswith("onlooker: ended (ValueError: onlooker); ")
+
+
 def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "_PATIENCE_S", 0.2)
     gate = threading.Event()
@@ -390,7 +405,7 @@ def test_a_read_only_disk_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     with disk(tmp_path / "disk", "ro") as fixed:
         for passing in ("real", "packets"):
             assert as_command(fixed / "out", "--set", f"time={passing}", duration_s=0.5) == 2
-            said = f"gr-ros2: {fixed / 'out'}: cannot be made (Read-only file system); choose another folder"
+            said = f"gr-ros2: {fixed / 'out'}: cannot be written (Read-only file system); choose another folder"
             assert [line for line in capsys.readouterr().err.splitlines() if line] == [said]
 
 
