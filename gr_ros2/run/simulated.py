@@ -9,6 +9,7 @@ samples, as in a run in real time, so neither noise nor fading moves on in it.
 from __future__ import annotations
 
 import heapq
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,7 +24,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
@@ -31,6 +32,8 @@ from gr_ros2.run.simulate import Landed, Reception, Step, Transmission, drop_pac
 from gr_ros2.run.watch import EventSink, Fanout, LiveRun, Watcher
 
 _REPORT_S = 0.05
+
+_log = logging.getLogger(__name__)
 
 
 def run_simulated(
@@ -59,7 +62,10 @@ def run_simulated(
     with ExitStack() as stack:
         if bag is None and out is not None:
             origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
-            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns))
+            source = recording(scenario)
+            for line in source.differences:
+                _log.warning(line)
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
