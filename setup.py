@@ -42,6 +42,7 @@ setup(
         ("lib/gr_ros2", ["resource/link"]),
     ],
     install_requires=[
+        "apsw>=3.46",
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
         "cyclonedds==11.0.1",

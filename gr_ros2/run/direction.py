@@ -13,17 +13,15 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import source_names
+from gr_ros2.run.load import recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 
 _QUIET_S = 0.3
@@ -129,7 +127,5 @@ class Direction:
         path = self.scenario.bag_path
         if path is None:
             return open_graph(self.scenario, self.scenario.ros_source, "source")
-        found = [info.topic for info in bag_topics(path)]
-        if not set(found) & set(self.topics):
-            raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
+        recorded_names(self.scenario, self.registry)  # refuses a recording with nothing for this link
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)

@@ -25,7 +25,7 @@ from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, Result, write_result
 from gr_ros2.record.trace import make_folder, write_trace, write_whole
 from gr_ros2.run.direction import Direction, open_graph
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
@@ -47,14 +47,17 @@ class Listener:
     """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
 
     :param graphs: name and type of the topics to hear, by graph
+    :param definitions: ``.msg`` texts of types by name; ROS's where missing
     """
 
-    def __init__(self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path) -> None:
+    def __init__(
+        self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path, definitions: Mapping[str, str]
+    ) -> None:
         self.received: Counter[str] = Counter()
         self._closed = False
         self._guard = Guard("bag of delivered messages")
         # A reader that waits for the disk would make DDS hold up the link's own publisher.
-        self._bag = BagMiddleware(path=bag, mode="write", lossless=False)
+        self._bag = BagMiddleware(path=bag, mode="write", definitions=definitions, lossless=False)
         self._publishers = {
             name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
         }
@@ -214,7 +217,7 @@ class _Run:
             stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
             for way in self.directions
         }
-        listener = Listener(graphs, out / DELIVERED_BAG)
+        listener = Listener(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
 

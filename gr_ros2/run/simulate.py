@@ -29,7 +29,7 @@ from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.settings import SimSettings
@@ -87,13 +87,14 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
     :raises ConfigError: for a recording played as fast as the link takes it, which has no times
     :raises BagError: for one whose times leap by more than 30 days
     """
-    names = source_names(scenario, registry)
     if scenario.bag_path is None:
+        names = source_names(scenario, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
     if not scenario.bag_speed:
         raise ConfigError("bag_speed = 0: a recording as fast as the link takes it cannot be simulated; set it above 0")
+    names = recorded_names(scenario, registry)
     first = last = None
     for message in read_bag(scenario.bag_path, names):
         first = message.stamp_ns if first is None else first

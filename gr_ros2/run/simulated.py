@@ -9,6 +9,7 @@ samples, as in a run in real time, so neither noise nor fading moves on in it.
 from __future__ import annotations
 
 import heapq
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,7 +26,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
@@ -33,6 +34,8 @@ from gr_ros2.run.simulate import Landed, Reception, Step, Transmission, drop_pac
 from gr_ros2.run.watch import LiveRun, Onlookers
 
 _REPORT_S = 0.05
+
+_log = logging.getLogger(__name__)
 
 
 def run_simulated(
@@ -61,7 +64,10 @@ def run_simulated(
     with ExitStack() as stack:
         if bag is None and out is not None:
             origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
-            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns))
+            source = recording(scenario)
+            for line in source.differences:
+                _log.warning(line)
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
@@ -73,7 +79,7 @@ def run_simulated(
         )
         onlookers = onlookers or Onlookers(apart=False)
         ears = Observers[LinkObserver]()
-        recording = ears.add(recorder, needed=True)
+        recorded = ears.add(recorder, needed=True)
         ears.add(onlookers)
         directions = [_Direction(way, registry, phy, ears) for way, phy in zip(ways, phys, strict=True)]
         clock = _Clock()
@@ -82,13 +88,13 @@ def run_simulated(
         for now, number, step in heapq.merge(*(one.timed(place) for place, one in enumerate(directions)), key=_when):
             clock.now = now
             directions[number].reception.take(step)
-            recording.check()
+            recorded.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
                 progress(on_progress, Progress(now, scenario.duration_s, *recorder.progress()))
         for direction in directions:
             direction.reception.wait_until(direction.transmission.end)
-        recording.check()
+        recorded.check()
     played = max(direction.transmission.duration_s for direction in directions)
     topics = recorder.finish(played, played, all(direction.transmission.empty for direction in directions))
     there, *back = (direction.counters() for direction in directions)
