@@ -12,11 +12,19 @@ import fuzz.receiver
 import fuzz.wire
 from fuzz.loop import Harness, inputs, run
 
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import fuzz.kernels
+
 ROOT = Path(__file__).parents[1]
-HARNESSES = {"wire": (fuzz.wire.wire, fuzz.wire.corpus), "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus)}
+HARNESSES = {
+    "wire": (fuzz.wire.wire, fuzz.wire.corpus),
+    "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+    "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
+}
 
 
-@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("receiver", 1_500)])
+@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("receiver", 1_500), ("kernels", 400)])
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     harness, corpus = HARNESSES[name]
     run(harness, corpus(), seed=1, count=count)
@@ -27,7 +35,7 @@ def test_equal_seeds_give_equal_inputs(name: str) -> None:
     corpus = HARNESSES[name][1]()
 
     def first(seed: int) -> list[bytes]:
-        return [data for _, data in zip(range(100), inputs(corpus, seed), strict=False)]
+        return [data for _, data in zip(range(len(corpus) + 100), inputs(corpus, seed), strict=False)]
 
     assert first(3) == first(3)
     assert first(3) != first(4)
