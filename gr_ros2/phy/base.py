@@ -77,6 +77,10 @@ class Phy(ABC):
         """What works on the samples, in a few words; '' where there are none."""
         return ""
 
+    def leaves_tags(self) -> bool:
+        """Whether the transmitter's samples carry tags, which a receiver in the same flowgraph must not see."""
+        return False
+
     def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
         """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
 
@@ -93,7 +97,7 @@ class Phy(ABC):
     def receiver(self, aside: bool = False) -> Any:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
-        :param aside: in a process of its own where it is made of Python, which keeps the ROS side free; it takes a
+        :param aside: in a process of its own where it works in Python, which keeps the ROS side free; it takes a
             second to start, and packets come a moment after the samples have passed
         :raises PhyError: for a PHY without samples
         """

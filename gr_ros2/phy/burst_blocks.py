@@ -75,7 +75,9 @@ class BurstPhy(Phy):
         return BurstTransmitter(self)
 
     def receiver(self, aside: bool = False) -> BurstSink:
-        return BurstSink(self, aside and len(os.sched_getaffinity(0)) > 1)
+        # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
+        compiled = self.running_modem is not self.modem
+        return BurstSink(self, aside and not compiled and len(os.sched_getaffinity(0)) > 1)
 
 
 class BurstTransmitter(Transmitter):
@@ -141,15 +143,15 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self._waiting.append(packet)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
-        if not len(self._rest):
-            if not self._waiting:
-                return 0
-            self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
-        out = output_items[0]
-        count = min(len(out), len(self._rest))
-        out[:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
+        out, done = output_items[0], 0
+        while done < len(out) and (len(self._rest) or self._waiting):
+            if not len(self._rest):
+                self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
+            count = min(len(out) - done, len(self._rest))
+            out[done : done + count] = self._rest[:count]
+            self._rest = self._rest[count:]
+            done += count
+        return done
 
 
 class BurstSink(HierBlock):

@@ -439,6 +439,9 @@ class LoraPhy(BurstPhy):
     def runs_on(self) -> str:
         return super().runs_on() if self._sdr is None else STOCK
 
+    def leaves_tags(self) -> bool:
+        return self._sdr is not None
+
     def transmitter(self) -> Any:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
 

@@ -125,6 +125,9 @@ class OfdmPhy(BurstPhy):
     def runs_on(self) -> str:
         return super().runs_on() if self._stock is None else STOCK
 
+    def leaves_tags(self) -> bool:
+        return self._stock is not None
+
     def prefer_latency(self) -> None:
         if self._stock is not None:
             idle_spinning_threads()

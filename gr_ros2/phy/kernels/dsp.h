@@ -53,20 +53,48 @@ class Rotation {
                 next_[j] = mul(next_[j], four_);
             }
         }
-        for (int j = 0; k < count; k++, j++) out[k] = Sample(next_[j]);
+        for (int j = 0; j < 4 && k < count; k++, j++) out[k] = Sample(next_[j]);
     }
 
    private:
     Turn four_, next_[4];
 };
 
+// The largest value; what comes out where there is a NaN is not said.
+inline float largest(const float* values, int count) {
+    constexpr int lanes = 16;
+    float most[lanes];
+    int k = 0;
+    for (int lane = 0; lane < lanes; lane++) most[lane] = values[0];
+    for (; k + lanes <= count; k += lanes) {
+        for (int lane = 0; lane < lanes; lane++)
+            most[lane] = values[k + lane] > most[lane] ? values[k + lane] : most[lane];
+    }
+    float top = values[0];
+    for (int lane = 0; lane < lanes; lane++) top = most[lane] > top ? most[lane] : top;
+    for (; k < count; k++) top = values[k] > top ? values[k] : top;
+    return top;
+}
+
 // Index of the largest value; of the first NaN where there is one.
 inline int argmax(const float* values, int count) {
+    float sum = 0;
+    for (int k = 0; k < count; k++) sum += values[k];
     int best = 0;
+    if (sum == sum) {
+        const float top = largest(values, count);
+        while (best + 1 < count && values[best] != top) best++;
+        return best;
+    }
     for (int k = 1; k < count && values[best] == values[best]; k++) {
         if (!(values[k] <= values[best])) best = k;
     }
     return best;
+}
+
+// Squared magnitudes.
+inline void squares(const Sample* values, int count, float* out) {
+    for (int k = 0; k < count; k++) out[k] = square(values[k]);
 }
 
 // Where the parabola through three neighbours is highest, -0.5..0.5 from the middle one.

@@ -21,6 +21,7 @@ struct Scratch {
     std::vector<float> re, im, power, match, chance;       // per sample, per position
     std::vector<Sample> symbols, spectrum, spare, rotation;  // per preamble symbol, per bin
     std::vector<Sample> raw, turned, other;                // per symbol of a chunk
+    std::vector<float> heights;
     std::vector<double> drift, places, angles;
     std::vector<int> decided;
 };
@@ -85,6 +86,7 @@ class Linear final : public Modem {
         for (auto* one : {&s.symbols, &s.rotation}) one->resize(p_.preamble);
         for (auto* one : {&s.spectrum, &s.spare}) one->resize(fft_.size());
         for (auto* one : {&s.raw, &s.turned, &s.other}) one->resize(p_.chunk);
+        s.heights.resize(fft_.size());
         s.drift.resize(p_.chunk);
         const int blocks = std::max(1, p_.chunk / p_.block);
         for (auto* one : {&s.places, &s.angles}) one->resize(blocks + 1);
@@ -143,19 +145,13 @@ class Linear final : public Modem {
             power += square(s.symbols[k]);
         }
         fft_.run(s.spectrum.data(), s.spare.data());
-        int peak = 0;
-        float highest = -1;
-        for (int k = 0; k < size; k++) {
-            if (square(s.spectrum[k]) > highest) {
-                highest = square(s.spectrum[k]);
-                peak = k;
-            }
-        }
-        const auto height = [&](int bin) { return std::sqrt(static_cast<double>(square(s.spectrum[bin & (size - 1)]))); };
+        squares(s.spectrum.data(), size, s.heights.data());
+        const int peak = argmax(s.heights.data(), size);
+        const auto height = [&](int bin) { return std::sqrt(static_cast<double>(s.heights[bin & (size - 1)])); };
         const double place = peak + summit(height(peak - 1), height(peak), height(peak + 1));
         const double frequency = kTau * (wrapped(place + size / 2.0, size) - size / 2.0) / size;
         const double all = static_cast<double>(p_.preamble) * power;
-        return {frequency, std::isfinite(power) ? highest / std::max(all, kTiny) : 0.0};
+        return {frequency, std::isfinite(power) ? s.heights[peak] / std::max(all, kTiny) : 0.0};
     }
 
     // Take the carrier from the preamble's symbols; returns their phase.

@@ -7,6 +7,7 @@ namespace {
 
 constexpr float kTiny = 1e-20f;
 constexpr int kWords = 16, kNibble = 4, kMostCodeBits = 8;
+constexpr int kMostBits = 16;  // of a chirp
 constexpr int kBlock = 64;  // values interpolated at a time
 
 struct Place {
@@ -151,9 +152,7 @@ class Lora final : public Modem {
             const float* row = pairs + static_cast<size_t>(j) * chips;
             for (int k = 0; k < chips; k++) s.sum[k] += row[k];
         }
-        float top = 0;
-        for (int k = 0; k < chips; k++) top = s.sum[k] > top ? s.sum[k] : top;
-        return top;
+        return largest(s.sum.data(), chips);
     }
 
     // Look closely at a preamble.
@@ -172,8 +171,8 @@ class Lora final : public Modem {
         float highest = -1;
         for (int row = 0; row + 1 < rows; row++) {
             const float *one = &s.falls[static_cast<size_t>(row) * fine], *two = one + fine;
-            float top = 0;
-            for (int k = 0; k < fine; k++) top = one[k] + two[k] > top ? one[k] + two[k] : top;
+            for (int k = 0; k < fine; k++) s.sum[k] = one[k] + two[k];
+            const float top = largest(s.sum.data(), fine);
             if (top > highest) {
                 highest = top;
                 at = row;
@@ -191,7 +190,7 @@ class Lora final : public Modem {
         if (first < 0 || begin > samples.count) return none;
         add_up(samples.at + first, p_.look, down_, s);
         rise = bin(s.sum.data());
-        const float top = *std::max_element(s.sum.begin(), s.sum.begin() + fine);
+        const float top = largest(s.sum.data(), fine);
         add_up(samples.at + begin - static_cast<int64_t>(p_.down) * chips, p_.down, up_, s);
         fall = bin(s.sum.data());
         return {true, static_cast<double>(begin) + (fall - rise) / 2, (fall + rise) / 2,
@@ -287,11 +286,11 @@ class Lora final : public Modem {
             std::copy_n(&s.tones[static_cast<size_t>(symbol) * chips], chips, s.row.begin());
             fft_.run(s.row.data(), s.spare.data());
             float* heights = &s.heights[static_cast<size_t>(symbol) * chips];
+            squares(s.row.data(), chips, heights);
             float power = 0;
             for (int k = 0; k < chips; k++) {
-                const float here = square(s.row[k]);
-                power += here;
-                heights[k] = std::sqrt(here);
+                power += heights[k];
+                heights[k] = std::sqrt(heights[k]);
             }
             const int peak = argmax(heights, chips);
             s.places[symbol] = peak;
@@ -304,25 +303,30 @@ class Lora final : public Modem {
         const auto scale = static_cast<float>(2 * peaks / count / noise), certain = static_cast<float>(p_.certain);
         for (int symbol = 0; symbol < count; symbol++) {
             points[symbol] = s.peaks[symbol] / std::max(highest, kTiny);
-            const float* heights = &s.heights[static_cast<size_t>(symbol) * chips];
+            float differences[kMostBits];
+            differ(&s.heights[static_cast<size_t>(symbol) * chips], differences);
             for (int bit = 0; bit < p_.spreading_factor; bit++) {
-                const float found = difference(heights, bit) * scale;
+                const float found = differences[bit] * scale;
                 *soft++ = found > -certain ? (found < certain ? found : certain) : -certain;
             }
         }
     }
 
-    // The highest bin whose Gray code has a bit, less the highest that has not: bins come in runs of equal bits.
-    float difference(const float* heights, int bit) const {
-        const int run = 1 << bit;
-        float one = -1, zero = -1;
-        for (int from = 0; from < p_.chips; from += run) {
-            float& most = ((from ^ from >> 1) >> bit & 1) ? one : zero;
-            float top = heights[from];
-            for (int k = from + 1; k < from + run; k++) top = heights[k] > top ? heights[k] : top;
-            most = top > most ? top : most;
+    // Of each bit, the highest bin whose Gray code has it, less the highest that has not. The Gray codes of bins have bit
+    // 0 in the second and third of each four; the same is true of bit 1 and pairs of bins, and so on. Heights are lost.
+    void differ(float* heights, float* out) const {
+        int count = p_.chips;
+        for (int bit = 0; bit < p_.spreading_factor - 1; bit++, count /= 2) {
+            float one = -1, zero = -1;
+            for (int k = 0; k < count; k += 4) {
+                const float inner = std::max(heights[k + 1], heights[k + 2]), outer = std::max(heights[k], heights[k + 3]);
+                one = inner > one ? inner : one;
+                zero = outer > zero ? outer : zero;
+            }
+            out[bit] = one - zero;
+            for (int k = 0; k < count / 2; k++) heights[k] = std::max(heights[2 * k], heights[2 * k + 1]);
         }
-        return one - zero;
+        out[p_.spreading_factor - 1] = heights[1] - heights[0];
     }
 
     // Samples by which windows lie behind their chirps, -0.5..0.5.

@@ -82,6 +82,7 @@ class CompiledModem(BurstModem):
         self._kernel = _new(self._functions, constants)
         weakref.finalize(self, self._functions.modem_free, self._kernel)
         self._soft, self._points = constants.soft_bits, constants.points
+        self._fixed_span = reference.span if type(reference).end is BurstModem.end else None
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
@@ -116,6 +117,8 @@ class CompiledModem(BurstModem):
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
     def end(self, samples: Samples, start: int) -> int:
+        if self._fixed_span is not None:
+            return start + self._fixed_span
         samples = np.ascontiguousarray(samples, np.complex64)
         return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
 

@@ -26,7 +26,7 @@ struct Scratch {
     std::vector<double> products[2], powers;                       // running sums
     std::vector<Sample> rotation, first, second, profile, spare;   // an FFT long
     std::vector<Sample> rows, model, turns;                        // a chunk of symbols by used carriers
-    std::vector<float> energies;
+    std::vector<float> energies, heights;
     std::vector<Sample> gains, before, sum, step, known;           // per used carrier
     std::vector<float> weight, total;
     std::vector<Sample> inverse;                                   // per data carrier
@@ -200,6 +200,7 @@ class Ofdm final : public Modem {
         s.energies.resize(static_cast<size_t>(rows) * used_);
         for (auto* one : {&s.gains, &s.before, &s.sum, &s.step, &s.known}) one->resize(used_);
         for (auto* one : {&s.weight, &s.total}) one->resize(used_);
+        s.heights.resize(p_.size);
         s.inverse.resize(p_.data_count);
         s.sharpness.resize(p_.data_count);
         for (auto* one : {&s.tone, &s.straight}) one->resize(rows);
@@ -248,7 +249,7 @@ class Ofdm final : public Modem {
         fft_.run(one, s.spare.data());
         fft_.run(two, s.spare.data());
         for (int k = 0; k < size; k++) profile[k] = mul_conj(two[k], one[k]);
-        float heights[16];
+        float heights[16] = {};
         for (int row = 0; row < p_.shift_count; row++) {
             const Sample* expected = &turns_[static_cast<size_t>(row) * size];
             float a = 0, b = 0;
@@ -283,15 +284,9 @@ class Ofdm final : public Modem {
         // Of the inverse FFT only the magnitude is wanted: the forward one of the conjugate has it.
         for (int k = 0; k < size; k++) profile[k] = std::conj(one[k] + mul(two[k], straight));
         fft_.run(profile, s.spare.data());
-        int peak = 0;
-        float highest = -1;
-        for (int k = 0; k < size; k++) {
-            if (square(profile[k]) > highest) {
-                highest = square(profile[k]);
-                peak = k;
-            }
-        }
-        const double alike = highest / std::max(static_cast<double>(power) * p_.energy, kTiny);
+        squares(profile, size, s.heights.data());
+        const int peak = argmax(s.heights.data(), size);
+        const double alike = s.heights[peak] / std::max(static_cast<double>(power) * p_.energy, kTiny);
         const int late = (peak + half_) % size - half_;
         return {first - p_.prefix + late, frequency + angle / symbol_, std::isfinite(power) ? alike : 0.0};
     }
