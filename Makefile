@@ -35,7 +35,7 @@ grc: setup
 setup: $(VENV)/stamp-run
 setup-dev: $(VENV)/stamp-dev
 
-$(VENV)/stamp-run: tools/install-system requirements.txt setup.py
+$(VENV)/stamp-run: tools/install-system requirements.txt setup.py $(wildcard gr_ros2/phy/kernels/*.cpp gr_ros2/phy/kernels/*.h)
 	tools/install-system run
 	test -x $(BIN)/pip || $(PYTHON) -m venv --system-site-packages $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-input -r requirements.txt
@@ -48,4 +48,4 @@ $(VENV)/stamp-dev: $(VENV)/stamp-run requirements-dev.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist *.egg-info gr_ros2/phy/kernels/*.so

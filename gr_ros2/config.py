@@ -57,6 +57,7 @@ MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
+Kernels = Literal["auto", "numpy"]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -332,12 +333,15 @@ class PhyConfig:
     :param name: a name of ``gr_ros2.phy.PHY``
     :param sample_rate: samples/s; 0 = chosen by the experiment to carry ``headroom`` times the offered load
     :param headroom: capacity over offered load where sample_rate is 0
+    :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
+        numpy = the reference, several times slower
     :param options: settings of that PHY, by its constructor's parameter names
     """
 
     name: str = "ofdm"
     sample_rate: Seconds = 0.0
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    kernels: Kernels = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 

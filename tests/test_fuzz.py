@@ -16,15 +16,20 @@ import fuzz.receiver
 import fuzz.wire
 from fuzz.loop import Harness, inputs, run, within
 
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import fuzz.kernels
+
 ROOT = Path(__file__).parents[1]
 HARNESSES = {
     "wire": (fuzz.wire.wire, fuzz.wire.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "doorbell": (fuzz.doorbell.doorbell, fuzz.doorbell.corpus),
+    "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
 }
-COUNTS = {"wire": 20_000, "receiver": 1_500, "compression": 2_000, "doorbell": 1_000, "dashboard": 300}
-if find_spec("bokeh") is not None and find_spec("gnuradio") is not None:
+COUNTS = {"wire": 20_000, "receiver": 1_500, "compression": 2_000, "doorbell": 1_000, "dashboard": 300, "kernels": 400}
+if find_spec("bokeh") is not None:
     import fuzz.dashboard
 
     HARNESSES["dashboard"] = (fuzz.dashboard.dashboard, fuzz.dashboard.corpus)
@@ -43,7 +48,7 @@ def test_equal_seeds_give_equal_inputs(name: str) -> None:
     corpus = HARNESSES[name][1]()
 
     def first(seed: int) -> list[bytes]:
-        return [data for _, data in zip(range(len(corpus) + 50), inputs(corpus, seed), strict=False)]
+        return [data for _, data in zip(range(len(corpus) + 100), inputs(corpus, seed), strict=False)]
 
     assert first(3) == first(3)
     assert first(3) != first(4)

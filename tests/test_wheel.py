@@ -21,6 +21,7 @@ from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.compression.dictionary import shipped
 from gr_ros2.settings_file import BUILTIN_DIR
 from gr_ros2.grc_path import example, grc_path
+from gr_ros2.phy.kernels.library import loaded
 print(json.dumps({
     "package": str(Path(gr_ros2.__file__).parent),
     "blocks": sorted(path.name for path in grc_path().iterdir()),
@@ -28,6 +29,7 @@ print(json.dumps({
     "scenarios": sorted(path.name for path in BUILTIN_DIR.iterdir()),
     "dissector": DISSECTOR.read_text(),
     "dictionary": shipped().number,
+    "kernels": loaded().functions is not None,
 }))
 """
 
@@ -72,6 +74,7 @@ def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
         assert found[name] == tracked(folder), folder
     assert found["dissector"] == (package / "wireshark" / "gr_ros2.lua").read_text()
     assert found["dictionary"] > 0
+    assert found["kernels"] == bool(shutil.which("g++"))
 
 
 def test_its_command_runs(installed: Path, tmp_path: Path) -> None:

@@ -87,7 +87,8 @@ def _opening(running: Any) -> str:
     phy, front_end, source = running.phy, running.front_end, running.source
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
-    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}; Ctrl-C ends it"
+    runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
+    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{runs_on}; Ctrl-C ends it"
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:

@@ -96,8 +96,8 @@ class Result:
     :param duration_s: s during which messages were submitted
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
-    :param phy: name, channels (one per direction), sample_rate, airtime_s (of one packet), airtime_per_message_s and
-        airtime_per_byte_s (of all packets sent, per delivered message and byte), …
+    :param phy: name, channels (one per direction), sample_rate, runs_on (what worked on samples), airtime_s (of one
+        packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why

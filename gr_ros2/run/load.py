@@ -12,7 +12,7 @@ from pathlib import Path
 from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet
@@ -27,12 +27,11 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
 
     :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
     """
-    cls = PHY.load(scenario.phy.name)
     rate = scenario.phy.sample_rate
-    if not rate and cls.has_samples:
-        at_1_hz: Phy = cls(scenario.packet_len, 1.0, **scenario.phy.options)
+    if not rate and PHY.load(scenario.phy.name).has_samples:
+        at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
         rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
-    phy: Phy = cls(scenario.packet_len, rate, **scenario.phy.options)
+    phy = configured(scenario.phy, scenario.packet_len, rate)
     phy.check_channel(scenario.channel)
     return phy
 

@@ -73,7 +73,7 @@ def test_a_channel_that_ofdm_is_made_for_loses_nothing(frequency_offset: float) 
 
 def test_noise_while_running() -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make("ofdm"), source, sink) as link:
+    with LoopbackLink(make("ofdm"), source, sink, instrumented=True) as link:
         link.set_snr_db(-20.0)
         for packet in packets(20):
             source.post(packet)
