@@ -3,21 +3,47 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
 
 from gr_ros2.record.result import Result
+from tests import domains
 from tests.record.results import RESULT
 
 # Helpers that assert say what they saw, as tests do.
-pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support")
+pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support", "tests.waiting")
 
 # Machines are shared and noisy: no example has a deadline. CI draws the same examples each time, so that a red run
 # means a change; `make test` elsewhere draws new ones.
 settings.register_profile("here", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
+
+# A test that names no domain is on one of this process's own, and tests never meet robots on the network.
+os.environ.update(ROS_DOMAIN_ID=str(domains.domain()), ROS_LOCALHOST_ONLY="1")
+# What a person has set for their own robots is not for tests.
+for name in ("CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "ZENOH_CONFIG_OVERRIDE", "ZENOH_SESSION_CONFIG_URI"):
+    os.environ.pop(name, None)
+
+# A shell script's background jobs ignore Ctrl-C, and so would every program that a test starts and interrupts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Workers of ``-n auto``: tests mostly wait, for radios in real time and for other programs, so two per core."""
+    return 2 * len(os.sched_getaffinity(0))
+
+
+@pytest.fixture(autouse=True)
+def _domains_of_one_test() -> Iterator[None]:
+    """DDS domains are a test's own until it ends."""
+    yield
+    domains.give_back()
 
 
 @pytest.fixture

@@ -19,7 +19,15 @@ HARNESSES = {"wire": (fuzz.wire.wire, fuzz.wire.corpus), "receiver": (fuzz.recei
 @pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("receiver", 1_500)])
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     harness, corpus = HARNESSES[name]
-    run(harness, corpus(), seed=1, count=count)
+    tried = 0
+
+    def counted(data: bytes) -> None:
+        nonlocal tried
+        harness(data)
+        tried += 1
+
+    run(counted, corpus(), seed=1, count=count)
+    assert tried == count
 
 
 @pytest.mark.parametrize("name", HARNESSES)

@@ -116,4 +116,5 @@ def test_reports_need_no_radio_and_no_ros(tmp_path: Path) -> None:
         "heavy = {'gnuradio', 'cyclonedds', 'rclpy', 'matplotlib.pyplot', 'pandas'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

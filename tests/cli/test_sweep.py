@@ -16,8 +16,8 @@ pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[swee
 from gr_ros2.cli.main import BAD_INPUT, FAILED, INTERRUPTED, run
 from gr_ros2.study.sweep.definition import builtin_sweeps
 from tests.e2e.support import COMMAND
-from tests.middleware.support import wait_for
 from tests.study.sweeps import write_sweep_file
+from tests.waiting import wait_for
 
 
 def test_without_a_name_it_lists_the_built_in_sweeps(capsys: pytest.CaptureFixture[str]) -> None:

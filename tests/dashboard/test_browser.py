@@ -24,14 +24,13 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.keys import Keys
 
 from gr_ros2.record.result import Result, read_result
-from tests.gr.probe import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(
     not (CHROMIUM and DRIVER), reason="no chromium or chromedriver; Debian: apt-get install chromium chromium-driver"
 )
 
-PATIENCE_S = 90.0
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--window-size=1500,1600"),
@@ -90,7 +89,7 @@ class Viewer:
         return float(self.run(f"{FIND} return found", ".noUi-handle")[number].get_attribute("aria-valuenow"))
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        wait_for(condition, what, PATIENCE_S)
+        wait_for(condition, what)
 
 
 SNR, OFFSET, LOSS = range(3)

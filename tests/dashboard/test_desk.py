@@ -13,7 +13,7 @@ from gr_ros2.dashboard.desk import Desk
 from gr_ros2.errors import RunError
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
 
 ENDS = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
 OFDM = ("phy.name=ofdm", "phy.sample_rate=2e6", "packet_len=220", "channel.snr_db=30")

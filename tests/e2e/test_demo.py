@@ -14,8 +14,10 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.record.result import read_result
 from gr_ros2.registry import Registry
-from tests.e2e.support import COMMAND, check_books, delivered_bag, free_domains, set_options
-from tests.middleware.support import LATCHED, Peer, message, same, wait_for
+from tests.domains import free_domains
+from tests.e2e.support import COMMAND, check_books, delivered_bag, set_options
+from tests.middleware.support import LATCHED, Peer, message, same
+from tests.waiting import wait_for
 
 PEER = Path(__file__).parents[1] / "middleware" / "dds_peer.py"
 ODOM, GRID = "nav_msgs/msg/Odometry", "nav_msgs/msg/OccupancyGrid"

@@ -18,9 +18,10 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.registry import Registry
-from tests.e2e.support import free_domains
+from tests.domains import free_domains
 from tests.gr.probe import Probe
-from tests.middleware.support import STRING, wait_for
+from tests.middleware.support import STRING
+from tests.waiting import wait_for
 
 GROWTH_BYTES = 3_000_000
 """Less than 20 bytes a message: anything kept of each would show."""
@@ -100,6 +101,7 @@ def test_engine_and_block_agree_on_the_order_of_packets() -> None:
 def test_a_flowgraph_starts_while_other_threads_map_memory() -> None:
     # GNU Radio's buffers lose that race now and then; without a second attempt a run would die at random.
     over = threading.Event()
+    started = 0
 
     def churn() -> None:
         while not over.is_set():
@@ -113,8 +115,9 @@ def test_a_flowgraph_starts_while_other_threads_map_memory() -> None:
     try:
         for _ in range(5):
             with LoopbackLink(OfdmPhy(64, 1e6), Probe(), Probe()):
-                pass
+                started += 1
     finally:
         over.set()
         for thread in threads:
             thread.join()
+    assert started == 5

@@ -14,7 +14,7 @@ import pytest
 
 from gr_ros2.record.result import read_result
 from tests.e2e.support import COMMAND, check_books, delivered_bag, on_free_domains, set_options
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 class Run:

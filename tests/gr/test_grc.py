@@ -33,7 +33,8 @@ from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 DESCRIPTIONS = sorted(grc_path().glob("*.block.yml"))
 EXAMPLES = sorted(example("topics.csv").parent.glob("*.grc"))
@@ -248,9 +249,10 @@ def compiled(path: Path, folder: Path) -> ModuleType:
 
 
 def in_memory(path: Path, folder: Path) -> Any:
-    """An example's flowgraph on the graph of tests, which needs no discovery time."""
+    """An example's flowgraph on the graph of tests, which needs no discovery time, and at addresses of its own."""
     copy = folder / path.name
-    copy.write_text(path.read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    text = path.read_text().replace("'\"dds\"'", "'\"memory\"'")
+    copy.write_text(text.replace("tcp://127.0.0.1:", f"ipc://{folder}/"))
     assert "memory" in copy.read_text()
     return getattr(compiled(copy, folder), path.stem)()
 

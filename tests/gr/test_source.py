@@ -22,8 +22,9 @@ from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 from gr_ros2.wire import decode
-from tests.e2e.support import free_domains
-from tests.gr.probe import Probe, wait_for
+from tests.domains import free_domains
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61

@@ -16,7 +16,7 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.measure import deliver, record
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 def test_what_gnu_radio_refuses_is_named() -> None:

@@ -5,23 +5,15 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from gr_ros2.race.contenders import CONTENDERS
 from tests.race.support import needs_namespaces
+from tests.waiting import wait_for
 
 pytestmark = needs_namespaces
 
 COMMAND = (sys.executable, "-m", "gr_ros2.cli", "race", "--short")
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    limit = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < limit, what
-        time.sleep(0.05)
 
 
 def descendants(pid: int) -> set[int]:

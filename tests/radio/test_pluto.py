@@ -28,7 +28,7 @@ SLOW = 6e5
 MESSAGES = 10
 TALK = """
 import json, sys
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 from tests.radio.robots import Robot
 
 front_end, phy = map(json.loads, sys.argv[1:])

@@ -26,8 +26,8 @@ from gr_ros2.study.sweep import store
 from gr_ros2.study.sweep.cluster import alone_on_this_machine, local_cluster
 from gr_ros2.study.sweep.run import SweepOutcome, SweepProgress, run_sweep
 from gr_ros2.study.sweep.store import Store, run_key
-from tests.middleware.support import wait_for
 from tests.study.sweeps import plan
+from tests.waiting import wait_for
 
 
 @pytest.fixture(scope="module")
