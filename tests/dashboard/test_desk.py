@@ -27,6 +27,7 @@ def run(desk: Desk, *overrides: str, duration_s: float) -> tuple[threading.Threa
     return thread, outcomes
 
 
+@pytest.mark.slow
 def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     desk = Desk()
     assert desk.tick().phase == "waiting"

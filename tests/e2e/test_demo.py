@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
 from gnuradio import gr
 
 from gr_ros2.gr import RosSink, RosSource
@@ -35,6 +36,7 @@ def subscriber(domain: int, topic: str, type_name: str) -> Iterator[Peer]:
         peer.close()
 
 
+@pytest.mark.slow
 def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path) -> None:
     sending, receiving = free_domains()
     out = tmp_path / "out"

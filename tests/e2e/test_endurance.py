@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 
+import pytest
 from gnuradio import gr
 
 from gr_ros2.config import SourceConfig
@@ -27,6 +28,7 @@ GROWTH_BYTES = 3_000_000
 """Less than 20 bytes a message: anything kept of each would show."""
 
 
+@pytest.mark.slow
 def test_memory_is_flat_over_200_000_messages() -> None:
     done = subprocess.run([sys.executable, "-m", "tests.e2e.endurance"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -141,6 +141,7 @@ def both_hear_news(robots: Sequence[Robot], after: str) -> None:
         raise AssertionError(f"{error}: {[(robot.link.output, robot.programs.output) for robot in robots]}") from error
 
 
+@pytest.mark.slow
 def test_both_ways_at_once_through_kills_and_a_pulled_plug(robots: list[Robot]) -> None:
     both_hear_news(robots, "the start")
 

@@ -53,6 +53,7 @@ class Run:
         return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["paper-direct", "paper-ofdm"])
 def test_a_run_that_is_stopped_writes_its_result(tmp_path: Path, name: str, number: signal.Signals) -> None:

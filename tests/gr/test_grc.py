@@ -257,6 +257,7 @@ def in_memory(path: Path, folder: Path) -> Any:
     return getattr(compiled(copy, folder), path.stem)()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_THE_AIR)
 def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: Path) -> None:
     copy = tmp_path / f"{name}.grc"
@@ -267,6 +268,7 @@ def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: 
     assert f"RadioError: front_end {name.removesuffix('_radio')}: args = " in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path: Path) -> None:
     top = in_memory(example("sim_radio.grc"), tmp_path)
     heard: list[bytes] = []
@@ -326,6 +328,7 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
         radio.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", CARRYING, ids=lambda path: path.stem)
 def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) -> None:
     top = in_memory(path, tmp_path)

@@ -46,6 +46,7 @@ def segments() -> int:
     return sum("SYSV" in line for line in Path("/proc/self/maps").read_text().splitlines())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), [("psk", {}), ("ofdm", {"detection_threshold": "stock"})])
 def test_flowgraphs_that_are_over_hold_no_shared_memory(name: str, options: dict[str, str]) -> None:
     phy = PHY.load(name)(64, 1e6, **options)

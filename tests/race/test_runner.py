@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from gr_ros2.race.contenders import CONTENDERS
 from tests.race.support import needs_namespaces
 from tests.waiting import wait_for
@@ -35,6 +37,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     peers = ("gr-ros2", "cyclone-best-effort", "zenoh-tcp")
     options = ("--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "2", "--out", str(tmp_path))
@@ -56,6 +59,7 @@ def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     assert cells["cyclone-best-effort"]["air_bytes_per_message"] > 700
 
 
+@pytest.mark.slow
 def test_ctrl_c_and_sudden_death_leave_no_process(tmp_path: Path) -> None:
     for how in (signal.SIGINT, signal.SIGKILL):
         with subprocess.Popen(

@@ -138,6 +138,7 @@ def test_what_a_device_does_not_take_is_dropped_and_counted(driver: Path) -> Non
     assert 0 < result["unsent"] <= (result["packets"]["out"] - 3) * result["layout"]
 
 
+@pytest.mark.slow
 def test_a_half_duplex_robot_hardly_hears_itself(driver: Path) -> None:
     front_end = {
         "name": "soapy",
@@ -198,6 +199,7 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
     assert log.read_text().splitlines()[-1] == "tx closed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "said"),
     [

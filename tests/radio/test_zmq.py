@@ -70,6 +70,7 @@ def test_both_ways_at_once_and_nobody_takes_its_own(ends: list[dict[str, Any]]) 
             assert counters(robot)["bursts_out"] == robot.link.stats()["packets"]["out"]
 
 
+@pytest.mark.slow
 def test_a_robot_that_comes_again_is_heard_again(ends: list[dict[str, Any]]) -> None:
     with Robot(1, ends[0], hears=(2,)) as one:
         for times in range(3):
