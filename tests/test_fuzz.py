@@ -40,7 +40,15 @@ def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     if name not in HARNESSES:
         pytest.skip("needs GNU Radio 3.10 and bokeh: pip install 'gr-ros2[dashboard]'")
     harness, corpus = HARNESSES[name]
-    run(harness, corpus(), seed=1, count=count)
+    tried = 0
+
+    def counted(data: bytes) -> None:
+        nonlocal tried
+        harness(data)
+        tried += 1
+
+    run(counted, corpus(), seed=1, count=count)
+    assert tried == count
 
 
 @pytest.mark.parametrize("name", HARNESSES)

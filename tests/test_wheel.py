@@ -59,6 +59,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment
 
 
+@pytest.mark.slow
 def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
     python = installed / "bin" / "python"
     # Isolated and elsewhere: the tree is not on its path.
@@ -77,7 +78,9 @@ def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
     assert found["kernels"] == bool(shutil.which("g++"))
 
 
-def test_its_command_runs(installed: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_its_command_runs(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # a tree on it would come before the wheel
     command = [installed / "bin" / "gr-ros2"]
     listed = subprocess.run([*command, "scenarios"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     assert "paper-ofdm-paced" in listed

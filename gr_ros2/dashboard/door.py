@@ -40,7 +40,7 @@ _MAX_CONNECTIONS = 256
 _SILENT_S = 15
 """s a connection may take for a request, or for an answer to a ping."""
 _MAX_BODY, _MAX_HEADER = 1 << 12, 1 << 14
-_MAX_FRAME = 1 << 16
+_MAX_FRAME = 65_536
 """Bytes of a WebSocket message; a viewer sends positions of sliders."""
 _TRY_AGAIN_LATER, _NOT_UNDERSTOOD = 1013, 1002
 """Status codes of a WebSocket that is closed (RFC 6455, section 7.4, and IANA's registry)."""

@@ -18,7 +18,7 @@ import pytest
 
 from gr_ros2.cli.doorbell import Doorbell, folder, neighbours, ring
 from gr_ros2.errors import ConfigError, RunError
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
 
 PATIENCE_S = 60.0
 

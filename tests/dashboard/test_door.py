@@ -25,7 +25,7 @@ from gr_ros2.dashboard import door
 from gr_ros2.dashboard.page import Page
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.errors import ConfigError
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
 
 PATIENCE_S = 60.0
 PULL = ('{"msgid": "1", "msgtype": "PULL-DOC-REQ"}', "{}", "{}")

@@ -207,6 +207,7 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory from")
 def test_an_hour_at_35_hz_takes_no_more_memory_than_ten_minutes() -> None:
     state = make(packet_len=220)

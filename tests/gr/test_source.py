@@ -23,8 +23,9 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0
-from tests.e2e.support import free_domains
-from tests.gr.probe import Probe, wait_for
+from tests.domains import free_domains
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61

@@ -216,6 +216,7 @@ def test_garbage_is_rejected_by_name_and_loses_nothing_else(garbage: list[bytes]
     assert len(rejected) == sum(sink.stats.rejected.values()) == len(garbage)
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_forged_packets_never_raise_and_memory_stays_bounded(data: st.DataObject) -> None:
     sink = receiver(topics=4, packet_len=40, max_source_bytes=4096, max_bytes=8192, max_sources=3)

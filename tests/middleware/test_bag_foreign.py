@@ -25,7 +25,7 @@ from tests.middleware.foreign_bags import (
     profile,
     qos,
 )
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 def counts(path: Path) -> dict[str, int]:

@@ -15,7 +15,8 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError, PhyError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 RATE = 5e6
 
