@@ -30,8 +30,8 @@ from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.run.watch import LiveRun
 from tests.e2e.support import COMMAND, check_complete
-from tests.waiting import wait_for
 from tests.radio.robots import ROOT, Robot, link_command
+from tests.waiting import wait_for
 
 MEMORY = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
 FULL = "No space left on device"
