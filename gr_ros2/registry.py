@@ -1,4 +1,4 @@
-"""The registry: which topics cross the link and which nibble stands for each (the paper, section 4.3).
+"""The registry: which topics cross the link and which number stands for each (the paper, section 4.3).
 
 Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
 """
@@ -13,16 +13,19 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import overload
 
-from gr_ros2.config import TopicOptions, build
+from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
+from gr_ros2.names import filled, topic_fault
+from gr_ros2.wire import FORMATS
 
-MAX_TOPICS = 16
+MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
 
-_NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _LATCHED = frozenset({"tf_static", "map", "robot_description"})
 """Topics that ROS programs publish transient-local by convention."""
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+_LONGEST_ID = 255
 
 
 def normalize_type(text: str) -> str:
@@ -40,7 +43,7 @@ def normalize_type(text: str) -> str:
 class Topic:
     """One row.
 
-    :param topic_id: nibble on the wire, 0..15
+    :param topic_id: its number on the wire
     :param name: as registered, relative to the robot's namespace or absolute with leading slash
     :param type_name: ``package/msg/Type``
     """
@@ -60,9 +63,9 @@ class Topic:
     def republished(self, namespace_format: str, src_id: int) -> str:
         """Absolute topic name of this row at a sink, for one sender."""
         if self.options.publish_as:
-            name = self.options.publish_as.format(src_id=src_id)
+            name = filled(self.options.publish_as, src_id)
         else:
-            name = f"{namespace_format.format(src_id=src_id).rstrip('/')}/{self.name.lstrip('/')}"
+            name = f"{filled(namespace_format, src_id).rstrip('/')}/{self.name.lstrip('/')}"
         return name if name.startswith("/") else f"/{name}"
 
     @property
@@ -74,7 +77,7 @@ class Topic:
 
 
 class Registry(Sequence[Topic]):
-    """At most 16 topics, indexed by topic id.
+    """At most ``MAX_TOPICS`` topics, indexed by topic id.
 
     :raises RegistryError: too many, none, or duplicate names
     """
@@ -83,7 +86,7 @@ class Registry(Sequence[Topic]):
         if not topics:
             raise RegistryError("no topics; add rows of the form name,type", path)
         if len(topics) > MAX_TOPICS:
-            raise RegistryError(f"{len(topics)} topics; a topic id is 4 bits, so at most {MAX_TOPICS}", path)
+            raise RegistryError(f"{len(topics)} topics; a link carries at most {MAX_TOPICS}", path)
         names: dict[str, Topic] = {}
         for topic in topics:
             same = names.setdefault(topic.name.lstrip("/"), topic)
@@ -169,6 +172,25 @@ class Registry(Sequence[Topic]):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def check_outputs(registry: Registry, sink: SinkConfig) -> None:
+    """Refuse settings with which a sink could not publish what it receives.
+
+    :raises ConfigError: where a topic would come out under a name that ROS does not allow, or two topics of different
+        types under one name, or ``topic_options`` has a topic that is not registered
+    """
+    types = dict.fromkeys(sink.merged_topics, _TF_TYPE)
+    for topic in registry.with_options(sink.topic_options):
+        name = topic.republished(sink.namespace_format, _LONGEST_ID)
+        remedy = "change its publish_as, or namespace_format"
+        if fault := topic_fault(name):
+            raise ConfigError(f"topic {topic.name!r} would come out as {name!r}: {fault}; {remedy}")
+        if types.setdefault(name, topic.type_name) != topic.type_name:
+            raise ConfigError(
+                f"topic {topic.name!r} would come out as {name!r} of type {topic.type_name}, where {types[name]} comes "
+                f"out already; {remedy}"
+            )
+
+
 def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator[Topic]:
     columns = ["name", "type"]
     first = True
@@ -186,7 +208,7 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
         if len(row) > len(columns) or len(row) < 2:
             raise RegistryError(f"{len(row)} columns where {len(columns)} were expected: {','.join(row)!r}", path, line)
         if topic_id >= MAX_TOPICS:
-            raise RegistryError(f"topic 17, {row[0]!r}: a topic id is 4 bits, so at most {MAX_TOPICS}", path, line)
+            raise RegistryError(f"topic {MAX_TOPICS + 1}, {row[0]!r}: a link carries at most {MAX_TOPICS}", path, line)
         if row[0].lstrip("/") in seen:
             raise RegistryError(
                 f"duplicate topic {row[0]!r}; it stands first in line {seen[row[0].lstrip('/')]}", path, line
@@ -210,16 +232,11 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
 
 
 def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:
-    if not _NAME.fullmatch(name):
-        raise ConfigError(
-            f"malformed topic name {name!r}; letters, digits and _ in parts joined by /, none starting with a digit"
-        )
+    if fault := topic_fault(name if name.startswith("/") else f"/{name}"):
+        raise ConfigError(f"malformed topic name {name!r}: {fault}")
     try:
         type_name = normalize_type(kind)
         topic_options = build(TopicOptions, options)
-        topic_options.publish_as.format(src_id=0)
     except ConfigError as error:
         raise ConfigError(f"topic {name!r}: {error}") from error
-    except (KeyError, IndexError, ValueError) as error:
-        raise ConfigError(f"topic {name!r}: publish_as may hold only {{src_id}} in braces") from error
     return Topic(topic_id, name, type_name, topic_options)

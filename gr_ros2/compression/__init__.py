@@ -1,7 +1,7 @@
 """Message compression inside version 0: fewer bytes per message, each message by itself (the C bit of the header).
 
-``LinkCodec(registry)`` is what a sender and a receiver take as their message codec; ``docs/explanation/compression.md`` has the
-format.
+``LinkCodec(registry)`` is what a sender and a receiver take as their message codec;
+``docs/explanation/compression.md`` has the format.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 Laws: a thin shell, all behaviour is in ``link.Receiver``, which one lock guards; only the bytes of a PDU are trusted;
 neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph seems
-alive; messages are published in completion order; everything not published is counted by name.
+alive; messages are published in completion order; what counts as delivered was published, and everything else is
+counted by name.
 """
 
 from __future__ import annotations
@@ -17,23 +18,25 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import GrRos2Error, MiddlewareError
+from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
-from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
+from gr_ros2.guard import Guard
+from gr_ros2.link import Delivered, Receiver, ReceiverEvent
+from gr_ros2.link.receiver import PUBLISH_FAILED
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, check_outputs
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
-    *("not_a_pair", "not_u8", "publish_failed", "handler_failed"),
+    *("not_a_pair", "not_u8", PUBLISH_FAILED, "handler_failed"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -48,7 +51,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     :param registry: CSV path or Registry, the same as at the source
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
     :param observer: called with every ReceiverEvent, in order; with Delivered after it was published
-    :param packet_observer: called with the bytes of every PDU before they are read
+    :param packet_observer: called with the bytes of every PDU before they are read; when one of the two raises, neither
+        is told anything more
     :param clock: s, monotonic
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
     :raises ConfigError: naming key, value and what is allowed
@@ -67,10 +71,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         super().__init__("ros2_sink", None, None)
         self.config = settings(SinkConfig, values, registry, middleware)
         rows = read_registry(registry)
+        check_outputs(rows, self.config)
         self._receiver = Receiver(rows, self.config, codec=message_codec(self.config, rows))
         self.registry = self._receiver.registry
         self._observer = observer
         self._packet_observer = packet_observer
+        self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
         self._lock = threading.Lock()
@@ -83,9 +89,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
         # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered anew. At most 256 senders (the id has 8 bits) of as many topics as the registry has, 16 at most.
+        # discovered anew. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
+        self._published: Counter[tuple[int, int]] = Counter()
         self._delivered_at: dict[tuple[int, int], float] = {}
         self._stamped = [has_header(topic.type_name) for topic in self.registry]
         self._sim_time: float | None = None
@@ -165,6 +172,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
                 **{name: self._counters[name] for name in _COUNTED},
+                "observer_missed": self._guard.missed,
                 "repeats": stats.repeats,
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
@@ -202,7 +210,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return {
             "src_id": key[0],
             "topic_id": key[1],
-            "delivered": stats.delivered[key],
+            "delivered": self._published[key],
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
             "latency_s": None,
             "recent_latency_s": None,
@@ -234,7 +242,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
             return
         if self._packet_observer is not None:
-            self._packet_observer(data)
+            self._guard(self._packet_observer, data)
         if self.config.debug:
             self._log.debug("rx %s", describe_bytes(data, self.config.packet_len, self.registry))
         with self._lock:
@@ -249,25 +257,23 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             try:
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
-                    self._observer(result)
+                    self._guard(self._observer, result)
             except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
                 self._failed(error)
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
         topic = self.registry[event.topic_id]
-        payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
         try:
+            payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
             publisher = self._publishers.get(key) or self._advertise(key)
             publisher.publish(payload)
-        except MiddlewareError as error:
+        except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
+            self._tell_first(PUBLISH_FAILED, f"a message of {self._name(key)} was not published", error)
             with self._lock:
-                self._counters["publish_failed"] += 1
-                first = self._counters["publish_failed"] == 1
-            if first:
-                self._log.warning("ros2_sink: a message was not published: %s", error)
-            return Lost(event.src_id, event.topic_id, "publish_failed", event.entry_id)
+                return self._receiver.unpublished(event)
         with self._lock:
+            self._published[key] += 1
             self._delivered_at[key] = self._clock()
         if self._stamped[event.topic_id]:
             self._measure(key, event.payload)
@@ -278,12 +284,17 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
         try:
             transforms.add(payload, static=static)
-        except MiddlewareError as error:
-            with self._lock:
-                self._counters["tf_failed"] += 1
-                first = self._counters["tf_failed"] == 1
-            if first:
-                self._log.warning("ros2_sink: transforms were not merged: %s", error)
+        except Exception as error:  # noqa: BLE001 - the message they came in is published and counts as delivered
+            self._tell_first("tf_failed", "transforms were not merged", error)
+
+    def _tell_first(self, counter: str, what: str, error: Exception) -> None:
+        """Count something that failed, and tell of the first: how it came about where it is no error of ours."""
+        with self._lock:
+            self._counters[counter] += 1
+            first = self._counters[counter] == 1
+        if first:
+            trace = None if isinstance(error, GrRos2Error) else error
+            self._log.warning("ros2_sink: %s: %s", what, error, exc_info=trace)
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
         topic = self.registry[key[1]]

@@ -25,7 +25,9 @@ from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, set
 from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, Sender, SenderEvent
+from gr_ros2.link.events import LOST_ON_GRAPH
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
@@ -50,7 +52,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     :param registry: CSV path or Registry
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
-    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back
+    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back; when it
+        raises, it is told nothing more
     :param clock: s, monotonic
     :param seed: of sequence number and entry ids; None is random
     :param settings: the fields of :class:`gr_ros2.config.SourceConfig`
@@ -74,6 +77,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._sender = Sender(rows, self.config, codec=codec, rng=random.Random(seed), observer=self._observe)
         self.registry = self._sender.registry
         self._observer = observer
+        self._guard = Guard(f"observer of ros2_source {self._sender.src_id}")
         self._clock = clock
         self._pdus = PduMaker()
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -91,7 +95,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._said: set[tuple[int, str]] = set()
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: dict[int, Subscription] = {}
         self.message_port_register_out(PDUS)
         self._publish = self.message_port_pub  # found through two proxies otherwise, for every packet
         self.message_port_register_in(CREDIT)
@@ -128,7 +132,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions)
+        return all(subscription.matched() for subscription in self._subscriptions.values())
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -150,6 +154,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def stop(self) -> bool:
         with self._lock:
             self._running = False
+            self._take_losses()
             self._work.notify_all()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
@@ -162,8 +167,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._closed = True
             self._room.notify_all()
-        for subscription in self._subscriptions:
+        for subscription in self._subscriptions.values():
             subscription.close()
+        with self._lock:
+            self._take_losses()
         self._subscriptions.clear()
         LOOP_GUARD.remove(self)
         self._finalizer()
@@ -171,12 +178,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def stats(self) -> dict[str, Any]:
         """A snapshot: packets and messages, per topic and in all."""
         with self._lock:
+            self._take_losses()
             stats = self._sender.stats
             queued = self._sender.queued()
             topics = {
                 name: {
                     "topic_id": topic.topic_id,
                     "submitted": stats.submitted[topic.topic_id],
+                    LOST_ON_GRAPH: stats.missed[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
                     "queue": self._sender.queue(topic.topic_id)[0],
@@ -194,6 +203,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "payload_bytes": stats.payload_bytes,
                 "repeats": stats.repeats,
                 **{name: self._counters[name] for name in _COUNTED},
+                "observer_missed": self._guard.missed,
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
@@ -246,7 +256,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             qos = Qos(options.reliability, options.durability, depth)
             callback = partial(self._take, topic.topic_id)
             subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
-            self._subscriptions.append(subscription)
+            self._subscriptions[topic.topic_id] = subscription
             subscription.follow(partial(self._follow, topic))
         if self._graph.owned:
             self.middleware.start()
@@ -271,12 +281,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
+            if topic_id in self._subscriptions:
+                self._sender.missed(topic_id, self._subscriptions[topic_id].lost)
             # A robot that comes late gets the newest message of a topic, which then has to hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             self._sender.submit(topic_id, whole or payload, self._clock())
             if not self._sender.out_of_credit:  # waking the pump for nothing would cost as much as a packet
                 self._work.notify()
+
+    def _take_losses(self) -> None:
+        """What the ROS graph has lost before it reached us is part of what was sent. Called with the lock held."""
+        for topic_id, subscription in self._subscriptions.items():
+            self._sender.missed(topic_id, subscription.lost)
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
@@ -288,7 +305,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         while self._running:
             try:
                 self._emit(self._compose())
-            except Exception as error:  # noqa: BLE001 - a failing observer must not end all transmission
+            except Exception as error:  # noqa: BLE001 - raised here, it would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1
                     first = self._counters["pump_failed"] == 1
@@ -329,4 +346,4 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             level = logging.INFO if event.reason == "superseded" else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
-            self._observer(event)
+            self._guard(self._observer, event)

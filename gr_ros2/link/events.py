@@ -24,7 +24,7 @@ class Lost:
 
     ``reason`` is a ledger row: ``lost_fragments`` (overtaken, contradicted, or behind an outage), ``expired``
     (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E); or it is complete and
-    its codec says ``unknown_dictionary`` or ``damaged``.
+    its codec says ``unknown_dictionary`` or ``damaged``, or it could not be published (``publish_failed``).
     """
 
     src_id: int
@@ -72,15 +72,34 @@ class Refused:
     detail: str = ""
 
 
+LOST_ON_GRAPH = "lost_on_graph"
+"""Ledger row of messages that were published for the link and lost by the ROS graph before the link had them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Missed:
+    """Messages of a topic that the source's ROS graph lost before they were submitted, as far as it tells.
+
+    They end in the ledger row ``lost_on_graph``. Nothing but their number is known: they have no serial and no time.
+    """
+
+    topic_id: int
+    count: int
+
+
 @dataclass(frozen=True, slots=True)
 class SentEntry:
-    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial`` (-1: a repeat)."""
+    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial``.
+
+    ``repeat`` says that the message has been sent before, and is sent again for robots that come late.
+    """
 
     serial: int
     topic_id: int
     entry_id: int
     index: int
     total: int
+    repeat: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,4 +111,4 @@ class SentPacket:
     now: float
 
 
-SenderEvent = Accepted | Refused | SentPacket
+SenderEvent = Accepted | Refused | Missed | SentPacket

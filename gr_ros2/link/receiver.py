@@ -10,17 +10,21 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from gr_ros2.config import BROADCAST, SinkConfig
+from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, Rejected
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, decode
+from gr_ros2.wire import BROADCAST
+from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
 """A source silent for so long gives its place to a new one when ``max_sources`` are known."""
+
+PUBLISH_FAILED = "publish_failed"
+"""Ledger row of a message that arrived complete and did not come onto the ROS graph."""
 
 Observer = Callable[[ReceiverEvent], None]
 
@@ -30,9 +34,10 @@ class ReceiverStats:
     """What arrived and what did not, since the start.
 
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic;
-    ``delivered`` by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason); ``packet_loss_est`` from gaps in
-    sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given up are estimates;
-    ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known of what was lost.
+    ``delivered``, what was given out, by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason);
+    ``packet_loss_est`` from gaps in sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given
+    up are estimates; ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known
+    of what was lost.
     """
 
     packets: int = 0
@@ -86,7 +91,7 @@ class Receiver:
         """Take the bytes of one packet; the events it causes, in order."""
         events = self.handle_timeout(now)
         try:
-            packet = decode(data, self.config.packet_len)
+            packet = V0.decode(data, self.config.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             return self._report(events, [Rejected(error)])
@@ -110,6 +115,14 @@ class Receiver:
         for partial in self._partials:
             return partial.last + self.config.reassembly_timeout
         return None
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+        source = self._sources.get(event.src_id)
+        if source is not None and source.latched.get(event.topic_id) == event.payload:
+            del source.latched[event.topic_id]
+        self.stats.lost[event.src_id, event.topic_id, PUBLISH_FAILED] += 1
+        return Lost(event.src_id, event.topic_id, PUBLISH_FAILED, event.entry_id)
 
     def knows(self, src_id: int) -> bool:
         """Whether a sender has a place at present."""
@@ -182,6 +195,7 @@ class Receiver:
                 self._release(result)
                 result = result.payload()
             events += self._deliver(source, packet, entry.topic_id, entry.entry_id, result)
+        source.epoch += placed.arrival is Arrival.LATE
         events += self._bound(source, packet.src_id)
         return events
 

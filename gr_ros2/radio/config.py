@@ -18,7 +18,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
 
 
@@ -32,7 +32,8 @@ class LinkConfig:
     :param ros_source: the sending block; its robot_id must be another at every robot
     :param ros_sink: the receiving block; its robot_id -1 means this robot's, except with a front end that loops back
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
-    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)
+    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings
+        (docs/how-to/radios.md)
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
@@ -82,8 +83,11 @@ class LinkConfig:
         """The registry every robot works with.
 
         :raises RegistryError: file, line, what is wrong
+        :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
-        return Registry.from_csv(self.registry)
+        registry = Registry.from_csv(self.registry)
+        check_outputs(registry, self.ros_sink)
+        return registry
 
 
 def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:

@@ -1,9 +1,9 @@
 """The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
 
 Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
-a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); repeats
-count neither as sent nor as delivered; memory holds payload digests only of messages whose fate is open, and about
-33 bytes of each message besides.
+a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); a
+repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; memory holds payload
+digests only of messages whose fate is open, and about 33 bytes of each message besides.
 
 Events must come in causal order: what a packet carries is told before its reception is, and a packet's reception
 (:meth:`Ledger.packet_received`) before what the receiver makes of it. The ledger may be fed from several threads.
@@ -21,9 +21,11 @@ from typing import TypeVar
 
 from gr_ros2.errors import RunError
 from gr_ros2.link.events import (
+    LOST_ON_GRAPH,
     Accepted,
     Delivered,
     Lost,
+    Missed,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -47,11 +49,12 @@ REORDER_WINDOW = 1024
 
 @dataclass(slots=True)
 class TopicLedger:
-    """What became of one topic of one source. The arrays run in parallel, one item per sent message, by submission.
+    """What became of one topic of one source. The arrays run in parallel, one item per message handed to the source, by
+    submission.
 
-    :param sent: messages handed to the source, repeats excluded
+    :param sent: messages for this link: handed to the source, or lost by its ROS graph before; repeats excluded
     :param corrupt: deliveries that match no message; 0 unless something is badly wrong
-    :param repeats_delivered: deliveries of repeats
+    :param repeats_delivered: deliveries of repeats whose message had its row already
     :param rows: ledger row -> messages
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
@@ -113,8 +116,8 @@ class _Source:
     open: _Shelf = field(default_factory=dict)
     by_entry_id: dict[tuple[int, int], _Shelf] = field(default_factory=dict)
     by_digest: dict[tuple[int, bytes], _Shelf] = field(default_factory=dict)
-    repeats: set[tuple[int, int]] = field(default_factory=set)
-    """(topic id, entry id) whose latest use was a repeat."""
+    repeats: dict[tuple[int, int], int] = field(default_factory=dict)
+    """(topic id, entry id) whose latest use was a repeat -> serial of the message repeated."""
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -148,6 +151,10 @@ class Ledger:
                 self._sent(source, event)
             elif isinstance(event, Accepted):
                 self._accepted(source, event)
+            elif isinstance(event, Missed):
+                topic = self._topic(src_id, event.topic_id)
+                topic.sent += event.count
+                topic.rows[LOST_ON_GRAPH] += event.count
             else:
                 self._refused(source, event)
 
@@ -258,7 +265,7 @@ class Ledger:
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
         expected = event.payload if event.expected is None else event.expected
-        message = _Open(topic, event.serial, topic.sent - 1, _digest(expected))
+        message = _Open(topic, event.serial, len(topic.serial) - 1, _digest(expected))
         source.open[event.serial] = message
         source.by_digest.setdefault((event.topic_id, message.digest), {})[event.serial] = message
 
@@ -266,7 +273,7 @@ class Ledger:
         message = source.open.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
-            topic.book(topic.sent - 1, event.reason)
+            topic.book(len(topic.serial) - 1, event.reason)
         else:
             self._close(source, message, event.reason)
 
@@ -275,8 +282,8 @@ class Ledger:
         source.packets_sent += 1
         for entry in event.entries:
             key = (entry.topic_id, entry.entry_id)
-            if entry.serial < 0:
-                source.repeats.add(key)
+            if entry.repeat:
+                source.repeats[key] = entry.serial
                 continue
             message = source.open.get(entry.serial)
             if message is None:  # delivered or dropped before its last fragment left
@@ -284,7 +291,7 @@ class Ledger:
             if message.entry_id < 0:
                 message.entry_id = entry.entry_id
                 message.total = entry.total
-                source.repeats.discard(key)
+                source.repeats.pop(key, None)
                 self._retire(source, key)
                 source.by_entry_id.setdefault(key, {})[entry.serial] = message
             message.sent += 1
@@ -310,9 +317,12 @@ class Ledger:
             exact = (m for m in source.by_entry_id.get(key, {}).values() if m.digest == digest)
             message = next(exact, None)
             if message is None and key in source.repeats:
-                self._topic(event.src_id, event.topic_id).repeats_delivered += 1
-                return None
-            if message is None:
+                repeated = source.open.get(source.repeats[key])
+                if repeated is None:
+                    self._topic(event.src_id, event.topic_id).repeats_delivered += 1
+                    return None
+                message = repeated if repeated.digest == digest else None
+            elif message is None:
                 message = next((m for m in same.values() if m.sent), None)
             if message is not None:
                 return self._deliver(source, message, now)
@@ -367,7 +377,8 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            if topic.rows.total() != topic.sent or len(topic.t_sent) != topic.sent:
+            submitted = topic.sent - topic.rows[LOST_ON_GRAPH]
+            if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
             if topic.rows[DELIVERED] != delivered:
@@ -398,7 +409,7 @@ def _arrived(source: _Source, digest: bytes) -> int:
         del source.waiting[digest]
     for entry in entries:
         message = source.open.get(entry.serial)
-        if message is not None:
+        if message is not None and not entry.repeat:
             message.received += 1
     source.last_received = max(source.last_received, ordinal)
     while source.in_air and source.in_air[0][0] < source.last_received - REORDER_WINDOW:

@@ -12,6 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gr_ros2.link.events import LOST_ON_GRAPH
+from gr_ros2.link.receiver import PUBLISH_FAILED
 from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS
 from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Ints, Packets, Trace
@@ -25,8 +27,10 @@ _ROWS = {
     IN_FLIGHT: "still in flight at the end",
     LOST_FRAGMENTS: "lost for want of a fragment",
     "queue_bound": "dropped at the bound of the source's queue",
+    LOST_ON_GRAPH: "lost by the ROS graph of the source before the link had them",
     "too_large": "too large for the packet length",
     "expired": "given up incomplete after the reassembly timeout",
+    PUBLISH_FAILED: "received whole but not published on the sink's ROS graph",
     "not_taken": "received whole but not taken by the sink",
 }
 

@@ -17,6 +17,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.events import LOST_ON_GRAPH
+from gr_ros2.link.receiver import PUBLISH_FAILED
 from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS, NOT_TAKEN
 
 SENT_EVERY = 50
@@ -40,6 +42,8 @@ _ROW_COLOURS = {
     "expired": "#b565a7",
     "memory": "#7f7f7f",
     "unsupported": "#17becf",
+    LOST_ON_GRAPH: "#5b5b9a",
+    PUBLISH_FAILED: "#6b1d1d",
     "stale": "#e7cf4f",
 }
 _RASTER_ABOVE = 20_000
@@ -171,6 +175,7 @@ def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
     try:
         Path(directory).mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_figure(paths[0], dpi=150)
+        figure.set_layout_engine("none")  # the layout stays, and half of the time is not spent on it again
         FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
     except OSError as error:
         raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error

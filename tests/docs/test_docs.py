@@ -27,12 +27,16 @@ LINK: dict[str, Any] = {
     "phy": {"name": "psk", "sample_rate": 1e6},
     "front_end": {"name": "sim"},
 }
-SCENARIO: dict[str, Any] = {"name": "trial", "registry": str(ROOT / "gr_ros2/scenarios/odom.csv"), "ros_source": {"namespace": "/robot_1"}}
+SCENARIO: dict[str, Any] = {
+    "name": "trial",
+    "registry": str(ROOT / "gr_ros2/scenarios/odom.csv"),
+    "ros_source": {"namespace": "/robot_1"},
+}
 SWEEP: dict[str, Any] = {
     "scenario": "paper-ofdm-paced",
     "time": "samples",
     "grid": {"channel.snr_db": [8, 10], "packet_len": [64, 128]},
-    "list": [{"phy.name": "ofdm"}, {"phy.name": "gfsk"}],
+    "list": [{"phy.name": "ofdm", "phy.options": {}}, {"phy.name": "gfsk", "phy.options": {}}],
 }
 
 OTHERS = {"cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
@@ -177,7 +181,9 @@ def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, t
         shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
     options = SHORTER.get(words[1], ())
     shorter = [] if not options or options[0] in words else list(options)
-    if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {re.split("=", word)[0] for word in words}:
+    if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {
+        re.split("=", word)[0] for word in words
+    }:
         shorter += ["--set", "time=samples"]
     if "--dashboard" in words:
         words = [word if word != "--dashboard" else "--dashboard=0" for word in words]

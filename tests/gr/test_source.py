@@ -17,13 +17,15 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link import Accepted, Refused, SentPacket
+from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.record.recorder import Recorder
 from gr_ros2.registry import Registry
-from gr_ros2.wire import decode
-from tests.e2e.support import free_domains
-from tests.gr.probe import Probe, wait_for
+from gr_ros2.wire.v0 import V0
+from tests.domains import free_domains
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61
@@ -76,7 +78,7 @@ def test_a_message_leaves_as_packets_with_metadata(rig: Rig) -> None:
     rig.start()
     rig.publish(b"\0\1\0\0" + bytes(720))
     wait_for(lambda: rig.probe.handled == 15)
-    packets = [decode(data, 64) for data in rig.probe.packets]
+    packets = [V0.decode(data, 64) for data in rig.probe.packets]
     assert {(packet.src_id, packet.dst_id, packet.hop) for packet in packets} == {(1, 9, 3)}
     metadata = [pmt.to_python(pmt.car(message)) for message in rig.probe.messages]
     assert [item["seq"] for item in metadata] == [packet.seq for packet in packets]
@@ -127,6 +129,43 @@ def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
     rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
     wait_for(lambda: bool(refused))
     assert refused[0].reason == "stale"
+
+
+def test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up(rig: Rig) -> None:
+    """Messages published while the source is held up, into a subscription of five."""
+    recorder = Recorder(REGISTRY, {1: "/robot_1"}, {1: [0]})
+    held, release = threading.Event(), threading.Event()
+
+    def observe(event: SenderEvent) -> None:
+        recorder.sender_event(1, event)
+        held.set()
+        release.wait(20)
+
+    source = rig.make(topics=["odom"], subscriber_depth=5, observer=observe)
+    rig.publish(bytes(40))
+    wait_for(held.is_set)
+    rig.publish(bytes(40), count=29)
+    release.set()
+    wait_for(lambda: source.stats()["topics"]["/robot_1/odom"]["submitted"] == 6)
+    topic = source.stats()["topics"]["/robot_1/odom"]
+    assert topic["lost_on_graph"] == 24
+    (result,) = recorder.finish(1.0, time.monotonic())
+    assert result.sent == sum(result.ledger.values()) == 30
+    assert result.ledger == {"in_flight": 6, "lost_on_graph": 24}
+
+
+def test_what_the_graph_loses_last_is_told_when_the_source_stops(rig: Rig) -> None:
+    events: list[SenderEvent] = []
+    source = rig.make(observer=events.append)
+    rig.start()
+    subscription = source._subscriptions[0]
+    source.middleware.count_lost(subscription, "/robot_1/odom", "lost", 3)
+    rig.top.stop()
+    rig.top.wait()
+    assert events == [Missed(0, 3)]
+    source.middleware.count_lost(subscription, "/robot_1/odom", "lost")
+    source.close()
+    assert events == [Missed(0, 3), Missed(0, 1)]
 
 
 def test_all_topics_or_a_subset(rig: Rig) -> None:
@@ -220,7 +259,7 @@ def test_settings_change_while_running(rig: Rig) -> None:
     source.set_debug(False)
     rig.publish(bytes(40))
     wait_for(lambda: rig.probe.handled == 1)
-    packet = decode(rig.probe.packets[0], 64)
+    packet = V0.decode(rig.probe.packets[0], 64)
     assert (packet.dst_id, packet.hop) == (4, 2)
     assert source.config.packet_rate == 1000.0
     with pytest.raises(ConfigError, match="dst_id = 300"):
@@ -236,9 +275,11 @@ def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
     source = rig.make(packet_len=64, observer=fail)
     rig.start()
     rig.publish(bytes(40))
-    wait_for(lambda: source.stats()["pump_failed"] == 1)
+    wait_for(lambda: source.stats()["observer_missed"] == 1)
     rig.publish(bytes(40))
-    wait_for(lambda: rig.probe.handled >= 1)
+    wait_for(lambda: rig.probe.handled == 2)
+    assert source.stats()["observer_missed"] == 3  # nor the second message, nor its packet
+    assert source.stats()["pump_failed"] == 0
 
 
 def test_debug_lines(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
