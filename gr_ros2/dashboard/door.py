@@ -1,16 +1,19 @@
 """Who may come in: the limits of the dashboard's web server, and what is said to those for whom there is no room.
 
-Laws: at most MAX_VIEWERS pages at a time, and one more is told so by a page that tries again; pages are made one after
-another, and making them takes at most a quarter of a core's time; connections are bounded, and those that say nothing
-are closed; whatever comes in on a WebSocket, the worst that follows is that it is closed; a WebSocket belongs to a page
-that was served here.
+Laws: at most MAX_VIEWERS pages at a time, and one more is told so by a page that tries again; pages are made and drawn
+for the first time one after another, which in the long run takes at most a quarter of a core; connections are bounded,
+and those that say nothing are closed; whatever comes in on a WebSocket, the worst that follows is that it is closed; a
+WebSocket belongs to a page that was served here.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +34,8 @@ MAX_VIEWERS = 8
 """Pages at a time. Each takes about 2 % of a core and 2 MB."""
 _RETRY_S = 10
 """s after which the page that says that there is no room tries again."""
-_IDLE_SHARE = 3.0
-"""Times as long as making a page took nothing is made afterwards."""
+SHARE, BURST_S = 0.25, 4.0
+"""Of a core, for making pages and drawing them for the first time; and s whose share may be used at once."""
 _MAX_WIRES = 2 * MAX_VIEWERS
 """WebSockets at a time; a page that is loaded anew has two for a moment."""
 _MAX_CONNECTIONS = 256
@@ -44,7 +47,7 @@ _MAX_FRAME = 65_536
 """Bytes of a WebSocket message; a viewer sends positions of sliders."""
 _TRY_AGAIN_LATER, _NOT_UNDERSTOOD = 1013, 1002
 """Status codes of a WebSocket that is closed (RFC 6455, section 7.4, and IANA's registry)."""
-_ANSWERS = {"PULL-DOC-REQ": ServerSession.pull, "PATCH-DOC": ServerSession.patch}
+_UNDERSTOOD = ("PULL-DOC-REQ", "PATCH-DOC")
 _CHANGES = ("ModelChanged", "MessageSent")
 _log = logging.getLogger(__name__)
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -69,7 +72,8 @@ class Room:
         self.documents: set[Document] = set()
         self.waiting = 0
         self.wires: set[Wire] = set()
-        self.making = asyncio.Lock()
+        self.budget = Budget()
+        self._busy = asyncio.Lock()
 
     @property
     def full(self) -> bool:
@@ -83,6 +87,32 @@ class Room:
         self.documents.add(document)
         document.on_session_destroyed(lambda _context: self.documents.discard(document))
         return True
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """For what takes long: one after another, and no more than the budget allows."""
+        async with self._busy:
+            await asyncio.sleep(self.budget.wait_s(time.monotonic()))
+            begin = time.thread_time()
+            try:
+                yield
+            finally:
+                self.budget.spend(time.thread_time() - begin, time.monotonic())
+
+
+class Budget:
+    """Processor time that may be spent: a share of each second, of the last BURST_S seconds together."""
+
+    def __init__(self) -> None:
+        self._paid_until = -math.inf
+
+    def wait_s(self, now: float) -> float:
+        """s until something may be spent again."""
+        return max(0.0, self._paid_until - now)
+
+    def spend(self, processor_s: float, now: float) -> None:
+        """So much has been spent."""
+        self._paid_until = max(self._paid_until, now - BURST_S) + processor_s / SHARE
 
 
 def keep(pages: BokehTornado, room: Room) -> None:
@@ -135,15 +165,10 @@ class Door(DocHandler):  # type: ignore[misc]
         self.request.headers.pop("Bokeh-Session-Id", None)
         room.waiting += 1
         try:
-            await room.making.acquire()
+            async with room.turn():
+                await super().get(*arguments, **named)
         finally:
             room.waiting -= 1
-        begin = time.thread_time()
-        try:
-            await super().get(*arguments, **named)
-        finally:
-            pause = _IDLE_SHARE * (time.thread_time() - begin)
-            asyncio.get_running_loop().call_later(pause, room.making.release)
 
     def _refuse(self) -> None:
         page = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True).get_template("full.html.j2")
@@ -193,7 +218,12 @@ class Wire(WSHandler):  # type: ignore[misc]
                 return
             if not _is_viewers(message):
                 raise ProtocolError(f"no viewer's page sends {message.msgtype}")
-            await self.send_message(await _ANSWERS[message.msgtype](message, self.connection))
+            if message.msgtype == "PULL-DOC-REQ":
+                async with self._room.turn():
+                    answer = await ServerSession.pull(message, self.connection)
+            else:
+                answer = await ServerSession.patch(message, self.connection)
+            await self.send_message(answer)
         except Exception as error:  # noqa: BLE001 - parsers fail in many ways on what is not meant for them
             _log.info("a viewer's connection is closed, since it sent what is not understood: %r", error)
             self.close(_NOT_UNDERSTOOD)
@@ -215,7 +245,7 @@ class Wire(WSHandler):  # type: ignore[misc]
 
 def _is_viewers(message: Any) -> bool:
     """Whether a message is one that the page of a viewer sends: it changes models, and neither adds nor removes any."""
-    if message.msgtype not in _ANSWERS:
+    if message.msgtype not in _UNDERSTOOD:
         return False
     events = message.content.get("events", []) if message.msgtype == "PATCH-DOC" else []
     return all(event["kind"] in _CHANGES for event in events)

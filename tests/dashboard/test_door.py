@@ -6,9 +6,11 @@ import asyncio
 import gc
 import json
 import logging
+import math
 import re
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -19,7 +21,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bokeh.document import Document
 from tornado.httpclient import HTTPRequest
-from tornado.websocket import WebSocketClientConnection, websocket_connect
+from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
 
 from gr_ros2.dashboard import door
 from gr_ros2.dashboard.page import Page
@@ -34,7 +36,7 @@ PULL = ('{"msgid": "1", "msgtype": "PULL-DOC-REQ"}', "{}", "{}")
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody waits for his page on purpose; pages that nobody connects to stay."""
-    monkeypatch.setattr(door, "_IDLE_SHARE", 0.0)
+    monkeypatch.setattr(door, "SHARE", math.inf)
     monkeypatch.setattr("gr_ros2.dashboard.server._UNUSED_MS", 60_000)
 
 
@@ -174,8 +176,8 @@ def test_garbage_closes_the_connection_and_prints_nothing(records: list[logging.
             for waits in (True, False):
                 wire = await connect(dashboard, token)
                 assert not waits or await hear(wire, "ACK")
-                for part in parts:
-                    if wire.close_code is None:
+                with suppress(WebSocketClosedError):  # closed after the first of them
+                    for part in parts:
                         await wire.write_message(part, binary=isinstance(part, bytes))
                 assert not await hear(wire, "nothing of that kind")
         for given, protocol in (("garbage", "bokeh"), ("YWJj.ZGVm", "bokeh"), (token[:-1], "bokeh"), (token, "other")):
@@ -238,3 +240,36 @@ def test_a_page_that_cannot_be_made_leaves_its_place(monkeypatch: pytest.MonkeyP
         get(dashboard.url)
         monkeypatch.undo()
         wait_for(lambda: get(dashboard.url)[0] == 200, "a place")
+
+
+def test_the_budget_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(door, "SHARE", 0.25)
+    budget = door.Budget()
+    now = spent = 0.0
+    while now < 100.0:
+        now += budget.wait_s(now)
+        budget.spend(0.15, now)
+        spent += 0.15
+    assert spent == pytest.approx(0.25 * (100.0 + door.BURST_S), abs=0.3)
+    now += 1000.0
+    assert budget.wait_s(now) == 0  # what was not spent for a long time
+    budget.spend(0.25 * door.BURST_S + 0.1, now)
+    assert budget.wait_s(now) == pytest.approx(0.4)  # is no reserve
+
+
+def test_drawing_a_page_again_and_again_is_held_to_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def pull(dashboard: Dashboard, token: str) -> None:
+        wire = await connect(dashboard, token)
+        assert await hear(wire, "ACK")
+        for _ in range(3):
+            for part in PULL:
+                await wire.write_message(part)
+        for _ in range(3):
+            assert await hear(wire, "PULL-DOC-REPLY")
+
+    with Dashboard(port=0) as dashboard:
+        spent: list[float] = []
+        monkeypatch.setattr(dashboard._room.budget, "spend", lambda processor_s, _now: spent.append(processor_s))
+        asyncio.run(pull(dashboard, token(get(dashboard.url)[1])))
+        assert len(spent) == 4
+        assert min(spent) > 0
