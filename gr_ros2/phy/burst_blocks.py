@@ -135,9 +135,10 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(phy.packet_len, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._modem = phy.running_modem
-        self._gap = np.zeros(phy.gap, np.complex64)
+        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
+        self._burst = self._whole[: phy.modem.burst_samples]
         self._waiting: deque[bytes] = deque()
-        self._rest = self._gap[:0]
+        self._rest = self._whole[:0]
 
     def take_packet(self, packet: bytes) -> None:
         self._waiting.append(packet)
@@ -146,7 +147,8 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         out, done = output_items[0], 0
         while done < len(out) and (len(self._rest) or self._waiting):
             if not len(self._rest):
-                self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
+                self._burst[:] = self._modem.modulate(self._waiting.popleft())
+                self._rest = self._whole
             count = min(len(out) - done, len(self._rest))
             out[done : done + count] = self._rest[:count]
             self._rest = self._rest[count:]

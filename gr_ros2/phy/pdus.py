@@ -12,6 +12,7 @@ import pmt
 PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 """The message ports of our blocks: packets, and what asks for them."""
 
+_NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
 _OFFSET = 8
 """A serialized u8vector: type 10, kind 0, length u32 big-endian, one byte of padding and its count, then the bytes."""
@@ -31,4 +32,4 @@ def octets(vector: Any) -> bytes:
 
 def pdu_of(data: bytes) -> Any:
     """A packet as a PDU without metadata."""
-    return pmt.cons(pmt.make_dict(), u8vector(data))
+    return pmt.cons(_NO_METADATA, u8vector(data))
