@@ -34,11 +34,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 GROUPS = {
+    "real_time": "radios that the processor must keep up with",
     "cluster": "Dask with two workers",
     "installed": "a wheel and a virtual environment",
     "platform": "GRC with all its blocks",
 }
-"""Fixtures that are dear to make: tests that share one run in one worker, so that it is made once."""
+"""Fixtures that are dear to make, and markers: tests that share one run one after another, in one worker."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -53,7 +54,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not config.pluginmanager.hasplugin("xdist"):
         return
     for item in items:
-        for name in GROUPS.keys() & set(getattr(item, "fixturenames", ())):
+        names = {mark.name for mark in item.iter_markers()} | set(getattr(item, "fixturenames", ()))
+        for name in GROUPS.keys() & names:
             item.add_marker(pytest.mark.xdist_group(name))
     if os.environ.get("PYTEST_XDIST_WORKER"):
         items.sort(key=lambda item: item.get_closest_marker("slow") is None)

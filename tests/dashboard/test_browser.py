@@ -107,7 +107,7 @@ def viewer(tmp_path: Path) -> Iterator[Viewer]:
 def program(out: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A long run over OFDM with a dashboard, and where that is."""
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
-    settings += ["phy.sample_rate=5e5", "channel.snr_db=30"]
+    settings += ["phy.sample_rate=5e5", "channel.snr_db=30", "sim.odom_rate=15"]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -130,6 +130,7 @@ def stop(process: subprocess.Popen[str], out: Path) -> Result:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path: Path) -> None:
     with program(tmp_path / "out") as (process, url):
         viewer.driver.get(url)
@@ -177,6 +178,7 @@ def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_the_page_returns_with_the_next_run(viewer: Viewer, tmp_path: Path) -> None:
     with program(tmp_path / "one") as (process, url):
         viewer.driver.get(url)

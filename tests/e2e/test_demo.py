@@ -37,6 +37,7 @@ def subscriber(domain: int, topic: str, type_name: str) -> Iterator[Peer]:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path) -> None:
     sending, receiving = free_domains()
     out = tmp_path / "out"

@@ -34,6 +34,7 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
     return heard
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [

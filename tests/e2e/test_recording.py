@@ -34,6 +34,7 @@ def recording(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
     return path, messages
 
 
+@pytest.mark.real_time
 @needs_husky
 def test_a_recorded_drive_crosses_the_ofdm_link_completely(
     tmp_path: Path, recording: tuple[Path, list[BagMessage]]

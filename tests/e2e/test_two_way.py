@@ -13,6 +13,7 @@ from tests.e2e.support import check_books, check_complete, delivered_bag, scenar
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -> None:
     clean = [
         "ros_source.topic_options={}",
@@ -35,6 +36,7 @@ def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path) -> None:
     lossy = [
         "ros_source.topic_options={}",
@@ -61,6 +63,7 @@ def test_a_sink_that_would_feed_the_source_beside_it_is_refused(tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_nothing_passes_while_the_link_is_unplugged(tmp_path: Path) -> None:
     begin, end, slack = 0.5, 1.2, 0.1
     unplugged = scenario("paper-direct", f"channel.outages=[[{begin}, {end}]]", duration_s=2.0)

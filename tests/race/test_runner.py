@@ -38,6 +38,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     peers = ("gr-ros2", "cyclone-best-effort", "zenoh-tcp")
     options = ("--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "2", "--out", str(tmp_path))

@@ -78,6 +78,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_without_noise_real_time_samples_and_packets_agree() -> None:
     patient = "ros_source.queue_depth=100"  # a busy computer may hold up real time, which must not lose messages
     real = run_scenario(scenario("paper-ofdm-paced", patient, duration_s=3.0)).result
