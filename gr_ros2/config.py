@@ -100,6 +100,10 @@ class TopicOptions:
         return self
 
 
+DEFAULT_MIDDLEWARE = "dds"
+"""Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
+
+
 @dataclass(frozen=True, config=_STRICT)
 class SourceConfig:
     """ROS Source (the paper, section 4.3; docs/parameters.md).
@@ -149,7 +153,7 @@ class SourceConfig:
     compression: bool = False
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
-    middleware: str = "dds"
+    middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 
@@ -220,7 +224,7 @@ class SinkConfig:
     use_sim_time: bool = False
     frame_prefix: FrameForm = ""
     merge_tf: MergedTopic = ""
-    middleware: str = "dds"
+    middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 

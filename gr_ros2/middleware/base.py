@@ -112,9 +112,12 @@ class Middleware(ABC):
 
     ``counters`` names what went wrong, for statistics: ``samples_lost:/topic``, ``incompatible_qos:/topic:policy``,
     ``incompatible_type:/topic`` and ``callback_failed:/topic``. The first of each is also logged.
+
+    :ivar domain_id: of its graph; None of one that nobody else can be on, such as a file
     """
 
     name: ClassVar[str]
+    domain_id: int | None = None
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()

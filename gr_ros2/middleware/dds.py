@@ -61,7 +61,7 @@ class DdsMiddleware(Middleware):
         localhost_only: bool | None = None,
     ) -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self.localhost_only = ros_graph.localhost_only() if localhost_only is None else localhost_only
         self._node = ros_graph.check_node(node_name, namespace)
         self._gid_bytes = ros_graph.gid_size(os.environ)

@@ -203,7 +203,7 @@ class MemoryMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = 0, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         ros_graph.check_node(node_name, namespace)
         with _graphs_lock:
             self.graph = _graphs.setdefault(self.domain_id, _Graph())

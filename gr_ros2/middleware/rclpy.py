@@ -138,7 +138,7 @@ class RclpyMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        domain_id = resolve_domain_id(domain_id)
+        self.domain_id = domain_id = resolve_domain_id(domain_id)
         node_name, namespace = check_node(node_name, namespace)
         self._context = Context()
         try:

@@ -100,7 +100,7 @@ class ZenohMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self._node_name, self._namespace = ros_graph.check_node(node_name, namespace)
         self._has_hashes = ros_graph.gid_size() != 24
         self._declaring = threading.RLock()  # held while Zenoh declares for us, so that close() comes before or after

@@ -16,6 +16,7 @@ PHY = BackendTable(
         "psk": Backend("gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO),
         "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO),
     },
+    Backend,
 )
 
 __all__ = ["PHY", "Phy"]

@@ -18,6 +18,7 @@ FRONT_ENDS = BackendTable(
         "uhd": Backend("gr_ros2.radio.uhd", "UhdFrontEnd", "USRPs", "gr-uhd, part of GNU Radio 3.10"),
         "pluto": Backend("gr_ros2.radio.pluto", "PlutoFrontEnd", "ADALM-Pluto", "gr-iio, part of GNU Radio 3.10"),
     },
+    Backend,
 )
 
 __all__ = ["FRONT_ENDS"]
