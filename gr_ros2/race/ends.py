@@ -123,6 +123,7 @@ class _ZenohPublisher(Publisher):
 
 class _ZenohSubscription(Subscription):
     def __init__(self, subscriber: Any, session: Any) -> None:
+        super().__init__()
         self._subscriber, self._session = subscriber, session
 
     def matched(self) -> int:
