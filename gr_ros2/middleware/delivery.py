@@ -18,15 +18,16 @@ from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback,
 class CallbackThread:
     """The thread in which a participant calls back.
 
-    :param middleware: whose it is
-    :param name: of the thread
+    :param middleware: whose it is, its domain known
+    :param node_name: of the participant, for the thread's name
     """
 
-    def __init__(self, middleware: Middleware, name: str) -> None:
+    def __init__(self, middleware: Middleware, node_name: str) -> None:
         self._middleware = middleware
         self._steps: deque[Callable[[], object]] = deque()
         self._changed = threading.Condition()
         self._closed = False
+        name = f"{middleware.name}-{middleware.domain_id}-{node_name}"
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 

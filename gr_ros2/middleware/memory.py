@@ -160,7 +160,7 @@ class MemoryMiddleware(Middleware):
         with _graphs_lock:
             self.graph = _graphs.setdefault(self.domain_id, _Graph())
         self.closed = False
-        self.thread = CallbackThread(self, f"memory-{self.domain_id}-{node_name}")
+        self.thread = CallbackThread(self, node_name)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> MemorySubscription:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)

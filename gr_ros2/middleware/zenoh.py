@@ -115,7 +115,7 @@ class ZenohMiddleware(Middleware):
             )
             node = Entity(self._session_id, 0, "NN", self._node_name, self._namespace)
             self._token = self._session.liveliness().declare_token(node.token(self.domain_id))
-        self.thread = CallbackThread(self, f"zenoh-{self.domain_id}-{node_name}")
+        self.thread = CallbackThread(self, node_name)
         self._patience = threading.Timer(_ROUTER_S, self.thread.call, [self._miss_router])
         self._patience.daemon = True
         self._patience.start()

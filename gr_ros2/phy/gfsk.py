@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import build
 from gr_ros2.phy.burst import Frame, Samples
 from gr_ros2.phy.burst_blocks import BurstOptions
 from gr_ros2.phy.fec import Soft
@@ -144,8 +143,8 @@ class GfskPhy(LinearPhy):
     """
 
     name = "gfsk"
+    Options = GfskOptions
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
-        self.options = build(GfskOptions, options, "phy gfsk")
-        modem = GfskModem(Frame(packet_len, self.options.fec), self.options)
-        super().__init__(packet_len, sample_rate, modem, self.options)
+        super().__init__(packet_len, sample_rate, **options)
+        self.modem = GfskModem(Frame(packet_len, self.options.fec), self.options)

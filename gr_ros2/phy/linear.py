@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
-from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.soft import Points, spread_about
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error
@@ -241,17 +241,9 @@ class LinearModem(BurstModem):
 
 
 class LinearPhy(BurstPhy):
-    """A PHY of single-carrier bursts, whose mean power is 1.
-
-    :param options: what every burst PHY has
-    """
+    """A PHY of single-carrier bursts, whose mean power is 1."""
 
     modem: LinearModem
-
-    def __init__(self, packet_len: int, sample_rate: float, modem: LinearModem, options: BurstOptions) -> None:
-        super().__init__(packet_len, sample_rate)
-        self.modem = modem
-        self.gap = options.gap
 
     @property
     def receiver_taps(self) -> Any:
