@@ -1,7 +1,8 @@
 """Lazy tables of back-ends: name -> where its class lives and what must be installed for it.
 
-Law: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio,
-ROS 2 or a DDS.
+Laws: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS 2 or a
+DDS; packages of others add rows by entry points, which are read only when a name is not one of ours, or all names are
+asked for; one of these that is broken harms nobody but who chooses it.
 """
 
 from __future__ import annotations
@@ -11,47 +12,83 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
-from typing import Any
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
 
 from gr_ros2.errors import BackendMissingError, ConfigError
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Backend:
-    """One row: module and class, one line of help, and the package a user installs to get it."""
+    """One row.
+
+    :param module: dotted name of the module
+    :param attribute: the class in it
+    :param summary: one line of help
+    :param requires: the package a user installs to get it, '' = nothing beside this one
+    :param title: what GRC calls it, '' = its name in capitals
+    """
 
     module: str
     attribute: str
     summary: str
     requires: str = ""
+    title: str = ""
 
 
-class BackendTable(Mapping[str, Backend]):
-    """A family of back-ends (middleware, PHY, scheduler), read by CLI, YAML, GRC options and docs alike."""
+RowT = TypeVar("RowT", bound=Backend)
 
-    def __init__(self, family: str, rows: Mapping[str, Backend]) -> None:
+
+class BackendTable(Mapping[str, RowT], Generic[RowT]):
+    """A family of back-ends (middleware, PHY, …), read by CLI, YAML, GRC options and docs alike.
+
+    Other packages add to it by entry points of the group ``gr_ros2.FAMILY``, in their ``pyproject.toml`` for instance::
+
+        [project.entry-points."gr_ros2.phy"]
+        ook = "my_package.ook:OokPhy"
+
+    The entry point names the class, for which the row then has its defaults, or a row.
+
+    :param family: what errors call a row, and the last part of the group
+    :param rows: ours, by name; no entry point can replace one
+    :param kind: of a row
+    """
+
+    def __init__(self, family: str, rows: Mapping[str, RowT], kind: type[RowT]) -> None:
         self.family = family
-        self._rows = dict(rows)
+        self.own: Mapping[str, RowT] = dict(rows)
+        """The rows of this package, without those of others."""
+        self._kind = kind
 
-    def __getitem__(self, name: str) -> Backend:
-        return self._rows[name]
+    def __getitem__(self, name: str) -> RowT:
+        """The row of a name.
+
+        :raises KeyError: for a name that is not in the table
+        :raises BackendMissingError: when the entry point that has this name cannot be loaded
+        """
+        return self.own[name] if name in self.own else self._row_of(self._others[name])
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
+        yield from self.own
+        yield from self._others
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.own) + len(self._others)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.own or name in self._others
 
     def load(self, name: str) -> Any:
         """The class behind a name.
 
         :raises ConfigError: for a name that is not in the table
-        :raises BackendMissingError: when its package is not installed
+        :raises BackendMissingError: when its package is not installed, or the entry point that names it is broken
         """
-        if name not in self._rows:
-            raise ConfigError(f"{self.family}: no {name!r}; known are {', '.join(self._rows)}")
-        row = self._rows[name]
+        if name not in self:
+            raise ConfigError(f"{self.family}: no {name!r}; known are {', '.join(self)}")
+        row = self[name]
         try:
             with uninterrupted():
                 return getattr(import_module(row.module), row.attribute)
@@ -59,6 +96,34 @@ class BackendTable(Mapping[str, Backend]):
             if not row.requires:
                 raise
             raise BackendMissingError(f"{self.family} {name!r} needs {row.requires} ({error})") from error
+
+    @cached_property
+    def _others(self) -> Mapping[str, EntryPoint]:
+        """Entry points of other packages; where two have one name, the first found."""
+        found: dict[str, EntryPoint] = {}
+        for entry in entry_points(group=f"gr_ros2.{self.family}"):
+            if entry.name not in self.own:
+                found.setdefault(entry.name, entry)
+        return found
+
+    def _row_of(self, entry: EntryPoint) -> RowT:
+        package = "?" if entry.dist is None else entry.dist.metadata["Name"]
+        try:
+            with uninterrupted():
+                loaded = entry.load()
+        except Exception as error:  # whatever code of others raises, it is to be said in one line
+            raise BackendMissingError(
+                f"{self.family} {entry.name!r}: package {package} has it as {entry.value}, which cannot be loaded "
+                f"({type(error).__name__}: {error}); mend or remove that package"
+            ) from error
+        if isinstance(loaded, self._kind):
+            return loaded
+        if not isinstance(loaded, type):
+            raise BackendMissingError(
+                f"{self.family} {entry.name!r}: package {package} has it as {entry.value}, which is neither a class "
+                f"nor a {self._kind.__name__}; mend or remove that package"
+            )
+        return self._kind(entry.module, entry.attr, f"of package {package}")
 
 
 @contextmanager

@@ -101,6 +101,10 @@ class TopicOptions:
         return self
 
 
+DEFAULT_MIDDLEWARE = "dds"
+"""Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
+
+
 @dataclass(frozen=True, config=_STRICT)
 class SourceConfig:
     """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
@@ -150,7 +154,7 @@ class SourceConfig:
     compression: bool = False
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
-    middleware: str = "dds"
+    middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 
@@ -226,7 +230,7 @@ class SinkConfig:
     use_sim_time: bool = False
     frame_prefix: FrameForm = ""
     merge_tf: MergedTopic = ""
-    middleware: str = "dds"
+    middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 

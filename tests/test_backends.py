@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import signal
 import subprocess
 import sys
@@ -11,18 +12,20 @@ from pathlib import Path
 
 import pytest
 
+import gr_ros2
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.link import SCHEDULER
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
+from gr_ros2.radio import FRONT_ENDS
 
 ROWS = {
     "there": Backend("collections", "OrderedDict", "always there"),
     "missing": Backend("no_such_package_at_all.bus", "Bus", "not installed", "pip install no-such-package"),
     "broken": Backend("no_such_package_at_all.bus", "Bus", "ours, so a missing module is a bug"),
 }
-TABLE = BackendTable("bus", ROWS)
+TABLE = BackendTable("bus", ROWS, Backend)
 
 
 def test_a_table_is_a_mapping_in_order() -> None:
@@ -66,7 +69,7 @@ def test_a_signal_waits_for_the_end_of_an_import(
     lines = ["import signal", f"signal.raise_signal({int(number)})", "Bus = 1" if works else "import no_such_package"]
     (tmp_path / f"{name}.py").write_text("\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
-    table = BackendTable("bus", {"one": Backend(name, "Bus", "is interrupted", "pip install something else")})
+    table = BackendTable("bus", {"one": Backend(name, "Bus", "is interrupted", "pip install something else")}, Backend)
     before = signal.signal(number, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
@@ -82,9 +85,37 @@ def test_a_thread_loads_too() -> None:
         assert pool.submit(TABLE.load, "there").result() is OrderedDict
 
 
-@pytest.mark.parametrize("table", [MIDDLEWARE, PHY, SCHEDULER], ids=lambda table: table.family)
-def test_every_row_has_a_summary_of_one_line(table: BackendTable) -> None:
-    assert all(row.summary and "\n" not in row.summary for row in table.values())
+@pytest.mark.parametrize("table", [MIDDLEWARE, PHY, FRONT_ENDS, SCHEDULER], ids=lambda table: table.family)
+def test_every_row_has_a_summary_of_one_line(table: BackendTable[Backend]) -> None:
+    assert all(row.summary and "\n" not in row.summary for row in table.own.values())
+
+
+NAMES = {*MIDDLEWARE.own, *PHY.own, *FRONT_ENDS.own}
+MEANT = {
+    "race/ends.py": {"dds", "zenoh"},  # these very stacks are what races
+    "race/settings.py": {"zenoh", "sim"},
+    "run/scenario.py": {"sim"},  # the simulated robots, not the front end
+}
+"""Modules outside the back-ends' own that may name one, and which."""
+
+
+def test_no_module_decides_by_the_name_of_a_back_end() -> None:
+    """A row of another name would not be part of what is compared with a name, or opened by one."""
+    root = Path(gr_ros2.__file__).parent
+    found: dict[str, set[str]] = {}
+    for path in sorted(root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            used: list[ast.AST] = []
+            if isinstance(node, ast.Compare):
+                used = [node.left, *node.comparators]
+            elif isinstance(node, ast.Call):
+                opens = {getattr(node.func, "attr", ""), getattr(node.func, "id", "")} & {"load", "join_graph"}
+                used = list(node.args) if opens else []
+            constants = (part for item in used for part in ast.walk(item) if isinstance(part, ast.Constant))
+            found.setdefault(path.relative_to(root).as_posix(), set()).update(
+                str(constant.value) for constant in constants if constant.value in NAMES
+            )
+    assert {module: names for module, names in found.items() if names} == MEANT
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,25 @@ def test_arrows_point_down_only(module: str) -> None:
     assert up == []
 
 
+def test_no_modules_import_each_other() -> None:
+    """Not for types either: two that know each other are one, in two files."""
+    names = {module.removesuffix(".py").removesuffix("/__init__").replace("/", "."): module for module in MODULES}
+
+    def imported(module: str) -> set[str]:
+        found = set()
+        for name in imports(MODULES[module]):
+            inner = name.removeprefix("gr_ros2.")
+            known = inner if inner in names else inner.rpartition(".")[0]
+            if name.startswith("gr_ros2.") and known in names:
+                found.add(names[known])
+        return found - {module}
+
+    needs = {module: imported(module) for module in MODULES}
+    while free := {module for module, others in needs.items() if not others & needs.keys()}:
+        needs = {module: others for module, others in needs.items() if module not in free}
+    assert {module: sorted(others & needs.keys()) for module, others in needs.items()} == {}
+
+
 @pytest.mark.parametrize("module", [module for module in MODULES if part(module) in PURE])
 def test_wire_and_link_are_pure(module: str) -> None:
     outside = {name.split(".")[0] for name in imports(MODULES[module])} - {"gr_ros2"}

@@ -11,13 +11,14 @@ from dataclasses import fields
 from pathlib import Path
 
 import click
+from click.shell_completion import CompletionItem
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gr_ros2.config import TopicOptions
+from gr_ros2.config import DEFAULT_MIDDLEWARE, TopicOptions
 from gr_ros2.errors import ConfigError
-from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos, TopicInfo
+from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.names import checked_namespace, topic_fault
@@ -30,9 +31,7 @@ _NO_MESSAGES = {"srv": "a service", "action": "an action"}
 """Of types: the middle part where it is not ``msg``, and what has such types."""
 _LATCHED = "durability"
 _QOS_COLUMNS = ("reliability", _LATCHED, "depth")
-
-_GRAPHS = [name for name in MIDDLEWARE if name in ("dds", "rclpy")]
-"""Back-ends that join a live ROS graph."""
+_SHARED = [name for name, row in MIDDLEWARE.own.items() if row.scope == "shared"]
 
 
 @click.command()
@@ -62,16 +61,42 @@ _topics = click.option("--topics", default="", metavar="A,B,…", help="Only the
 _out = click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write; default: print it.")
 
 
+class SharedGraph(click.ParamType):
+    """A middleware on whose graph a robot of another process can be; other packages' are looked up only when named."""
+
+    name = "middleware"
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if value not in MIDDLEWARE or MIDDLEWARE[value].scope != "shared":
+            self.fail(f"{value!r} has no graph that a robot could be on; take {', '.join(_SHARED)}", param, ctx)
+        return value
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002 - click's signature
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        return [CompletionItem(name) for name in _SHARED if name.startswith(incomplete)]
+
+
 @click.command("from-graph")
 @_namespace
 @_topics
-@click.option("--middleware", default="dds", show_default=True, type=click.Choice(_GRAPHS))
+@click.option(
+    "--middleware",
+    default=DEFAULT_MIDDLEWARE,
+    show_default=True,
+    type=SharedGraph(),
+    metavar="NAME",
+    help=f"Whose graph: {', '.join(_SHARED)}.",
+)
 @click.option("--domain-id", default=-1, type=click.IntRange(-1, 232), help="DDS domain; -1 takes ROS_DOMAIN_ID.")
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
 @_out
 def from_graph(*, namespace: str, topics: str, middleware: str, domain_id: int, wait: float, out: Path | None) -> None:
     """Write a registry from the topics that are published on the ROS graph."""
-    with _participant(middleware, domain_id) as graph:
+    with join_graph(middleware, domain_id=domain_id, node_name="gr_ros2") as graph:
         time.sleep(wait)  # discovery has no way to say that it is complete
         found = graph.discover()
     _write(registry_csv(found, namespace, _names(topics)), unfit(found), out)
@@ -189,11 +214,6 @@ def _write(text: str, left_out: Mapping[str, str], out: Path | None) -> None:
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
     print(f"{out}: {len(text.splitlines()) - 1} topics, digest {Registry.from_csv(out).digest}")
-
-
-def _participant(middleware: str, domain_id: int) -> Middleware:
-    made: Middleware = MIDDLEWARE.load(middleware)(domain_id=domain_id)
-    return made
 
 
 def _options(topic: Topic) -> str:

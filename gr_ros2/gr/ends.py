@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.middleware import MIDDLEWARE, Middleware
-from gr_ros2.middleware.ros_graph import resolve_domain_id
+from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry
 from gr_ros2.wire import BROADCAST
 
@@ -72,31 +71,20 @@ class Graph:
     """A block's participant on a ROS graph: handed over open, or opened by name and then closed by us.
 
     :param middleware: an open one, or None to open ``name``
-    :raises ConfigError: for a name that is not in the table, or a back-end that must be opened by hand
-    :raises BackendMissingError: when its package is not installed
+    :raises GrRos2Error: see :func:`gr_ros2.middleware.join_graph`
     """
 
     def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int, node_name: str) -> None:
         if isinstance(middleware, Middleware):
             self.middleware = middleware
             self.owned = False
-        elif name == "bag":
-            raise ConfigError("middleware = 'bag': a bag needs a path; open BagMiddleware and hand it over")
         else:
-            self.middleware = MIDDLEWARE.load(name)(domain_id=domain_id, node_name=node_name)
+            self.middleware = join_graph(name, domain_id=domain_id, node_name=node_name)
             self.owned = True
-        self._domain_id = getattr(self.middleware, "domain_id", resolve_domain_id(domain_id))
 
     def same_as(self, other: Graph) -> bool:
         """Whether what one publishes the other can hear."""
-        if self.middleware is other.middleware:
-            return True
-        if "bag" in (self.middleware.name, other.middleware.name):
-            return False
-        # rclpy meets DDS or Zenoh on the wire, as its RMW has it; these two never meet, and memory meets memory only.
-        names = {self.middleware.name, other.middleware.name}
-        apart = names == {"dds", "zenoh"} or ("memory" in names and len(names) > 1)
-        return self._domain_id == other._domain_id and not apart
+        return meet(self.middleware, other.middleware)
 
     def close(self) -> None:
         """Leave the graph, if we joined it."""

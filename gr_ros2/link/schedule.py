@@ -108,4 +108,5 @@ SCHEDULER = BackendTable(
             "gr_ros2.link.freshness", "FreshnessScheduler", "what lowers the weighted age most per airtime"
         ),
     },
+    Backend,
 )

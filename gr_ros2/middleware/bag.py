@@ -18,13 +18,10 @@ from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.bag_files import BagContents, BagMessage, bag_contents, bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
-from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.registry import normalize_type
 
 __all__ = ["BagMessage", "BagMiddleware", "BagPublisher", "bag_definitions", "bag_topics", "read_bag"]
-
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,25 +63,20 @@ class BagSubscription(Subscription):
     """A topic being played."""
 
     def __init__(self, topic: str, callback: MessageCallback, publishers: Sequence[Qos]) -> None:
+        super().__init__()
         self.topic = topic
         self.callback = callback
         self.closed = False
-        self.calling = threading.RLock()  # held while calling back
         self._publishers = publishers
+        self.found(publishers)
 
     def matched(self) -> int:
         """Number of recorded publishers of this topic."""
         return 0 if self.closed else len(self._publishers)
 
-    def follow(self, on_offers: OffersCallback) -> None:
-        if self._publishers:
-            on_offers(self._publishers)
-
     def close(self) -> None:
         self.closed = True
-        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
-        if self.calling.acquire(timeout=JOIN_S):
-            self.calling.release()
+        self.wait_for_callback()
 
 
 class BagMiddleware(Middleware):
@@ -234,11 +226,8 @@ class BagMiddleware(Middleware):
         self._stop.set()
         if self._recorder is not None:
             self._recorder.close()
-        thread = self._thread
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(JOIN_S)
-            if thread.is_alive():
-                _log.warning("bag %s: a callback has not returned; closing without it", self.path)
+        if self._thread is not None:
+            self.wait_for_thread(self._thread)
 
     def _reading(self, what: str) -> None:
         if self._recorder is not None:

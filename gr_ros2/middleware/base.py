@@ -12,7 +12,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import ClassVar, Literal
@@ -20,6 +20,8 @@ from typing import ClassVar, Literal
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
 MessageCallback = Callable[[bytes], None]
+JOIN_S = 1.0
+"""s that closing waits for a callback to return."""
 FOR_EVER_S = 1e9
 """A duration from which on it is none: what stands for "infinite" differs between DDS, rclpy and bags."""
 
@@ -70,6 +72,18 @@ class TopicInfo:
     subscribers: tuple[Qos, ...] = ()
 
 
+def grouped(publishers: Iterable[tuple[str, str, Qos]], subscribers: Iterable[tuple[str, str, Qos]]) -> list[TopicInfo]:
+    """Endpoints by topic and type, sorted by name.
+
+    :param publishers: topic, type and QoS of each; likewise those of the subscribers
+    """
+    rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
+    for column, endpoints in enumerate((publishers, subscribers)):
+        for topic, type_name, qos in endpoints:
+            rows.setdefault((topic, type_name), ([], []))[column].append(qos)
+    return [TopicInfo(*names, tuple(offers), tuple(requests)) for names, (offers, requests) in sorted(rows.items())]
+
+
 class Publisher(ABC):
     """A topic we publish on."""
 
@@ -89,22 +103,48 @@ class Subscription(ABC):
     """A topic we listen to.
 
     :ivar lost: messages published on it that were lost before they reached the callback, as far as the graph tells
+    :ivar calling: for back-ends: held while calling back
     """
 
-    lost: int = 0
+    def __init__(self) -> None:
+        self.lost = 0
+        self.calling = threading.RLock()
+        self._offers: list[Qos] = []
+        self._on_offers: OffersCallback | None = None
 
     @abstractmethod
     def matched(self) -> int:
         """Number of publishers currently matched."""
 
-    def follow(self, on_offers: OffersCallback) -> None:  # noqa: B027 - a graph without discovery has nothing to tell
+    def follow(self, on_offers: OffersCallback) -> None:
         """Call ``on_offers`` with what the publishers found offer, now and whenever that has changed.
 
         It runs in the thread of the caller or of the back-end; without any publisher it is not called.
         """
+        with self.calling:
+            self._on_offers = on_offers
+            self._tell()
 
     @abstractmethod
     def close(self) -> None: ...
+
+    # For back-ends
+
+    def found(self, offers: Sequence[Qos]) -> None:
+        """Let those who follow hear what the publishers found offer now, if that has changed."""
+        with self.calling:
+            if list(offers) != self._offers:
+                self._offers = list(offers)
+                self._tell()
+
+    def wait_for_callback(self) -> None:
+        """A callback in progress ends first, unless it is the one that closes or takes longer than we may wait."""
+        if self.calling.acquire(timeout=JOIN_S):
+            self.calling.release()
+
+    def _tell(self) -> None:
+        if self._on_offers is not None and self._offers:
+            self._on_offers(self._offers)
 
 
 class Middleware(ABC):
@@ -112,9 +152,12 @@ class Middleware(ABC):
 
     ``counters`` names what went wrong, for statistics: ``samples_lost:/topic``, ``incompatible_qos:/topic:policy``,
     ``incompatible_type:/topic`` and ``callback_failed:/topic``. The first of each is also logged.
+
+    :ivar domain_id: of its graph; None of one that nobody else can be on, such as a file
     """
 
     name: ClassVar[str]
+    domain_id: int | None = None
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -151,6 +194,11 @@ class Middleware(ABC):
         if first:
             _log.log(level, "%s (counted as %s, not logged again)", text, key)
 
+    def count_once(self, key: str, text: str) -> None:
+        """Count what lasts, such as endpoints that do not fit, the first time only."""
+        if key not in self.counters:
+            self.count(key, text)
+
     def count_lost(self, subscription: Subscription, topic: str, text: str, n: int = 1) -> None:
         """Count messages that a subscription was to hear and will not, from any thread."""
         self.count(f"samples_lost:{topic}", text, n)
@@ -164,6 +212,13 @@ class Middleware(ABC):
         except Exception as error:  # noqa: BLE001 - user code: whatever it raises must not stop the other topics
             self.count(f"callback_failed:{topic}", f"the callback of {topic} failed: {type(error).__name__}: {error}")
             _log.debug("callback of %s", topic, exc_info=True)
+
+    def wait_for_thread(self, thread: threading.Thread) -> None:
+        """Wait ``JOIN_S`` for a thread that calls back to end, unless called from it."""
+        if thread is not threading.current_thread():
+            thread.join(JOIN_S)
+            if thread.is_alive():
+                _log.warning("%s: a callback has not returned; closing without it", thread.name)
 
     def __enter__(self) -> Middleware:
         return self

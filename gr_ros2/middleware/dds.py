@@ -10,14 +10,14 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
-from gr_ros2.middleware.base import MessageCallback, Middleware, Qos, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Qos, TopicInfo, grouped
 from gr_ros2.middleware.cdr_dds import (
     DdsError,
     DiscoveredEndpoint,
@@ -30,7 +30,7 @@ from gr_ros2.middleware.cdr_dds import (
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
-from gr_ros2.middleware.dds_endpoints import JOIN_S, SLACK, DdsPublisher, DdsSubscription
+from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
 from gr_ros2.registry import normalize_type
 
 _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
@@ -39,7 +39,7 @@ _PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
 _log = logging.getLogger(__name__)
 
 
-class DdsMiddleware(Middleware):
+class DdsMiddleware(DdsParticipant):
     """A participant.
 
     :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
@@ -61,7 +61,7 @@ class DdsMiddleware(Middleware):
         localhost_only: bool | None = None,
     ) -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self.localhost_only = ros_graph.localhost_only() if localhost_only is None else localhost_only
         self._node = ros_graph.check_node(node_name, namespace)
         self._gid_bytes = ros_graph.gid_size(os.environ)
@@ -126,14 +126,9 @@ class DdsMiddleware(Middleware):
 
     def discover(self) -> list[TopicInfo]:
         """The topics seen so far; a fresh participant needs a moment (tenths of a second) to see any."""
-        rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         with self._lock:
-            found = [(column, e) for column, n in enumerate(self._found) for e in self._found[n].values()]
-        for column, endpoint in found:
-            topic = ros_graph.ros_topic(endpoint.topic)
-            if topic is not None and endpoint.participant != self._guid:
-                rows.setdefault((topic, ros_graph.ros_type(endpoint.type_name)), ([], []))[column].append(endpoint.qos)
-        return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
+            publishers, subscribers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
+        return grouped(self._foreign(publishers), self._foreign(subscribers))
 
     def close(self) -> None:
         worker = threading.current_thread() is self._thread
@@ -148,10 +143,7 @@ class DdsMiddleware(Middleware):
             for subscription in subscriptions:
                 subscription.mute()
             self._waitset.wake()
-            if not worker:
-                self._thread.join(JOIN_S)
-                if self._thread.is_alive():
-                    _log.warning("domain %d: a callback has not returned; closing without it", self.domain_id)
+            self.wait_for_thread(self._thread)
             POOL.leave(self.domain_id, self._participant)
 
     # What publishers and subscriptions ask of their participant.
@@ -183,14 +175,7 @@ class DdsMiddleware(Middleware):
             endpoint.writer.delete()
         self.announce()
 
-    def count_incompatible(self, topic: str, refused: tuple[int, str], ignored: Iterable[str]) -> None:
-        amount, policy = refused
-        if amount > 0 and policy not in ignored:
-            text = f"{topic}: another endpoint does not match, its {policy} does not fit ours"
-            self.count(f"incompatible_qos:{topic}:{policy}", text, amount)
-
     def announce(self) -> None:
-        """Tell the graph which endpoints belong to our node."""
         with self._announcing:
             with self._lock:
                 readers = [reader.guid for subscription in self._subscriptions for reader in subscription.readers()]
@@ -263,10 +248,16 @@ class DdsMiddleware(Middleware):
             all_of_topic = [e for e in self._found[_PUBLICATIONS].values() if e.topic == ros_graph.dds_topic(topic)]
         ours = ros_graph.dds_type(type_name)
         for other in {e.type_name for e in all_of_topic} - {ours}:
-            if f"incompatible_type:{topic}" not in self.counters:
-                text = f"{topic}: a publisher sends {ros_graph.ros_type(other)}, subscribed is {type_name}"
-                self.count(f"incompatible_type:{topic}", text)
+            text = f"{topic}: a publisher sends {ros_graph.ros_type(other)}, subscribed is {type_name}"
+            self.count_once(f"incompatible_type:{topic}", text)
         return [e.qos for e in all_of_topic if e.type_name == ours]
+
+    def _foreign(self, endpoints: Iterable[DiscoveredEndpoint]) -> Iterator[tuple[str, str, Qos]]:
+        """Topic, type and QoS of those of other participants that are ROS topics."""
+        for endpoint in endpoints:
+            topic = ros_graph.ros_topic(endpoint.topic)
+            if topic is not None and endpoint.participant != self._guid:
+                yield topic, ros_graph.ros_type(endpoint.type_name), endpoint.qos
 
     # Bookkeeping.
 

@@ -9,18 +9,14 @@ its participant's, never after.
 from __future__ import annotations
 
 import logging
-import threading
 import time
+from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.adapt import settle
-from gr_ros2.middleware.base import MessageCallback, OffersCallback, Publisher, Qos, Subscription
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription
 from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter, Sample
-
-if TYPE_CHECKING:
-    from gr_ros2.middleware.dds import DdsMiddleware
 
 OVERLAP_S = 2.0
 """s an outdated reader stays beside its successor: Fast DDS may take a second to send to a new reader."""
@@ -28,8 +24,6 @@ SLACK = 256
 """Messages a volatile reader holds beyond its depth: a DDS drops in silence what exceeds a history, so the subscription
 cuts to its depth itself, and counts. A transient-local reader has its depth and no more, else it would get more of the
 past than was asked for; what such a one drops is not counted."""
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
 
 _SEEN_PER_PUBLISHER = 256
 _SEEN_PUBLISHERS = 64
@@ -39,10 +33,41 @@ _LEAST = Qos("best_effort", "volatile")
 _log = logging.getLogger(__name__)
 
 
+class DdsParticipant(Middleware):
+    """What the endpoints ask of their participant."""
+
+    @property
+    @abstractmethod
+    def closed(self) -> bool: ...
+
+    @abstractmethod
+    def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:
+        """A reader of the subscription's topic; its samples come by ``subscription.service``."""
+
+    @abstractmethod
+    def drop_reader(self, reader: RawReader) -> None:
+        """Delete a reader."""
+
+    @abstractmethod
+    def forget(self, endpoint: DdsSubscription | DdsPublisher) -> None:
+        """Take a closed endpoint off the graph."""
+
+    @abstractmethod
+    def announce(self) -> None:
+        """Tell the graph which endpoints belong to our node."""
+
+    def count_incompatible(self, topic: str, refused: tuple[int, str], ignored: Iterable[str]) -> None:
+        """Count endpoints that refused ours, by the policy that does not fit, unless that is one of ``ignored``."""
+        amount, policy = refused
+        if amount > 0 and policy not in ignored:
+            text = f"{topic}: another endpoint does not match, its {policy} does not fit ours"
+            self.count(f"incompatible_qos:{topic}:{policy}", text, amount)
+
+
 class DdsPublisher(Publisher):
     """A writer. ``publish`` may be called from any thread."""
 
-    def __init__(self, middleware: DdsMiddleware, topic: str, writer: RawWriter) -> None:
+    def __init__(self, middleware: DdsParticipant, topic: str, writer: RawWriter) -> None:
         self._middleware = middleware
         self._topic = topic
         self.writer = writer
@@ -79,21 +104,19 @@ class DdsPublisher(Publisher):
 
 
 class DdsSubscription(Subscription):
-    """A reader, and for a while its predecessors."""
+    """A reader, and for a while its predecessors. ``calling`` is held while readers change, too."""
 
     def __init__(
-        self, middleware: DdsMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
+        self, middleware: DdsParticipant, topic: str, type_name: str, qos: Qos, callback: MessageCallback
     ) -> None:
+        super().__init__()
         self.topic = topic
         self.type_name = type_name
         self._middleware = middleware
         self._callback = callback
         self._wanted = qos
         self._open_policies = [name for name in ("reliability", "durability") if getattr(qos, name) is None]
-        self._lock = threading.RLock()  # held while readers change or deliver
         self._closed = False
-        self._offers: list[Qos] = []
-        self._on_offers: OffersCallback | None = None
         self._qos: Qos | None = None
         self._reader: RawReader | None = None
         self._outdated: list[tuple[float, RawReader]] = []
@@ -107,12 +130,10 @@ class DdsSubscription(Subscription):
     def adapt(self, offers: Iterable[Qos]) -> None:
         """Ask for what all publishers offer. Without any, leave things as they are, at first the least."""
         offers = list(offers)
-        with self._lock:
+        with self.calling:
             if self._closed or (self._reader and not offers):
                 return
-            if offers != self._offers:
-                self._offers = offers
-                self._tell()
+            self.found(offers)
             qos = settle(self._wanted, offers or [_LEAST])
             if qos == self._qos:
                 return
@@ -124,15 +145,6 @@ class DdsSubscription(Subscription):
             self._qos = qos
         self._middleware.announce()
 
-    def follow(self, on_offers: OffersCallback) -> None:
-        with self._lock:
-            self._on_offers = on_offers
-            self._tell()
-
-    def _tell(self) -> None:
-        if self._on_offers is not None and self._offers:
-            self._on_offers(self._offers)
-
     @property
     def outdated(self) -> float | None:
         """When the oldest outdated reader is due (time.monotonic()), None without any."""
@@ -141,7 +153,7 @@ class DdsSubscription(Subscription):
 
     def retire(self, now: float) -> None:
         """Delete readers whose time is over, with what they still hold delivered."""
-        with self._lock:
+        with self.calling:
             if self._closed:
                 return
             over = [reader for until, reader in self._outdated if until <= now]
@@ -154,7 +166,7 @@ class DdsSubscription(Subscription):
 
     def service(self, reader: RawReader) -> int:
         """Deliver what one reader holds (BATCH at a time where the depth is unbounded); returns how many there were."""
-        with self._lock:
+        with self.calling:
             if reader is self._reader:  # its predecessors may hold what came before
                 for _, older in self._outdated:
                     self._serve_all(older)
@@ -236,7 +248,5 @@ class DdsSubscription(Subscription):
         if self._closed:
             return
         self.mute()
-        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
-        if self._lock.acquire(timeout=JOIN_S):
-            self._lock.release()
+        self.wait_for_callback()
         self._middleware.forget(self)

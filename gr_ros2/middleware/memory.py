@@ -7,22 +7,16 @@ in the order of publication. Unlike a DDS it counts every message that a subscri
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import deque
-from collections.abc import Callable
 from weakref import WeakValueDictionary
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered, refused_policies
-from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, TopicInfo, grouped
+from gr_ros2.middleware.delivery import CallbackThread, QueuedSubscription
 from gr_ros2.registry import normalize_type
-
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
-
-_log = logging.getLogger(__name__)
 
 
 class _Graph:
@@ -53,14 +47,14 @@ class _Graph:
         if not refused:
             publisher.matches.append(subscription)
             subscription.matches[publisher] = publisher.published
-            subscription.middleware.call(subscription.tell)
+            subscription.look()
 
     def left(self, endpoint: MemoryPublisher | MemorySubscription) -> None:
         if isinstance(endpoint, MemoryPublisher):
             self.publishers.remove(endpoint)
             for subscription in endpoint.matches:
                 subscription.matches.pop(endpoint, None)
-                subscription.middleware.call(subscription.tell)
+                subscription.look()
                 self.replay(subscription)
         else:
             self.subscriptions.remove(endpoint)
@@ -123,72 +117,30 @@ class MemoryPublisher(Publisher):
                 self.middleware.graph.left(self)
 
 
-class MemorySubscription(Subscription):
-    """See :class:`gr_ros2.middleware.base.Subscription`."""
+class MemorySubscription(QueuedSubscription):
+    """See :class:`gr_ros2.middleware.delivery.QueuedSubscription`."""
 
     def __init__(
         self, middleware: MemoryMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
     ) -> None:
+        super().__init__(middleware, middleware.thread, topic, qos.depth, callback)
         self.middleware = middleware
-        self.topic = topic
         self.type_name = type_name
         self.qos = qos
-        self.callback = callback
         self.matches: dict[MemoryPublisher, int] = {}  # messages published before that are yet to be replayed
-        self.waiting: deque[bytes] = deque()
-        self.on_offers: OffersCallback | None = None
-        self.closed = False
-        self.calling = threading.RLock()  # held while calling back
 
-    def push(self, payload: bytes) -> None:
-        """Queue a message, the oldest going where the depth is reached. Called with the graph's lock held."""
-        if self.closed:
-            return
-        if self.qos.depth and len(self.waiting) >= self.qos.depth:
-            self.waiting.popleft()
-            self.waiting.append(payload)
-            text = f"{self.topic}: depth {self.qos.depth} is full, the oldest message goes"
-            self.middleware.count_lost(self, self.topic, text)
-        else:
-            self.waiting.append(payload)
-            self.middleware.call(self.take)
-
-    def take(self) -> None:
-        """Call back with the oldest message that waits."""
-        with self.calling:
-            with self.middleware.graph.lock:
-                if not self.waiting:
-                    return
-                payload = self.waiting.popleft()
-            if not self.closed:
-                self.middleware.deliver(self.topic, self.callback, payload)
-
-    def follow(self, on_offers: OffersCallback) -> None:
+    def offers(self) -> list[Qos]:
         with self.middleware.graph.lock:
-            self.on_offers = on_offers
-            self.middleware.call(self.tell)
-
-    def tell(self) -> None:
-        """Say what the publishers offer."""
-        with self.calling:
-            with self.middleware.graph.lock:
-                offers = [publisher.qos for publisher in self.matches]
-            if offers and self.on_offers is not None and not self.closed:
-                self.on_offers(offers)
+            return [publisher.qos for publisher in self.matches]
 
     def matched(self) -> int:
         return len(self.matches)
 
-    def close(self) -> None:
-        with self.middleware.graph.lock:
-            if self.closed:
-                return
-            self.closed = True
-            self.waiting.clear()
-            self.middleware.graph.left(self)
-        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
-        if self.calling.acquire(timeout=JOIN_S):
-            self.calling.release()
+    def leave(self) -> None:
+        graph = self.middleware.graph
+        with graph.lock:
+            if self in graph.subscriptions:  # else the participant has just left, and all that is its
+                graph.left(self)
 
 
 class MemoryMiddleware(Middleware):
@@ -203,15 +155,12 @@ class MemoryMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = 0, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         ros_graph.check_node(node_name, namespace)
         with _graphs_lock:
             self.graph = _graphs.setdefault(self.domain_id, _Graph())
         self.closed = False
-        self._pending: deque[Callable[[], None]] = deque()
-        self._wake = threading.Condition(self.graph.lock)
-        self._thread = threading.Thread(target=self._run, name=f"memory-{self.domain_id}-{node_name}", daemon=True)
-        self._thread.start()
+        self.thread = CallbackThread(self, node_name)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> MemorySubscription:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
@@ -236,18 +185,12 @@ class MemoryMiddleware(Middleware):
         return publisher
 
     def discover(self) -> list[TopicInfo]:
-        rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         with self.graph.lock:
-            for endpoint in self.graph.endpoints():
-                if endpoint.middleware is not self:
-                    row = rows.setdefault((endpoint.topic, endpoint.type_name), ([], []))
-                    row[isinstance(endpoint, MemorySubscription)].append(endpoint.qos)
-        return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
-
-    def call(self, step: Callable[[], None]) -> None:
-        """Let the participant's thread do something. Called with the graph's lock held."""
-        self._pending.append(step)
-        self._wake.notify()
+            found = [
+                [(end.topic, end.type_name, end.qos) for end in ends if end.middleware is not self]
+                for ends in (self.graph.publishers, self.graph.subscriptions)
+            ]
+        return grouped(*found)
 
     def close(self) -> None:
         with self.graph.lock:
@@ -258,21 +201,7 @@ class MemoryMiddleware(Middleware):
                 if endpoint.middleware is self:
                     endpoint.closed = True
                     self.graph.left(endpoint)
-            self._wake.notify_all()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(JOIN_S)
-            if self._thread.is_alive():
-                _log.warning("memory domain %d: a callback has not returned; closing without it", self.domain_id)
-
-    def _run(self) -> None:
-        while True:
-            with self.graph.lock:
-                while not self._pending and not self.closed:
-                    self._wake.wait()
-                if self.closed:
-                    return
-                step = self._pending.popleft()
-            step()
+        self.thread.close()
 
     def _check_open(self, what: str) -> None:
         if self.closed:

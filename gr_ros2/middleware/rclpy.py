@@ -33,9 +33,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.adapt import Adaptation, Replays, compatible
 from gr_ros2.middleware.base import (
+    JOIN_S,
     MessageCallback,
     Middleware,
-    OffersCallback,
     Publisher,
     Qos,
     Subscription,
@@ -54,9 +54,6 @@ _log = logging.getLogger(__name__)
 
 ADAPT_PERIOD_S = 0.1
 """How often adaptive subscriptions look for publishers; rclpy has no callback for changes of the graph."""
-
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
 
 ENCAPSULATION = 4
 """Bytes of the header every serialized message starts with."""
@@ -138,7 +135,7 @@ class RclpyMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        domain_id = resolve_domain_id(domain_id)
+        self.domain_id = domain_id = resolve_domain_id(domain_id)
         node_name, namespace = check_node(node_name, namespace)
         self._context = Context()
         try:
@@ -213,10 +210,7 @@ class RclpyMiddleware(Middleware):
         atexit.unregister(self.close)
         self._closing.set()
         self._trigger()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(JOIN_S)
-            if self._thread.is_alive():
-                _log.warning("rclpy: a callback has not returned; closing without it")
+        self.wait_for_thread(self._thread)
 
     # For our endpoints
 
@@ -235,9 +229,9 @@ class RclpyMiddleware(Middleware):
         with _translated(f"publishers of {topic} cannot be read"):
             infos = self._node.get_publishers_info_by_topic(topic)
         strangers = {i.topic_type for i in infos} - {type_name}
-        if strangers and f"incompatible_type:{topic}" not in self.counters:
+        if strangers:
             text = f"{topic}: a publisher sends {', '.join(sorted(strangers))}, subscribed is {type_name}"
-            self.count(f"incompatible_type:{topic}", text)
+            self.count_once(f"incompatible_type:{topic}", text)
         return {bytes(i.endpoint_gid): _from_profile(i.qos_profile) for i in infos if i.topic_type == type_name}
 
     def create(self, kind: str, events: type, handlers: dict[str, Callable[[Any], None]], **arguments: Any) -> Any:
@@ -339,11 +333,15 @@ class RclpyMiddleware(Middleware):
 
 
 class _RclpySubscription(Subscription):
-    """Made, adapted and destroyed in the executor's thread once ``subscribe`` has returned."""
+    """Made, adapted and destroyed in the executor's thread once ``subscribe`` has returned.
+
+    ``calling`` is held while it adapts: the first join is in the caller's thread, with the executor's already at work.
+    """
 
     def __init__(
         self, middleware: RclpyMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback
     ) -> None:
+        super().__init__()
         self._middleware = middleware
         self._topic = check_topic(topic)
         self._type_name = normalize_type(type_name)
@@ -352,33 +350,18 @@ class _RclpySubscription(Subscription):
         self._adaptation = Adaptation(qos)
         self._replays = Replays()
         self._endpoint: Any = None
-        self._offers: list[Qos] = []
-        self._on_offers: OffersCallback | None = None
         self._closed = False
-        self._lock = threading.RLock()  # the first join is in the caller's thread, with the executor's already at work
 
     def adapt(self) -> None:
         """Join the graph, or join it anew, where the publishers call for it."""
-        with self._lock:
+        with self.calling:
             if not self._closed:
                 publishers = self._middleware.publishers_of(self._topic, self._type_name)
-                offers = list(publishers.values())
-                if offers != self._offers:
-                    self._offers = offers
-                    self._tell()
+                self.found(list(publishers.values()))
                 qos = self._adaptation.consider(publishers)
                 if qos is not None:
                     _log.info("%s: joining as %s, %s", self._topic, qos.reliability, qos.durability)
                     self._join()
-
-    def follow(self, on_offers: OffersCallback) -> None:
-        with self._lock:
-            self._on_offers = on_offers
-            self._tell()
-
-    def _tell(self) -> None:
-        if self._on_offers is not None and self._offers:
-            self._on_offers(self._offers)
 
     def revive(self) -> None:
         """Join anew where rclpy failed to take a message (an empty one, say): it never listens there again."""

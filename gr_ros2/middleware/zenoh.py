@@ -16,8 +16,7 @@ import logging
 import os
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,8 @@ import zenoh.ext
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
-from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Publisher, Qos, Subscription, TopicInfo
+from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo, grouped
+from gr_ros2.middleware.delivery import CallbackThread, QueuedSubscription
 from gr_ros2.middleware.type_definitions import type_hash
 from gr_ros2.middleware.zenoh_graph import (
     DEFAULT_DEPTH,
@@ -41,9 +41,6 @@ from gr_ros2.middleware.zenoh_graph import (
     topic_key,
 )
 from gr_ros2.registry import normalize_type
-
-JOIN_S = 1.0
-"""s that close() waits for a callback to return."""
 
 _DEFAULTS = {
     "mode": '"peer"',
@@ -100,13 +97,12 @@ class ZenohMiddleware(Middleware):
 
     def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
-        self.domain_id = ros_graph.resolve_domain_id(domain_id)
+        self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self._node_name, self._namespace = ros_graph.check_node(node_name, namespace)
         self._has_hashes = ros_graph.gid_size() != 24
         self._declaring = threading.RLock()  # held while Zenoh declares for us, so that close() comes before or after
-        self._changed = threading.Condition()  # guards what follows
+        self._tables = threading.Lock()  # guards what follows
         self._closed = False
-        self._steps: deque[Callable[[], None]] = deque()  # for the thread
         self._endpoints: list[_ZenohPublisher | _ZenohSubscription] = []
         self._entities: dict[str, Entity] = {}  # of others and ourselves, by token
         self._numbers = 0
@@ -119,8 +115,10 @@ class ZenohMiddleware(Middleware):
             )
             node = Entity(self._session_id, 0, "NN", self._node_name, self._namespace)
             self._token = self._session.liveliness().declare_token(node.token(self.domain_id))
-        self._thread = threading.Thread(target=self._run, name=f"zenoh-{self.domain_id}-{node_name}", daemon=True)
-        self._thread.start()
+        self.thread = CallbackThread(self, node_name)
+        self._patience = threading.Timer(_ROUTER_S, self.thread.call, [self._miss_router])
+        self._patience.daemon = True
+        self._patience.start()
         atexit.register(self.close)  # an open session would keep the interpreter from ending
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
@@ -139,27 +137,19 @@ class ZenohMiddleware(Middleware):
 
     def discover(self) -> list[TopicInfo]:
         """The topics seen so far; a fresh session needs a moment to see any."""
-        rows: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
-        with self._changed:
-            entities = list(self._entities.values())
-        for entity in entities:
-            if entity.topic and entity.session != self._session_id:
-                row = rows.setdefault((entity.topic, entity.type_name), ([], []))
-                row[entity.kind == "MS"].append(entity.qos)
-        return [TopicInfo(*names, tuple(p), tuple(s)) for names, (p, s) in sorted(rows.items())]
+        with self._tables:
+            others = [entity for entity in self._entities.values() if entity.session != self._session_id]
+        found = [[(e.topic, e.type_name, e.qos) for e in others if e.kind == kind] for kind in ("MP", "MS")]
+        return grouped(*found)
 
     def close(self) -> None:
-        with self._changed:
+        with self._tables:
             if self._closed:
                 return
             self._closed = True
-            self._steps.clear()
-            self._changed.notify_all()
         atexit.unregister(self.close)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(JOIN_S)
-            if self._thread.is_alive():
-                _log.warning("zenoh domain %d: a callback has not returned; closing without it", self.domain_id)
+        self._patience.cancel()
+        self.thread.close()
         with self._declaring, _failures("close"):
             self._session.close()  # type: ignore[no-untyped-call]
 
@@ -180,7 +170,7 @@ class ZenohMiddleware(Middleware):
 
     def join(self, endpoint: _ZenohPublisher | _ZenohSubscription) -> Any:
         """Show an endpoint to the graph; its liveliness token."""
-        with self._changed:
+        with self._tables:
             self._endpoints.append(endpoint)
             others = list(self._entities.values())
         for other in others:
@@ -189,7 +179,7 @@ class ZenohMiddleware(Middleware):
 
     def leave(self, endpoint: _ZenohPublisher | _ZenohSubscription, declared: Iterable[Any]) -> None:
         """Take an endpoint off the graph."""
-        with self._changed:
+        with self._tables:
             self._endpoints.remove(endpoint)
         with self._declaring, _failures(f"close {endpoint.entity.topic}"):
             for thing in () if self._closed else declared:
@@ -198,31 +188,9 @@ class ZenohMiddleware(Middleware):
     def matches(self, entity: Entity) -> list[Entity]:
         """Entities of the other kind with that topic and type; none once closed."""
         wanted = ("MS" if entity.kind == "MP" else "MP", entity.topic, entity.type_name)
-        with self._changed:
+        with self._tables:
             found = [e for e in self._entities.values() if (e.kind, e.topic, e.type_name) == wanted]
             return [] if self._closed else found
-
-    def call(self, step: Callable[[], None]) -> None:
-        """Let the thread do something."""
-        with self._changed:
-            if not self._closed:
-                self._steps.append(step)
-                self._changed.notify()
-
-    def push(self, subscription: _ZenohSubscription, payload: bytes) -> None:
-        """Queue a message, the oldest going where the depth is reached. Called in a thread of Zenoh."""
-        depth = subscription.entity.qos.depth
-        with self._changed:
-            full = bool(depth) and len(subscription.waiting) >= depth
-            if full:
-                subscription.waiting.popleft()
-            subscription.waiting.append(payload)
-        if not full:
-            self.call(subscription.take)
-        else:
-            topic = subscription.entity.topic
-            text = f"{topic}: callbacks do not keep up, depth {depth} is full, the oldest go"
-            self.count_lost(subscription, topic, text)
 
     # Internals
 
@@ -234,7 +202,7 @@ class ZenohMiddleware(Middleware):
             )
 
     def _entity(self, kind: Any, topic: str, type_name: str, qos: Qos) -> Entity:
-        with self._changed:
+        with self._tables:
             self._numbers += 1
             number = self._numbers
             seen = next((e.type_hash for e in self._entities.values() if e.type_name == type_name), "")
@@ -248,7 +216,7 @@ class ZenohMiddleware(Middleware):
         entity = read_token(token)
         if entity is None:
             return
-        with self._changed:
+        with self._tables:
             here = sample.kind == zenoh.SampleKind.PUT
             if here:
                 self._entities[token] = entity
@@ -259,7 +227,7 @@ class ZenohMiddleware(Middleware):
             if here:
                 self._compare(endpoint, entity)
             if isinstance(endpoint, _ZenohSubscription) and endpoint.entity.topic == entity.topic:
-                self.call(endpoint.tell)
+                endpoint.look()
 
     def _compare(self, endpoint: _ZenohPublisher | _ZenohSubscription, other: Entity) -> None:
         """Count what cannot meet although its topic is the same."""
@@ -272,22 +240,7 @@ class ZenohMiddleware(Middleware):
             text = f"{own.topic}: a subscriber has type hash {other.type_hash}, we {own.type_hash}; set ROS_DISTRO"
         else:
             return
-        if f"incompatible_type:{own.topic}" not in self.counters:
-            self.count(f"incompatible_type:{own.topic}", text)
-
-    def _run(self) -> None:
-        missed_at: float | None = time.monotonic() + _ROUTER_S
-        while True:
-            with self._changed:
-                while not self._steps and not self._closed:
-                    self._changed.wait(None if missed_at is None else max(0.0, missed_at - time.monotonic()))
-                    if missed_at is not None and time.monotonic() >= missed_at:
-                        missed_at = None
-                        self._steps.append(self._miss_router)
-                if self._closed:
-                    return
-                step = self._steps.popleft()
-            step()
+        self.count_once(f"incompatible_type:{own.topic}", text)
 
 
 class _ZenohPublisher(Publisher):
@@ -344,16 +297,12 @@ class _ZenohPublisher(Publisher):
             self._middleware.leave(self, (self._token, self._publisher))
 
 
-class _ZenohSubscription(Subscription):
+class _ZenohSubscription(QueuedSubscription):
     """Takes messages of its topic and type whatever the type's hash, since it never looks into them."""
 
     def __init__(self, middleware: ZenohMiddleware, entity: Entity, callback: MessageCallback) -> None:
+        super().__init__(middleware, middleware.thread, entity.topic, entity.qos.depth, callback)
         self.entity = entity
-        self._callback = callback
-        self.waiting: deque[bytes] = deque()
-        self.closed = False
-        self._on_offers: OffersCallback | None = None
-        self._calling = threading.RLock()  # held while calling back
         self._middleware = middleware
         self._newest: dict[bytes, int] = {}  # publisher -> number of its newest message
         qos = entity.qos
@@ -374,32 +323,11 @@ class _ZenohSubscription(Subscription):
     def matched(self) -> int:
         return 0 if self.closed else len(self._middleware.matches(self.entity))
 
-    def follow(self, on_offers: OffersCallback) -> None:
-        self._on_offers = on_offers
-        self._middleware.call(self.tell)
+    def offers(self) -> list[Qos]:
+        return [publisher.qos for publisher in self._middleware.matches(self.entity)]
 
-    def tell(self) -> None:
-        """Say what the publishers offer, in the participant's thread."""
-        offers = [publisher.qos for publisher in self._middleware.matches(self.entity)]
-        with self._calling:
-            if offers and self._on_offers is not None and not self.closed:
-                self._on_offers(offers)
-
-    def take(self) -> None:
-        """Call back with the oldest message that waits, in the participant's thread."""
-        payload = self.waiting.popleft()
-        with self._calling:
-            if not self.closed and not self._middleware.closed:
-                self._middleware.deliver(self.entity.topic, self._callback, payload)
-
-    def close(self) -> None:
-        if self.closed:
-            return
-        self.closed = True
+    def leave(self) -> None:
         self._middleware.leave(self, (self._token, self._subscriber))
-        # A callback in progress ends first, unless it is the one that closes or takes longer than we may wait.
-        if self._calling.acquire(timeout=JOIN_S):
-            self._calling.release()
 
     def _heard(self, sample: Any) -> None:
         """Called in a thread of Zenoh, one message after the other."""
@@ -408,7 +336,7 @@ class _ZenohSubscription(Subscription):
         beside = read_attachment(sample.attachment.to_bytes()) if sample.attachment else None
         if beside is not None:
             self._count_missing(*beside)
-        self._middleware.push(self, sample.payload.to_bytes())
+        self.push(sample.payload.to_bytes())
 
     def _count_missing(self, sequence: int, gid: bytes) -> None:
         newest = self._newest.get(gid)

@@ -11,12 +11,21 @@ _GNURADIO = "GNU Radio 3.10 (apt install gnuradio)"
 PHY = BackendTable(
     "phy",
     {
-        "direct": Backend("gr_ros2.phy.direct", "DirectPhy", "message loopback, no samples"),
-        "ofdm": Backend("gr_ros2.phy.ofdm", "OfdmPhy", "OFDM against echoes, own or stock receiver", _GNURADIO),
-        "gfsk": Backend("gr_ros2.phy.gfsk", "GfskPhy", "GMSK bursts, constant envelope", _GNURADIO),
-        "psk": Backend("gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO),
-        "lora": Backend("gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO),
+        "direct": Backend(
+            "gr_ros2.phy.direct", "DirectPhy", "message loopback, no samples", title="Direct (no samples)"
+        ),
+        "ofdm": Backend(
+            "gr_ros2.phy.ofdm", "OfdmPhy", "OFDM against echoes, own or stock receiver", _GNURADIO, title="OFDM"
+        ),
+        "gfsk": Backend("gr_ros2.phy.gfsk", "GfskPhy", "GMSK bursts, constant envelope", _GNURADIO, title="GFSK"),
+        "psk": Backend(
+            "gr_ros2.phy.psk", "PskPhy", "single-carrier BPSK, QPSK or 8-PSK bursts", _GNURADIO, title="PSK"
+        ),
+        "lora": Backend(
+            "gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO, title="LoRa-like"
+        ),
     },
+    Backend,
 )
 
 

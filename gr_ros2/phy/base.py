@@ -8,10 +8,67 @@ on the message port itself. Law: one packet takes the same number of samples alw
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Protocol, get_args
 
-from gr_ros2.config import ChannelConfig, Kernels
+import numpy as np
+import numpy.typing as npt
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.config import ChannelConfig, Kernels, build
 from gr_ros2.errors import ConfigError
+
+Samples = npt.NDArray[np.complex64]
+
+
+class PacketTransmitter(Protocol):
+    """A GNU Radio block: message port `pdus` in, one complex stream out.
+
+    :class:`gr_ros2.phy.flowgraph.Transmitter` is the base of ours.
+    """
+
+    @property
+    def refused(self) -> int:
+        """PDUs that were no packet of the right length, as far as it tells."""
+
+    def packets_sent(self) -> int:
+        """Packets that have left it as samples."""
+
+    def release(self) -> None:
+        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+
+
+class SymbolSource(Protocol):
+    """What shows the symbols that packets are read from."""
+
+    def samples(self) -> Samples | None:
+        """The newest ones, None before the first packet."""
+
+
+class PacketReceiver(Protocol):
+    """A GNU Radio block: one complex stream in, message port `pdus` out.
+
+    :class:`gr_ros2.phy.flowgraph.Receiver` is the base of ours.
+    """
+
+    @property
+    def damaged(self) -> int:
+        """Packets heard that were not whole, as far as it tells."""
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR of the newest packets, dB over the sampled band; None before the first, or where it does not tell."""
+
+    def tap_symbols(self) -> SymbolSource | None:
+        """Let the symbols that packets are read from be seen; None where that cannot be. Before the start, once."""
+
+    def release(self) -> None:
+        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PhyOptions:
+    """Of a PHY without settings beside packet length and sample rate."""
 
 
 class Phy(ABC):
@@ -20,13 +77,18 @@ class Phy(ABC):
     :param packet_len: bytes per packet, 14..4095
     :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
     :param kernels: what works on the samples: ``auto`` = compiled kernels where there are any, or ``numpy``
-    :raises ConfigError: for a sample rate that is not above 0 where one is needed, or kernels there are none of
+    :param options: fields of ``Options``
+    :raises ConfigError: for an option that is unknown or out of range, a sample rate that is not above 0 where one is
+        needed, or kernels there are none of
     """
 
     name: ClassVar[str]
-    has_samples: ClassVar[bool]
+    has_samples: ClassVar[bool] = True
+    Options: ClassVar[type[Any]] = PhyOptions
+    """A frozen dataclass: the settings of this PHY, each with a default."""
 
-    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto") -> None:
+    def __init__(self, packet_len: int, sample_rate: float, *, kernels: Kernels = "auto", **options: Any) -> None:
+        self.options: Any = build(self.Options, options, f"phy {self.name}")
         if self.has_samples and not sample_rate > 0:
             raise ConfigError(f"phy {self.name}: sample_rate = {sample_rate}: must be above 0 samples/s")
         if kernels not in get_args(Kernels):
@@ -85,16 +147,14 @@ class Phy(ABC):
         """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
 
     @abstractmethod
-    def transmitter(self) -> Any:
+    def transmitter(self) -> PacketTransmitter:
         """A fresh hier block: message port `pdus` in, one complex stream out.
-
-        Its method ``packets_sent() -> int`` tells how many packets have left it as samples.
 
         :raises PhyError: for a PHY without samples
         """
 
     @abstractmethod
-    def receiver(self, aside: bool = False) -> Any:
+    def receiver(self, aside: bool = False) -> PacketReceiver:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
         :param aside: in a process of its own where it works in Python, which keeps the ROS side free; it takes a

@@ -20,10 +20,10 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.aside import ReceiverProcess
-from gr_ros2.phy.base import Phy
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.fec import CodeName
-from gr_ros2.phy.flowgraph import HierBlock, Transmitter
+from gr_ros2.phy.flowgraph import Receiver, Transmitter
 from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.tap import SymbolTap
@@ -31,7 +31,6 @@ from gr_ros2.phy.threads import Held
 
 STOCK = "GNU Radio's blocks"
 """What PHYs of blocks by others run on."""
-_SAMPLE_LEN = 8
 _log = logging.getLogger(__name__)
 
 
@@ -48,12 +47,17 @@ class BurstOptions:
 
 
 class BurstPhy(Phy):
-    """A PHY made of a burst modem; a subclass sets ``modem``, its numpy form, and ``gap`` (zero samples after each
-    burst)."""
+    """A PHY made of a burst modem: a subclass sets ``modem``, its numpy form.
 
-    has_samples = True
+    :ivar gap: zero samples after each burst
+    """
+
+    Options = BurstOptions
     modem: BurstModem
-    gap: int
+
+    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
+        self.gap: int = BurstOptions.gap if self.options.gap is None else self.options.gap
 
     def airtime_samples(self) -> int:
         return self.modem.burst_samples + self.gap
@@ -67,14 +71,14 @@ class BurstPhy(Phy):
         return which(self.kernels)
 
     @property
-    @abstractmethod
     def receiver_taps(self) -> Any:
         """The filter the samples pass before the modem sees them; None = none."""
+        return None
 
-    def transmitter(self) -> BurstTransmitter:
+    def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)
 
-    def receiver(self, aside: bool = False) -> BurstSink:
+    def receiver(self, aside: bool = False) -> PacketReceiver:
         # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
         compiled = self.running_modem is not self.modem
         return BurstSink(self, aside and not compiled and len(os.sched_getaffinity(0)) > 1)
@@ -156,12 +160,11 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         return done
 
 
-class BurstSink(HierBlock):
+class BurstSink(Receiver):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, phy: BurstPhy, aside: bool) -> None:
-        super().__init__(f"gr_ros2_{phy.name}_rx", gr.io_signature(1, 1, _SAMPLE_LEN), gr.io_signature(0, 0, 0))
-        self.message_port_register_hier_out("pdus")
+        super().__init__(f"gr_ros2_{phy.name}_rx")
         self._demodulator = _Demodulator(phy, aside)
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)

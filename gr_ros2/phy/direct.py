@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
-
-from gr_ros2.config import Kernels, build
 from gr_ros2.errors import PhyError
-from gr_ros2.phy.base import Phy
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class DirectOptions:
-    """The `direct` PHY has no settings beside packet length."""
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 
 
 class DirectPhy(Phy):
@@ -26,9 +17,8 @@ class DirectPhy(Phy):
     name = "direct"
     has_samples = False
 
-    def __init__(self, packet_len: int, sample_rate: float = 0.0, kernels: Kernels = "auto", **options: Any) -> None:
-        super().__init__(packet_len, sample_rate, kernels)
-        build(DirectOptions, options, "phy direct")
+    def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
 
     def airtime_samples(self) -> int:
         return 0
@@ -36,8 +26,8 @@ class DirectPhy(Phy):
     def burst_power(self) -> float:
         return 0.0
 
-    def transmitter(self) -> Any:
+    def transmitter(self) -> PacketTransmitter:
         raise PhyError("phy direct has no transmitter; connect the source's `pdus` to the sink's")
 
-    def receiver(self, aside: bool = False) -> Any:  # noqa: ARG002
+    def receiver(self, aside: bool = False) -> PacketReceiver:  # noqa: ARG002
         raise PhyError("phy direct has no receiver; connect the source's `pdus` to the sink's")

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from gnuradio import gr
 
 from gr_ros2.errors import PhyError
+from gr_ros2.phy.base import SymbolSource
 from gr_ros2.phy.threads import begin
 
 _Self = TypeVar("_Self", bound="Flowgraph")
@@ -101,6 +102,11 @@ class Transmitter(HierBlock):
         self._airtime_samples = airtime_samples
         self._last: Any = None
 
+    @property
+    def refused(self) -> int:
+        """PDUs that were no packet of the right length; 0 where GNU Radio's own blocks take them and do not tell."""
+        return 0
+
     def leave_by(self, block: Any) -> None:
         """Let samples leave from a block within."""
         self._last = block
@@ -112,3 +118,28 @@ class Transmitter(HierBlock):
             return int(self._last.nitems_written(0)) // self._airtime_samples
         except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
             return 0
+
+
+class Receiver(HierBlock):
+    """Complex stream in, message port `pdus` out. What it does not tell of packets has no number.
+
+    :param name: in GNU Radio's log
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
+        self.message_port_register_hier_out("pdus")
+
+    @property
+    def damaged(self) -> int:
+        """Packets heard that were not whole."""
+        return 0
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR over the sampled band of the newest packets, dB; None before the first."""
+        return None
+
+    def tap_symbols(self) -> SymbolSource | None:
+        """Let the points that packets are read from be seen."""
+        return None

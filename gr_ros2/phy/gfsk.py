@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Kernels, build
 from gr_ros2.phy.burst import Frame, Samples
 from gr_ros2.phy.burst_blocks import BurstOptions
 from gr_ros2.phy.linear import LinearModem, LinearPhy, Reals, preamble_steps, shape
@@ -140,8 +139,8 @@ class GfskPhy(LinearPhy):
     """
 
     name = "gfsk"
+    Options = GfskOptions
 
-    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
-        self.options = build(GfskOptions, options, "phy gfsk")
-        modem = GfskModem(Frame(packet_len, self.options.fec), self.options)
-        super().__init__(packet_len, sample_rate, kernels, modem, self.options)
+    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
+        self.modem = GfskModem(Frame(packet_len, self.options.fec), self.options)

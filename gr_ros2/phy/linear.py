@@ -13,9 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.config import Kernels
 from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
-from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.soft import Points, spread_about
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error
@@ -281,19 +280,9 @@ class LinearModem(BurstModem):
 
 
 class LinearPhy(BurstPhy):
-    """A PHY of single-carrier bursts, whose mean power is 1.
-
-    :param options: what every burst PHY has
-    """
+    """A PHY of single-carrier bursts, whose mean power is 1."""
 
     modem: LinearModem
-
-    def __init__(
-        self, packet_len: int, sample_rate: float, kernels: Kernels, modem: LinearModem, options: BurstOptions
-    ) -> None:
-        super().__init__(packet_len, sample_rate, kernels)
-        self.modem = modem
-        self.gap = options.gap
 
     @property
     def receiver_taps(self) -> Any:

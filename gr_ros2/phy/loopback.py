@@ -67,7 +67,8 @@ class LoopbackLink(PacketPath, Flowgraph):
             last = self._receiver
             # A hier block with message ports holds itself, and 60 of the system's 4096 shared memory segments for OFDM.
             for hier_block in (self._transmitter, self._receiver):
-                weakref.finalize(self, hier_block.release)
+                if hier_block is not None:
+                    weakref.finalize(self, hier_block.release)
         if self.channel.loses_packets or instrumented:
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Kernels, build
 from gr_ros2.errors import ConfigError
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frame, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
@@ -354,10 +354,11 @@ class LoraPhy(BurstPhy):
     """
 
     name = "lora"
+    Options = LoraOptions
 
-    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
-        super().__init__(packet_len, sample_rate, kernels)
-        self.options = chosen = build(LoraOptions, options, "phy lora")
+    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
+        chosen: LoraOptions = self.options
         self._sdr: SdrFrame | None = None
         if chosen.implementation == "lora_sdr":
             self._sdr = self._checked_sdr()
@@ -367,7 +368,6 @@ class LoraPhy(BurstPhy):
             if getattr(chosen, name) is not None:
                 raise ConfigError(f"phy lora: {name} = {getattr(chosen, name)}: only with implementation = lora_sdr")
         self.modem: LoraModem = LoraModem(Frame(packet_len, chosen.fec), chosen)
-        self.gap = BurstOptions.gap if chosen.gap is None else chosen.gap
         if self.modem.burst_samples > MAX_BURST:
             raise ConfigError(
                 f"phy lora: packet_len = {packet_len} with spreading_factor = {chosen.spreading_factor}: a burst "
@@ -414,10 +414,6 @@ class LoraPhy(BurstPhy):
     def airtime_samples(self) -> int:
         return super().airtime_samples() if self._sdr is None else self._sdr.airtime_samples
 
-    @property
-    def receiver_taps(self) -> Any:
-        return None
-
     def burst_power(self) -> float:
         return 1.0
 
@@ -442,8 +438,8 @@ class LoraPhy(BurstPhy):
     def leaves_tags(self) -> bool:
         return self._sdr is not None
 
-    def transmitter(self) -> Any:
+    def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
 
-    def receiver(self, aside: bool = False) -> Any:
+    def receiver(self, aside: bool = False) -> PacketReceiver:
         return super().receiver(aside) if self._sdr is None else SdrReceiver(self._sdr)

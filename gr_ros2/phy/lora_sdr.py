@@ -23,7 +23,7 @@ from gnuradio.filter import firdes
 from gr_ros2.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
 from gr_ros2.phy.burst_blocks import TakesPackets
-from gr_ros2.phy.flowgraph import HierBlock, Transmitter
+from gr_ros2.phy.flowgraph import Receiver, Transmitter
 from gr_ros2.phy.pdus import PDUS, pdu_of
 from gr_ros2.phy.threads import Held, keep_messages
 
@@ -180,13 +180,12 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 
 
-class SdrReceiver(HierBlock):
+class SdrReceiver(Receiver):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: SdrFrame) -> None:
-        super().__init__("gr_ros2_lora_sdr_rx", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
+        super().__init__("gr_ros2_lora_sdr_rx")
         lora = load()
-        self.message_port_register_hier_out("pdus")
         self._collector = _Collector(frame)
         factor, per_chip = frame.spreading_factor, frame.oversampling
         # The module takes every so many samples, so that noise beside the band would fall into it.

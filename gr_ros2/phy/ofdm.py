@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Kernels, build
 from gr_ros2.errors import ConfigError
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import Frame
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import Layout, point_power
@@ -63,10 +63,11 @@ class OfdmPhy(BurstPhy):
     """
 
     name = "ofdm"
+    Options = OfdmOptions
 
-    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
-        super().__init__(packet_len, sample_rate, kernels)
-        self.options = chosen = build(OfdmOptions, options, "phy ofdm")
+    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
+        chosen: OfdmOptions = self.options
         fft_len = chosen.fft_len
         cp_len = fft_len // 4 if chosen.cp_len is None else chosen.cp_len
         if not fft_len <= 4 * cp_len <= 2 * fft_len:
@@ -81,7 +82,6 @@ class OfdmPhy(BurstPhy):
             self._stock = self._checked_stock()
             self.gap = self._stock.gap
         else:
-            self.gap = BurstOptions.gap if chosen.gap is None else chosen.gap
             fill = layout.fill(packet_len)
             mask = layout.mask(packet_len + fill + 4)
             frame = Frame(packet_len, chosen.fec, order="little", fill=fill, mask=mask)
@@ -98,10 +98,6 @@ class OfdmPhy(BurstPhy):
         if gap < least:
             raise ConfigError(f"phy ofdm: gap = {gap}: below {least} the last packet stays in the stock receiver")
         return StockFrame(self.layout, self.packet_len, gap)
-
-    @property
-    def receiver_taps(self) -> Any:
-        return None
 
     def frame_bits(self) -> int:
         """Payload bits of one frame, CRC-32, filling and coding included."""
@@ -132,8 +128,8 @@ class OfdmPhy(BurstPhy):
         if self._stock is not None:
             idle_spinning_threads()
 
-    def transmitter(self) -> Any:
+    def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self, aside: bool = False) -> Any:
+    def receiver(self, aside: bool = False) -> PacketReceiver:
         return super().receiver(aside) if self._stock is None else StockReceiver(self._stock)

@@ -20,7 +20,7 @@ from typing import Any
 import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
-from gr_ros2.phy.flowgraph import HierBlock, Transmitter
+from gr_ros2.phy.flowgraph import HierBlock, Receiver, Transmitter
 from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, Layout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import keep_messages, only_warnings
@@ -136,12 +136,11 @@ class StockTransmitter(Transmitter):
         frame.fit_buffers(parts)
 
 
-class StockReceiver(HierBlock):
+class StockReceiver(Receiver):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: StockFrame) -> None:
-        super().__init__("gr_ros2_ofdm_rx", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
-        self.message_port_register_hier_out("pdus")
+        super().__init__("gr_ros2_ofdm_rx")
         self._frame = frame
         self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
         # Header parser and demultiplexer tell of every header lost in noise.

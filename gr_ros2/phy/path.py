@@ -13,7 +13,7 @@ from typing import Any
 from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.airtime import AirtimeGate
-from gr_ros2.phy.base import Phy
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy, SymbolSource
 from gr_ros2.phy.channel import Channel, PacketLoss
 from gr_ros2.phy.tap import Samples, Tap
 
@@ -51,12 +51,12 @@ class PacketPath:
     channel: ChannelConfig
     """Impairments as they are set now."""
     _gate: AirtimeGate | None = None
-    _transmitter: Any = None
+    _transmitter: PacketTransmitter | None = None
     _faded: Channel | None = None
-    _receiver: Any = None
+    _receiver: PacketReceiver | None = None
     _loss: PacketLoss | None = None
     _tap: Tap | None = None
-    _symbols: Any = None
+    _symbols: SymbolSource | None = None
 
     def counts(self) -> LinkCounts:
         """A snapshot."""
@@ -82,8 +82,7 @@ class PacketPath:
     def snr_db(self) -> float | None:
         """SNR of the newest packets received, dB over the sampled band; None before the first, or where the PHY does
         not tell."""
-        snr_db: float | None = getattr(self._receiver, "snr_db", None)
-        return snr_db
+        return None if self._receiver is None else self._receiver.snr_db
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Noise on what is received, dB, None = none; see :meth:`Channel.set_snr_db`.
@@ -149,7 +148,7 @@ class PacketPath:
         if shown:
             self._tap = Tap(_LOOK)
             graph.connect(samples, self._tap)
-            self._symbols = self._receiver.tap_symbols() if hasattr(self._receiver, "tap_symbols") else None
+            self._symbols = self._receiver.tap_symbols()
         return samples
 
     def _follow(self, packets: Any, block: Any) -> Any:

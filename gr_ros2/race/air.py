@@ -16,12 +16,12 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig, TopicOptions
+from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, TopicOptions
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.link import SenderEvent
 from gr_ros2.link.events import SentPacket
-from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.pdus import PDUS, pdu_of
@@ -298,5 +298,4 @@ class TunSink(KeepsThread, gr.basic_block):  # type: ignore[misc]
 
 
 def _graph(domain_id: int) -> Middleware:
-    graph: Middleware = MIDDLEWARE.load("dds")(domain_id=domain_id, node_name="gr_ros2_race", localhost_only=True)
-    return graph
+    return join_graph(DEFAULT_MIDDLEWARE, domain_id=domain_id, node_name="gr_ros2_race", localhost_only=True)

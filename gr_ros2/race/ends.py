@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from gr_ros2.middleware import MIDDLEWARE, Middleware, Publisher, Qos, Subscription
+from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.base import MessageCallback, Reliability
 from gr_ros2.race.air import DEPTH, SINK_DOMAIN, SOURCE_DOMAIN
@@ -61,9 +61,7 @@ class DdsNetwork(Network):
     """
 
     def __init__(self, domain_id: int, localhost_only: bool, qos: Qos) -> None:
-        self._graph: Middleware = MIDDLEWARE.load("dds")(
-            domain_id=domain_id, node_name="race", localhost_only=localhost_only
-        )
+        self._graph = join_graph("dds", domain_id=domain_id, node_name="race", localhost_only=localhost_only)
         self._qos = qos
 
     def advertise(self, topic: str, type_name: str) -> Publisher:
@@ -125,6 +123,7 @@ class _ZenohPublisher(Publisher):
 
 class _ZenohSubscription(Subscription):
     def __init__(self, subscriber: Any, session: Any) -> None:
+        super().__init__()
         self._subscriber, self._session = subscriber, session
 
     def matched(self) -> int:

@@ -7,17 +7,37 @@ from gr_ros2.backends import Backend, BackendTable
 FRONT_ENDS = BackendTable(
     "front_end",
     {
-        "sim": Backend("gr_ros2.radio.sim", "SimFrontEnd", "channel model: what a robot sends comes back to it"),
+        "sim": Backend(
+            "gr_ros2.radio.sim",
+            "SimFrontEnd",
+            "channel model: what a robot sends comes back to it",
+            title="Simulated Radio",
+        ),
         "zmq": Backend(
-            "gr_ros2.radio.zmq", "ZmqFrontEnd", "samples over ZeroMQ: processes or machines without radios", "pyzmq"
+            "gr_ros2.radio.zmq",
+            "ZmqFrontEnd",
+            "samples over ZeroMQ: processes or machines without radios",
+            "pyzmq",
+            title="ZeroMQ Radio",
         ),
-        "file": Backend("gr_ros2.radio.file", "FileFrontEnd", "SigMF recordings, written and replayed"),
+        "file": Backend(
+            "gr_ros2.radio.file", "FileFrontEnd", "SigMF recordings, written and replayed", title="SigMF File Radio"
+        ),
         "soapy": Backend(
-            "gr_ros2.radio.soapy", "SoapyFrontEnd", "any SoapySDR device", "gr-soapy, part of GNU Radio 3.10"
+            "gr_ros2.radio.soapy",
+            "SoapyFrontEnd",
+            "any SoapySDR device",
+            "gr-soapy, part of GNU Radio 3.10",
+            title="SoapySDR Radio",
         ),
-        "uhd": Backend("gr_ros2.radio.uhd", "UhdFrontEnd", "USRPs", "gr-uhd, part of GNU Radio 3.10"),
-        "pluto": Backend("gr_ros2.radio.pluto", "PlutoFrontEnd", "ADALM-Pluto", "gr-iio, part of GNU Radio 3.10"),
+        "uhd": Backend(
+            "gr_ros2.radio.uhd", "UhdFrontEnd", "USRPs", "gr-uhd, part of GNU Radio 3.10", title="USRP Radio"
+        ),
+        "pluto": Backend(
+            "gr_ros2.radio.pluto", "PlutoFrontEnd", "ADALM-Pluto", "gr-iio, part of GNU Radio 3.10", title="Pluto Radio"
+        ),
     },
+    Backend,
 )
 
 __all__ = ["FRONT_ENDS"]

@@ -64,7 +64,7 @@ class LinkConfig:
         ):
             if name not in table:
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
-        if self.phy.sample_rate == 0 and self.phy.name != "direct":
+        if self.phy.sample_rate == 0 and PHY.load(self.phy.name).has_samples:
             raise ValueError("phy.sample_rate = 0: a link needs one; set it to what the radio can do, samples/s")
         self.ros_source.src_id()
         return self

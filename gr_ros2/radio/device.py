@@ -118,6 +118,11 @@ class DeviceFrontEnd(FrontEnd):
                 self.close()
                 raise
 
+    @property
+    def receive_frequency(self) -> float:
+        frequency: float = self.options.receive_frequency
+        return frequency
+
     @abstractmethod
     def _open_transmitter(self) -> Any:
         """The block that sends, ready to run."""

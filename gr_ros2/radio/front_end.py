@@ -47,6 +47,8 @@ class FrontEnd(ABC):
     """Whether the channel is a real one, which no setting can impair."""
     loops_back: ClassVar[bool] = False
     """Whether a robot hears itself as if it were another."""
+    refuses: ClassVar[frozenset[str]] = frozenset()
+    """Options of its base that it cannot have, and GRC does not offer."""
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
@@ -68,6 +70,11 @@ class FrontEnd(ABC):
 
     def wire(self, graph: Any) -> None:  # noqa: B027 - most are one block each way
         """Connect what lies behind ``sink`` and before ``source`` in a flowgraph."""
+
+    @property
+    def receive_frequency(self) -> float | None:
+        """Hz at which it receives; None where there is no radio."""
+        return None
 
     def airtime(self) -> float:
         """s from the start of one packet to the earliest start of the next."""

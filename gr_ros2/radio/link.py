@@ -16,11 +16,10 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig
-from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
-from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.phy import configured
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
@@ -122,13 +121,9 @@ class RobotLink(Flowgraph):
         return opened[places[0]], opened[places[1]]
 
     def _graph(self, name: str, domain_id: int) -> Middleware:
-        node_name = self.node_name
-        settings: dict[str, Any] = {"domain_id": domain_id, "node_name": node_name}
-        if name == "bag":
-            raise ConfigError("middleware = 'bag': a link is between live graphs; play the bag on a graph beside it")
-        if name == "dds" and self.config.localhost_only is not None:
-            settings["localhost_only"] = self.config.localhost_only
-        graph: Middleware = MIDDLEWARE.load(name)(**settings)
+        graph = join_graph(
+            name, domain_id=domain_id, node_name=self.node_name, localhost_only=self.config.localhost_only
+        )
         self._stack.callback(graph.close)
         return graph
 

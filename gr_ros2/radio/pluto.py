@@ -63,6 +63,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     name = "pluto"
     Options = PlutoOptions
+    refuses = frozenset({"antenna_tx", "antenna_rx"})
     example_args = "ip:192.168.2.1 or usb:1.5.5"
     find_with = "iio_info -S"
 
@@ -72,7 +73,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
             raise RadioError(
                 f"front_end pluto: phy.sample_rate = {rate:,.0f}: a Pluto has {SLOWEST:,.0f} to {FASTEST:,.0f}"
             )
-        if options.antenna_tx or options.antenna_rx:
+        if any(getattr(options, name) for name in self.refuses):
             raise RadioError("front_end pluto: a Pluto has one port to send and one to receive; leave antennas out")
         block = iio.fmcomms2_sink_fc32(options.args, _CHANNELS, self.layout.total, False)
         block.set_filter_params(*_AUTOMATIC_FILTER)

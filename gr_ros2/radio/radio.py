@@ -92,7 +92,7 @@ class Radio(PacketPath, HierBlock):
         # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
         heard = self._receive(front_end.source, faded=faded, shown=instrumented, aside=not front_end.ends)
         if record:
-            frequency = getattr(front_end.options, "receive_frequency", None)
+            frequency = front_end.receive_frequency
             about = Recording(self.phy.sample_rate, frequency, f"received by {front_end.name}, phy {self.phy.name}")
             self._recorder = SigmfRecorder(Path(record), about)
             self.connect(heard, self._recorder)
@@ -118,12 +118,12 @@ class Radio(PacketPath, HierBlock):
     @property
     def refused(self) -> int:
         """PDUs the transmitter could not take."""
-        return int(getattr(self._transmitter, "refused", 0))
+        return 0 if self._transmitter is None else self._transmitter.refused
 
     @property
     def damaged(self) -> int:
         """Packets heard that were not whole, as far as the PHY tells."""
-        return int(getattr(self._receiver, "damaged", 0))
+        return 0 if self._receiver is None else self._receiver.damaged
 
     @property
     def _medium(self) -> str:

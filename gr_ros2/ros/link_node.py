@@ -105,8 +105,7 @@ def _settings(link: RobotLink) -> list[Parameter]:
     """Those of the configuration, with all that PHY and front end have settings for, each once."""
     found = list(parameters(link.config))
     for prefix, part in (("phy.options.", link.phy), ("front_end.", link.front_end)):
-        options = getattr(part, "options", None)
-        found += [] if options is None else parameters(options, prefix)
+        found += parameters(part.options, prefix)
     return list({parameter.name: parameter for parameter in found}.values())
 
 

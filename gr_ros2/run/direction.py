@@ -16,7 +16,7 @@ from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.middleware import MIDDLEWARE, Middleware
+from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
@@ -33,11 +33,12 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
 
     :param node: what it is called there, after ``gr_ros2_``
     """
-    settings: dict[str, Any] = {"domain_id": end.domain_id, "node_name": f"gr_ros2_{node}"}
-    if end.middleware == "dds":
-        settings["localhost_only"] = scenario.localhost_only
-    graph: Middleware = MIDDLEWARE.load(end.middleware)(**settings)
-    return graph
+    return join_graph(
+        end.middleware,
+        domain_id=end.domain_id,
+        node_name=f"gr_ros2_{node}",
+        localhost_only=scenario.localhost_only,
+    )
 
 
 class Direction:
@@ -67,9 +68,8 @@ class Direction:
         self.input = stack.enter_context(self._input_graph())
         self.output = stack.enter_context(open_graph(scenario, scenario.ros_sink, "sink"))
         # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
-        backpressure = scenario.ros_source.backpressure or (
-            isinstance(self.input, BagMiddleware) and self.input.speed == 0
-        )
+        pulled = scenario.bag_path is not None and scenario.bag_speed == 0
+        backpressure = scenario.ros_source.backpressure or pulled
         self.source = RosSource(
             registry,
             middleware=self.input,

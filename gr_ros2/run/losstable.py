@@ -112,12 +112,9 @@ def neighbours(snr_db: float) -> tuple[float, float]:
 
 def setting_of(phy: Phy, channel: ChannelConfig) -> dict[str, Any]:
     """What the losses of a PHY's packets depend on, beside the SNR; what is at its default is left out."""
-    chosen = getattr(phy, "options", None)
-    options = {}
-    if chosen is not None:
-        default = type(chosen)()
-        names = (item.name for item in fields(chosen))
-        options = {name: getattr(chosen, name) for name in names if getattr(chosen, name) != getattr(default, name)}
+    chosen, default = phy.options, phy.Options()
+    names = [item.name for item in fields(chosen)]
+    options = {name: getattr(chosen, name) for name in names if getattr(chosen, name) != getattr(default, name)}
     on_samples = {name: value for name, value in channel.on_samples().items() if name != "snr_db"}
     setting = {"phy": phy.name, "packet_len": phy.packet_len, "options": options, "channel": on_samples}
     if channel.doppler_hz:

@@ -104,6 +104,12 @@ def test_from_the_dds_graph(
     assert capsys.readouterr().out == f"{out}: 1 topics, digest {Registry.from_csv(out).digest}\n"
 
 
+@pytest.mark.parametrize("name", ["memory", "bag", "nothing"])
+def test_a_middleware_that_no_robot_is_on_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["registry", "from-graph", "--middleware", name]) == 2
+    assert f"'{name}' has no graph that a robot could be on; take dds, rclpy, zenoh" in capsys.readouterr().err
+
+
 SERVICE = TopicInfo("/add/_service_event", "example_interfaces/srv/AddTwoInts_Event", (Qos(),))
 FEEDBACK = TopicInfo("/fib/_action/feedback", "example_interfaces/action/Fibonacci_FeedbackMessage", (Qos(),))
 STATUS = TopicInfo("/fib/_action/status", "action_msgs/msg/GoalStatusArray", (LATCHED,))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import Graph, check_loop, read_registry, settings
+from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 
@@ -40,6 +43,43 @@ def test_the_same_graph_is_the_same_domain() -> None:
     finally:
         for graph in graphs:
             graph.close()
+
+
+class Elsewhere(MemoryMiddleware):
+    """Stands for another row."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(domain_id=55)
+        self.name = name  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        ("dds", "dds", True),
+        ("dds", "rclpy", True),
+        ("zenoh", "rclpy", True),
+        ("dds", "zenoh", False),
+        ("memory", "dds", False),
+        ("memory", "rclpy", False),
+        ("own", "own", True),
+        ("own", "dds", False),
+    ],
+)
+def test_who_can_hear_whom_is_as_the_rows_say(one: str, other: str, expected: bool) -> None:
+    with Elsewhere(one) as first, Elsewhere(other) as second:
+        assert Graph(first, one, 55, "node").same_as(Graph(second, other, 55, "node")) is expected
+        assert Graph(second, other, 55, "node").same_as(Graph(first, one, 55, "node")) is expected
+
+
+def test_a_bag_is_nobody_elses_graph(tmp_path: Path) -> None:
+    with (
+        BagMiddleware(path=tmp_path / "one", mode="write") as one,
+        BagMiddleware(path=tmp_path / "two", mode="write") as two,
+    ):
+        graphs = [Graph(bag, "bag", 55, "node") for bag in (one, two)]
+        assert graphs[0].same_as(graphs[0])
+        assert not graphs[0].same_as(graphs[1])
 
 
 def test_what_was_handed_over_is_not_closed() -> None:

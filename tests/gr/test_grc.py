@@ -139,12 +139,12 @@ def test_a_setting_has_one_label_wherever_it_stands() -> None:
     assert {name: said for name, said in labels.items() if len(said) > 1} == {}
 
 
-@pytest.mark.parametrize("name", list(FRONT_ENDS))
+@pytest.mark.parametrize("name", list(FRONT_ENDS.own))
 def test_a_radio_offers_what_it_can_do(name: str) -> None:
     loaded = description(f"ros2_radio_{name}")
     offered = {parameter["id"]: parameter["dtype"] for parameter in loaded["parameters"]}
     settings = {item.name for item in fields(FRONT_ENDS.load(name).Options)}
-    refused = {"antenna_tx", "antenna_rx"} if name == "pluto" else set()
+    refused = FRONT_ENDS.load(name).refuses
     channel = set() if FRONT_ENDS.load(name).has_radio else {"snr_db", "frequency_offset", "packet_loss"}
     made = {"phy", "phy_options", "packet_len", "sample_rate", "record"}
     assert set(offered) == settings - refused | channel | made
@@ -166,10 +166,10 @@ def test_options_are_the_tables() -> None:
     for name in BLOCKS:
         options = {item["id"]: item.get("options") for item in description(name)["parameters"]}
         assert [ast.literal_eval(option) for option in options["middleware"]] == [
-            name for name in MIDDLEWARE if name != "bag"
+            name for name, row in MIDDLEWARE.own.items() if row.scope != "none"
         ]
     options = {item["id"]: item.get("options") for item in description("ros2_source")["parameters"]}
-    assert [ast.literal_eval(option) for option in options["scheduler"]] == list(SCHEDULER)
+    assert [ast.literal_eval(option) for option in options["scheduler"]] == list(SCHEDULER.own)
 
 
 @pytest.fixture(scope="module")

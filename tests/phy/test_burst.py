@@ -14,9 +14,10 @@ import numpy as np
 
 from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import BurstReceiver, Frame, whitening
+from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.lora import code_words
 
-NAMES = ("ofdm", "gfsk", "psk", "lora")
+NAMES = [name for name in PHY.own if issubclass(PHY.load(name), BurstPhy)]
 
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [

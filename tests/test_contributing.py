@@ -1,0 +1,76 @@
+"""The worked examples of CONTRIBUTING.md: installed from the page as a package, and held to the contracts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.packages import REPOSITORY, install, run
+
+PAGE = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"^### [^\n]*`(\w+)\.py`\n.*?^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+TOML = "".join(re.findall(r"^```toml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("site-packages")
+    groups: dict[str, dict[str, str]] = {}
+    for line in filter(None, TOML.splitlines()):
+        if group := re.fullmatch(r'\[project\.entry-points\."(.*)"\]', line):
+            rows = groups.setdefault(group[1], {})
+        else:
+            name, value = re.fullmatch(r'(\w+) = "(.*)"', line).groups()  # type: ignore[union-attr]
+            rows[name] = value
+    install(made, "worked-examples", FILES, groups)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("name", "suite", "least"),
+    [
+        ("spool", ("tests/middleware/test_contract.py",), 30),
+        ("halfsine", ("tests/phy/test_contract.py", "tests/phy/test_loopback.py"), 15),
+    ],
+)
+def test_a_worked_example_keeps_the_contract(
+    folder: Path, tmp_path: Path, name: str, suite: tuple[str, ...], least: int
+) -> None:
+    if name == "halfsine":
+        pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    done = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", *suite, "-k", name, SPOOL=str(tmp_path))
+    passed = re.search(r"(\d+) passed", done.stdout)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr
+    assert passed is not None and int(passed[1]) >= least, done.stdout[-1000:]
+    assert "skipped" not in done.stdout, done.stdout[-1000:]
+
+
+def test_the_worked_examples_carry_a_run_together(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    scenario = tmp_path / "worked.yaml"
+    scenario.write_text(
+        "{name: worked, registry: table4, duration_s: 2, packet_len: 64, phy: {name: halfsine, options: {sps: 8}}, "
+        "ros_source: {namespace: /robot_1, middleware: spool, domain_id: 41}, "
+        "ros_sink: {middleware: spool, domain_id: 42}}"
+    )
+    arguments = ("run", str(scenario), "--out", str(tmp_path / "out"))
+    done = run(folder, "-m", "gr_ros2.cli", *arguments, SPOOL=str(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert '"name": "halfsine"' in next((tmp_path / "out").glob("*.json")).read_text()
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_the_worked_examples_are_written_like_the_rest(folder: Path, name: str) -> None:
+    pytest.importorskip("ruff", reason="ruff is not installed")
+    for check in (("check", "--config", "pyproject.toml"), ("format", "--check", "--config", "pyproject.toml")):
+        done = run(folder, "-m", "ruff", *check, str(folder / f"{name}.py"))
+        assert done.returncode == 0, done.stdout + done.stderr
+    pytest.importorskip("mypy", reason="mypy is not installed")
+    typed = run(folder, "-m", "mypy", "--config-file", "pyproject.toml", str(folder / f"{name}.py"))
+    assert typed.returncode == 0, typed.stdout
+
+
+def test_the_page_has_an_example_of_each() -> None:
+    assert sorted(FILES) == ["halfsine", "spool"]
