@@ -8,7 +8,7 @@ Counts are exact while it runs; once the result is in, every number is the resul
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from hashlib import blake2b
 from math import nan
 from threading import Lock
@@ -19,7 +19,17 @@ import numpy as np
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
-from gr_ros2.link.events import Accepted, Delivered, Lost, ReceiverEvent, Refused, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import (
+    Accepted,
+    Delivered,
+    Lost,
+    Received,
+    ReceiverEvent,
+    Refused,
+    Rejected,
+    SenderEvent,
+    SentPacket,
+)
 from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -41,6 +51,9 @@ PACKETS_SHOWN = 12
 
 _PATH_STEP_S = 0.1
 _DIGEST_SIZE = 16
+
+
+_Away = tuple[int, Hashable, bytes]
 
 
 class _Topic:
@@ -73,12 +86,12 @@ class _Source:
         self.last_serial = -1
         self.open: OrderedDict[int, tuple[int, float, bytes]] = OrderedDict()
         """Serial -> topic id, time of submission, digest; until the first fragment leaves."""
-        self.away: OrderedDict[tuple[int, int, bytes], float] = OrderedDict()
-        """Topic id, entry id, digest -> time of submission."""
-        self.left_as: OrderedDict[int, tuple[int, int, bytes]] = OrderedDict()
+        self.away: OrderedDict[_Away, float] = OrderedDict()
+        """Topic id, the engine's key, digest -> time of submission."""
+        self.left_as: OrderedDict[int, _Away] = OrderedDict()
         """Serial -> key in ``away``."""
-        self.repeats: OrderedDict[Key, int] = OrderedDict()
-        """Topic id and entry id whose latest use was a repeat -> serial of the message repeated."""
+        self.repeats: OrderedDict[tuple[int, Hashable], int] = OrderedDict()
+        """Topic id and key whose latest use was a repeat -> serial of the message repeated."""
 
 
 class DashboardState:
@@ -115,7 +128,7 @@ class DashboardState:
         self._start: float | None = None
         self._sources: dict[int, _Source] = {}
         self._topics: dict[Key, _Topic] = {}
-        self._received: deque[tuple[float, bytes]] = deque(maxlen=PACKETS_SHOWN + 1)
+        self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
         self._packets_sent, self._packets_received = Rate(RATE_S), Rate(RATE_S)
         self._phase = "waiting"
@@ -138,14 +151,6 @@ class DashboardState:
             else:
                 self._refused(source, src_id, event)
 
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Bytes the PHY handed to the sink, whatever they are."""
-        with self._lock:
-            self._begin(now)
-            self._packets["handed_up"] += 1
-            self._packets_received.add(now)
-            self._received.append((now, data))
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports."""
         with self._lock:
@@ -153,11 +158,16 @@ class DashboardState:
                 self._delivered(event, now)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
-                if source is None or (event.topic_id, event.entry_id) not in source.repeats:
+                if source is None or (event.topic_id, event.key) not in source.repeats:
                     self._topic((event.src_id, event.topic_id)).ended[event.reason] += 1
-            elif isinstance(event, Rejected):
-                self._packets[f"rejected_{event.error.kind}"] += 1
-                self._packets["rejected"] += 1
+            else:
+                self._begin(now)
+                self._packets["handed_up"] += 1
+                self._packets_received.add(now)
+                self._received.append((now, event))
+                if isinstance(event, Rejected):
+                    self._packets[f"rejected_{event.error.kind}"] += 1
+                    self._packets["rejected"] += 1
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
         """It is over; without a result where a run failed, and where there was one end of a link only."""
@@ -333,15 +343,15 @@ class DashboardState:
     def _left(self, source: _Source, event: SentPacket) -> None:
         for entry in event.entries:
             if entry.repeat:
-                source.repeats[entry.topic_id, entry.entry_id] = entry.serial
+                source.repeats[entry.topic_id, entry.key] = entry.serial
                 _bound(source.repeats)
                 continue
             message = source.open.pop(entry.serial, None)
             if message is not None:  # its first fragment
                 topic_id, t_sent, digest = message
-                source.repeats.pop((topic_id, entry.entry_id), None)
-                source.left_as[entry.serial] = (topic_id, entry.entry_id, digest)
-                source.away[topic_id, entry.entry_id, digest] = t_sent
+                source.repeats.pop((topic_id, entry.key), None)
+                source.left_as[entry.serial] = (topic_id, entry.key, digest)
+                source.away[topic_id, entry.key, digest] = t_sent
                 _bound(source.left_as)
                 _bound(source.away)
 
@@ -351,10 +361,10 @@ class DashboardState:
         t_sent = None
         if source is not None:
             digest = _digest(event.payload)
-            t_sent = source.away.pop((event.topic_id, event.entry_id, digest), None)
-            repeated = source.repeats.get((event.topic_id, event.entry_id))
+            t_sent = source.away.pop((event.topic_id, event.key, digest), None)
+            repeated = source.repeats.get((event.topic_id, event.key))
             if t_sent is None and repeated is not None:
-                t_sent = source.away.pop(source.left_as.get(repeated, (-1, -1, b"")), None)
+                t_sent = source.away.pop(source.left_as.get(repeated, (-1, None, b"")), None)
                 if t_sent is None:
                     return
         topic = self._topic(key)

@@ -1,21 +1,43 @@
-"""What the engines tell their shells: values only, no behaviour."""
+"""What the engines tell their shells: values only, no behaviour.
+
+A message is named by its source, its topic and a ``key``: a hashable value that the engine makes and only compares. A
+key may come round, but never while the message that had it before can still arrive.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from gr_ros2.errors import WireError
+from gr_ros2.wire import Packet
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A packet came in: its bytes and what they say. What it completes or ends is told behind it."""
+
+    data: bytes
+    packet: Packet
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Bytes from the PHY that are no packet of ours."""
+
+    data: bytes
+    error: WireError
 
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """A message is complete. ``qos`` is the class of the packet that completed it; ``entry_id`` names it on the air."""
+    """A message is complete. ``qos`` is the class of the packet that completed it."""
 
     src_id: int
     topic_id: int
     payload: bytes
     qos: int
-    entry_id: int = 0
+    key: Hashable = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,17 +52,10 @@ class Lost:
     src_id: int
     topic_id: int
     reason: str
-    entry_id: int = 0
+    key: Hashable = None
 
 
-@dataclass(frozen=True, slots=True)
-class Rejected:
-    """Bytes from the PHY that are no packet of ours."""
-
-    error: WireError
-
-
-ReceiverEvent = Delivered | Lost | Rejected
+ReceiverEvent = Received | Rejected | Delivered | Lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +89,15 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class SentEntry:
-    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial``.
+    """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
-    ``repeat`` says that the message has been sent before, and is sent again for robots that come late.
+    ``total`` fragments are all of it; 0 while a message is cut as it goes. ``repeat`` says that the message has been
+    sent before, and is sent again for robots that come late.
     """
 
     serial: int
     topic_id: int
-    entry_id: int
+    key: Hashable
     index: int
     total: int
     repeat: bool = False
@@ -89,9 +105,10 @@ class SentEntry:
 
 @dataclass(frozen=True, slots=True)
 class SentPacket:
-    """A packet that left the sender."""
+    """A packet that left the sender: its bytes, what they say, and of which messages its entries are, in order."""
 
     data: bytes
+    packet: Packet
     entries: tuple[SentEntry, ...]
     now: float
 

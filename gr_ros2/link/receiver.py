@@ -7,13 +7,13 @@ name; memory is bounded per source and in all; time is an argument and never goe
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, Rejected
+from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
@@ -22,8 +22,6 @@ from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
 """A source silent for so long gives its place to a new one when ``max_sources`` are known."""
-
-Observer = Callable[[ReceiverEvent], None]
 
 
 @dataclass(slots=True)
@@ -61,7 +59,6 @@ class Receiver:
     """Reassembles the messages of every source heard.
 
     :param registry: says which topic ids exist and which are transient-local
-    :param observer: called with every ReceiverEvent, in order
     :param codec: decodes messages from packets with C = 1, which without it are ``unsupported``
     """
 
@@ -70,13 +67,11 @@ class Receiver:
         registry: Registry,
         config: SinkConfig,
         *,
-        observer: Observer | None = None,
         codec: MessageCodec | None = None,
     ) -> None:
         self.config = config
         self.registry = registry.with_options(config.topic_options)
         self.stats = ReceiverStats()
-        self._observer = observer
         self._codec = codec
         self._sources: dict[int, _Source] = {}
         self._partials: OrderedDict[Partial, int] = OrderedDict()
@@ -90,11 +85,13 @@ class Receiver:
             packet = V0.decode(data, self.config.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
-            return self._report(events, [Rejected(error)])
+            events.append(Rejected(data, error))
+            return events
         self.stats.packets += 1
+        events.append(Received(data, packet))
         source = self._admit(packet, now)
         if source is not None:
-            self._report(events, self._take(source, packet, data, now))
+            events += self._take(source, packet, data, now)
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
@@ -104,7 +101,7 @@ class Receiver:
             if partial.last + self.config.reassembly_timeout > now:
                 break
             ended.append(partial)
-        return self._report([], [self._abandon(partial, "expired") for partial in ended])
+        return [self._abandon(partial, "expired") for partial in ended]
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
@@ -242,10 +239,3 @@ class Receiver:
         source.size -= partial.size
         self._size -= partial.size
         del source.topics[partial.topic_id].partials[partial.entry_id]
-
-    def _report(self, events: list[ReceiverEvent], more: Iterable[ReceiverEvent]) -> list[ReceiverEvent]:
-        for event in more:
-            events.append(event)
-            if self._observer is not None:
-                self._observer(event)
-        return events

@@ -325,7 +325,7 @@ class Sender:
         stats.packets += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
-        self._observe(SentPacket(data, tuple(record), now))
+        self._observe(SentPacket(data, packet, tuple(record), now))
         return data
 
     def _take_id(self, topic_id: int) -> int:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig
@@ -82,7 +81,7 @@ class RobotLink(Flowgraph):
         self.source = RosSource(
             self.registry,
             middleware=graphs[0],
-            observer=None if observer is None else partial(observer.sender_event, config.ros_source.src_id()),
+            observer=observer,
             clock=self._clock,
             **own_settings(config.ros_source),
         )
@@ -90,8 +89,7 @@ class RobotLink(Flowgraph):
         self.sink = RosSink(
             self.registry,
             middleware=graphs[1],
-            observer=None if observer is None else lambda event: observer.receiver_event(event, self._clock()),
-            packet_observer=None if observer is None else lambda data: observer.packet_received(data, self._clock()),
+            observer=observer,
             clock=self._clock,
             **own_settings(self._sink_config()),
         )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter, deque
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from math import isnan, nan
@@ -88,7 +89,8 @@ class _Open:
     serial: int
     position: int
     digest: bytes
-    entry_id: int = -1
+    key: tuple[int, Hashable] | None = None
+    """Topic id and the engine's key, once its first fragment has left."""
     total: int = 0
     sent: int = 0
     received: int = 0
@@ -107,14 +109,15 @@ _Shelf = dict[int, _Open]
 
 @dataclass(slots=True)
 class _Source:
-    """One sender: its open messages, found by serial, by entry id and by payload; and its packets in the air."""
+    """One sender: its open messages, found by serial, by key and by payload; and its packets in the air."""
 
     src_id: int
     open: _Shelf = field(default_factory=dict)
-    by_entry_id: dict[tuple[int, int], _Shelf] = field(default_factory=dict)
+    by_key: dict[tuple[int, Hashable], _Shelf] = field(default_factory=dict)
+    """Topic id and key -> those that had it; a key may come round."""
     by_digest: dict[tuple[int, bytes], _Shelf] = field(default_factory=dict)
-    repeats: dict[tuple[int, int], int] = field(default_factory=dict)
-    """(topic id, entry id) whose latest use was a repeat -> serial of the message repeated."""
+    repeats: dict[tuple[int, Hashable], int] = field(default_factory=dict)
+    """Topic id and key whose latest use was a repeat -> serial of the message repeated."""
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -274,29 +277,29 @@ class Ledger:
         ordinal = source.packets_sent
         source.packets_sent += 1
         for entry in event.entries:
-            key = (entry.topic_id, entry.entry_id)
+            key = (entry.topic_id, entry.key)
             if entry.repeat:
                 source.repeats[key] = entry.serial
                 continue
             message = source.open.get(entry.serial)
             if message is None:  # delivered or dropped before its last fragment left
                 continue
-            if message.entry_id < 0:
-                message.entry_id = entry.entry_id
-                message.total = entry.total
+            message.total = entry.total
+            if message.key is None:
+                message.key = key
                 source.repeats.pop(key, None)
                 self._retire(source, key)
-                source.by_entry_id.setdefault(key, {})[entry.serial] = message
+                source.by_key.setdefault(key, {})[entry.serial] = message
             message.sent += 1
             message.last_packet = ordinal
         digest = _digest(event.data)
         source.in_air.append((ordinal, digest))
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
-    def _retire(self, source: _Source, key: tuple[int, int]) -> None:
-        """Settle what had this entry id before and cannot arrive any more; 256 ids have passed since."""
+    def _retire(self, source: _Source, key: tuple[int, Hashable]) -> None:
+        """Settle what had this key before and cannot arrive any more: keys have come round since."""
         horizon = source.last_received - REORDER_WINDOW
-        for message in [m for m in source.by_entry_id.get(key, {}).values() if m.all_sent and m.last_packet < horizon]:
+        for message in [m for m in source.by_key.get(key, {}).values() if m.all_sent and m.last_packet < horizon]:
             self._close(source, message, _final_row(source, message, drained=False))
 
     # -- receiver -----------------------------------------------------------------------------------------------
@@ -305,9 +308,9 @@ class Ledger:
         digest = _digest(event.payload)
         source = self._sources.get(event.src_id)
         if source is not None:
-            key = (event.topic_id, event.entry_id)
+            key = (event.topic_id, event.key)
             same = source.by_digest.get((event.topic_id, digest), {})
-            exact = (m for m in source.by_entry_id.get(key, {}).values() if m.digest == digest)
+            exact = (m for m in source.by_key.get(key, {}).values() if m.digest == digest)
             message = next(exact, None)
             if message is None and key in source.repeats:
                 repeated = source.open.get(source.repeats[key])
@@ -330,9 +333,10 @@ class Ledger:
     def _lost(self, event: Lost) -> None:
         """Note the reason. It stands unless a delivery proves it wrong."""
         source = self._sources.get(event.src_id)
-        if source is None or (event.topic_id, event.entry_id) in source.repeats:
+        key = (event.topic_id, event.key)
+        if source is None or key in source.repeats:
             return
-        shelf = source.by_entry_id.get((event.topic_id, event.entry_id), {})
+        shelf = source.by_key.get(key, {})
         candidates = [m for m in shelf.values() if not m.reason]
         seen = [m for m in candidates if m.received]  # the receiver held at least one fragment of it
         for message in (seen or candidates)[:1]:
@@ -351,8 +355,8 @@ class Ledger:
         message.topic.book(message.position, row)
         del source.open[serial]
         _take(source.by_digest, (topic_id, message.digest), serial)
-        if message.entry_id >= 0:
-            _take(source.by_entry_id, (topic_id, message.entry_id), serial)
+        if message.key is not None:
+            _take(source.by_key, message.key, serial)
 
     def _match_late(self) -> None:
         """Deliveries that matched nothing when they came: by their bytes alone, against all that is still open."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import message_codec
-from gr_ros2.link import Receiver, Sender, SenderEvent, SenderStats, SentPacket
+from gr_ros2.link import Delivered, Receiver, Sender, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.losses import PduLosses
@@ -286,9 +286,9 @@ class Reception:
         """One step, no earlier than the one before."""
         if isinstance(step, Landed):
             self.wait_until(step.now)
-            self._ears.packet_received(step.data, step.now)
             for event in self._receiver.receive(step.data, step.now):
-                self._ears.receiver_event(event, step.now + self._overhead)
+                over = step.now + self._overhead if isinstance(event, Delivered) else step.now
+                self._ears.receiver_event(event, over)
         else:
             self._ears.sender_event(self._src_id, step)
 
@@ -296,4 +296,4 @@ class Reception:
         """Give up what has waited too long by then."""
         while (at := self._receiver.next_timeout()) is not None and at < now:
             for event in self._receiver.handle_timeout(at):
-                self._ears.receiver_event(event, at + self._overhead)
+                self._ears.receiver_event(event, at)

@@ -166,7 +166,7 @@ def test_packets_field_by_field() -> None:
     feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, hop=5)
     feed.submit(1, bytes(300), 10.0)
     feed.fly(10.0)
-    state.packet_received(b"no packet", 11.0)
+    feed.hear(b"no packet", 11.0)
     *packets, refused = state.tick(12.0).last_packets
     assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
     first = packets[0]

@@ -9,6 +9,8 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
+from gr_ros2.link import ReceiverEvent, SenderEvent
+
 PATIENCE_S = 30.0
 
 
@@ -18,6 +20,19 @@ def wait_for(condition: Callable[[], Any], what: str = "condition", patience: fl
     while not condition():
         assert time.monotonic() < deadline, f"waited {patience} s for {what}"
         time.sleep(0.002)
+
+
+class Hears:
+    """A LinkObserver that hands every event to one function."""
+
+    def __init__(self, hear: Callable[[Any], object]) -> None:
+        self._hear = hear
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002
+        self._hear(event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
+        self._hear(event)
 
 
 def pdu(data: bytes) -> Any:

@@ -21,11 +21,11 @@ from gr_ros2.config import SourceConfig
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.latency import Latency, LatencyWindow
-from gr_ros2.link import Delivered, Lost, Sender
+from gr_ros2.link import Delivered, Lost, Received, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Hears, Probe, wait_for
 
 REGISTRY = Registry.from_rows(
     {"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid", "cmd_vel": "geometry_msgs/Twist"}
@@ -141,12 +141,12 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
 
 def test_an_incomplete_message_expires_without_further_packets(rig: Rig) -> None:
     events: list[Any] = []
-    rig.make(reassembly_timeout=0.05, observer=events.append)
+    rig.make(reassembly_timeout=0.05, observer=Hears(events.append))
     rig.start()
     rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
-    wait_for(lambda: events)
-    assert isinstance(events[0], Lost)
-    assert events[0].reason == "expired"
+    wait_for(lambda: len(events) == 2)
+    assert [type(event) for event in events] == [Received, Lost]
+    assert events[1].reason == "expired"
     assert rig.sink.stats()["topics"]["/rx_robot_1/odom"]["lost"] == {"expired": 1}
 
 
@@ -163,26 +163,25 @@ def test_delivered_is_observed_after_publication(rig: Rig) -> None:
             return publisher
 
         middleware.advertise = watched
-        rig.make(middleware=middleware, observer=lambda event: seen.append((event, len(published))))
+        rig.make(middleware=middleware, observer=Hears(lambda event: seen.append((event, len(published)))))
         rig.start()
         rig.probe.post(packets((0, stamped(5)[:40]))[0])
-        wait_for(lambda: seen)
-        assert isinstance(seen[0][0], Delivered)
-        assert seen[0][1] == 1
+        wait_for(lambda: len(seen) == 2)
+        assert [(type(event), count) for event, count in seen] == [(Received, 0), (Delivered, 1)]
         rig.sink.close()
 
 
 def test_a_failed_publication_is_counted_and_observed(rig: Rig) -> None:
     events: list[Any] = []
     middleware = MemoryMiddleware(domain_id=DOMAIN)
-    sink = rig.make(middleware=middleware, observer=events.append)
+    sink = rig.make(middleware=middleware, observer=Hears(events.append))
     rig.start()
     middleware.close()
     with pytest.raises(MiddlewareError):
         middleware.advertise("/x", "nav_msgs/Odometry", Qos())
     rig.probe.post(packets((0, stamped(5)[:40]))[0])
-    wait_for(lambda: events)
-    assert events == [Lost(1, 0, "publish_failed", events[0].entry_id)]
+    wait_for(lambda: len(events) == 2)
+    assert events[1] == Lost(1, 0, "publish_failed", events[0].packet.entries[0].entry_id)
     assert sink.stats()["publish_failed"] == 1
 
 
@@ -190,36 +189,25 @@ def test_a_failing_observer_does_not_end_reception(rig: Rig, caplog: pytest.LogC
     def fail(_event: Any) -> None:
         raise ValueError("observer")
 
-    sink = rig.make(observer=fail)
+    sink = rig.make(observer=Hears(fail))
     rig.start()
     for data in packets(*((0, stamped(number)[:40]) for number in (1, 2))):
         rig.probe.post(data)
     wait_for(lambda: len(rig.heard) == 2)
-    wait_for(lambda: sink.stats()["observer_missed"] == 2)
+    wait_for(lambda: sink.stats()["observer_missed"] == 4)  # two packets and their messages
     assert [record.message for record in caplog.records if record.levelname == "ERROR"] == [
         "observer of ros2_sink: ended (ValueError: observer); the link goes on without it"
     ]
 
 
-def test_a_failing_observer_of_packets_does_not_end_reception(rig: Rig) -> None:
-    def fail(_data: bytes) -> None:
-        raise ValueError("observer")
-
-    sink = rig.make(packet_observer=fail)
-    rig.start()
-    for data in packets(*((0, stamped(number)[:40]) for number in (1, 2))):
-        rig.probe.post(data)
-    wait_for(lambda: len(rig.heard) == 2)
-    assert sink.stats()["observer_missed"] == 2
-
-
 def test_a_failing_observer_does_not_end_the_watch_over_timeouts(rig: Rig) -> None:
-    def fail(_event: Any) -> None:
-        raise ValueError("observer")
+    def fail(event: Any) -> None:
+        if isinstance(event, Lost):
+            raise ValueError("observer")
 
-    sink = rig.make(reassembly_timeout=0.05, observer=fail)
+    sink = rig.make(reassembly_timeout=0.05, observer=Hears(fail))
     rig.start()
-    for count in (1, 2):
+    for count in (1, 3):  # the second packet and what it began
         rig.probe.post(packets((0, stamped(count) + bytes(600)))[0])
         wait_for(lambda count=count: sink.stats()["observer_missed"] == count)
     assert [thread for thread in threading.enumerate() if thread.name == "gr-ros2-sink"]
@@ -230,13 +218,13 @@ def test_what_an_observer_makes_of_a_loss_does_not_cost_the_next_message(rig: Ri
         if isinstance(event, Lost):
             raise ValueError("observer")
 
-    sink = rig.make(observer=fail)
+    sink = rig.make(observer=Hears(fail))
     rig.start()
     # The same entry id: the second message ends the first, which is not complete.
     for data in packets((0, bytes(600)))[:1] + packets((0, stamped(5)[:40])):
         rig.probe.post(data)
     wait_for(lambda: rig.heard == [stamped(5)[:40]])
-    wait_for(lambda: sink.stats()["observer_missed"] == 2)
+    wait_for(lambda: sink.stats()["observer_missed"] == 2)  # the loss, and the message delivered behind it
 
 
 def test_nothing_waits_while_latencies_are_sorted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

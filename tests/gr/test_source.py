@@ -23,7 +23,7 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0
 from tests.e2e.support import free_domains
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Hears, Probe, wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61
@@ -116,7 +116,7 @@ def test_each_topic_has_its_depth(rig: Rig) -> None:
 
 def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
     refused: list[Refused] = []
-    rig.make(observer=lambda event: refused.append(event) if isinstance(event, Refused) else None)
+    rig.make(observer=Hears(lambda event: refused.append(event) if isinstance(event, Refused) else None))
     publisher = rig.robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=5, lifespan_s=0.01))
     rig.source.use_credit()
     rig.start(credit=True)
@@ -160,7 +160,7 @@ def test_credit_paces(rig: Rig) -> None:
 
 def test_events_reach_the_observer_in_order(rig: Rig) -> None:
     events: list[Any] = []
-    rig.make(packet_len=64, observer=events.append)
+    rig.make(packet_len=64, observer=Hears(events.append))
     rig.start()
     rig.publish(bytes(40))
     rig.publish(bytes(64_000))
@@ -233,7 +233,7 @@ def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
         if isinstance(event, SentPacket) and event.entries[0].serial == 0:
             raise ValueError("observer")
 
-    source = rig.make(packet_len=64, observer=fail)
+    source = rig.make(packet_len=64, observer=Hears(fail))
     rig.start()
     rig.publish(bytes(40))
     wait_for(lambda: source.stats()["observer_missed"] == 1)

@@ -22,7 +22,7 @@ from gr_ros2.run.outcome import DELIVERED_BAG
 from gr_ros2.run.replay import replay
 from gr_ros2.run.scenario import load_scenario
 from tests.e2e.support import check_books
-from tests.experiment.runs import odometry
+from tests.record.runs import odometry
 
 TOPIC = "/robot_1/odom"
 COUNT = 60
