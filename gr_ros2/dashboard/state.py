@@ -30,7 +30,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT
+from gr_ros2.link.outcome import Row
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import Result, TopicResult
@@ -74,9 +74,9 @@ class _Topic:
 
     def rows(self) -> dict[str, int]:
         """What the events alone say: who sees both ends asks the ledger instead."""
-        rows = {row: count for row, count in {DELIVERED: self.delivered, **self.ended}.items() if count}
+        rows = {row: count for row, count in {Row.DELIVERED.value: self.delivered, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
-        return {**rows, IN_FLIGHT: rest} if rest > 0 else rows
+        return {**rows, Row.IN_FLIGHT.value: rest} if rest > 0 else rows
 
 
 class _Source:
@@ -159,7 +159,7 @@ class DashboardState:
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or (event.topic_id, event.key) not in source.repeats:
-                    self._topic((event.src_id, event.topic_id)).ended[event.reason] += 1
+                    self._topic((event.src_id, event.topic_id)).ended[str(event.reason)] += 1
             else:
                 self._begin(now)
                 self._packets["handed_up"] += 1
@@ -248,7 +248,7 @@ class DashboardState:
         # What the ledger knows wins: it has heard every event, also those from before there was a state.
         rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
         sent, delivered = (
-            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(DELIVERED, 0))
+            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(Row.DELIVERED, 0))
         )
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
@@ -334,7 +334,7 @@ class DashboardState:
 
     def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
         topic = self._topic((src_id, event.topic_id))
-        topic.ended[event.reason] += 1
+        topic.ended[str(event.reason)] += 1
         source.open.pop(event.serial, None)
         if event.serial > source.last_serial:  # refused before it was queued
             source.last_serial = event.serial

@@ -26,6 +26,7 @@ from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Lost, Received, Receiver, ReceiverEvent, Rejected
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
@@ -266,7 +267,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 first = self._counters["publish_failed"] == 1
             if first:
                 self._log.warning("ros2_sink: a message was not published: %s", error)
-            return Lost(event.src_id, event.topic_id, "publish_failed", event.key)
+            return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
         with self._lock:
             self._delivered_at[key] = self._clock()
         if self._stamped[event.topic_id]:

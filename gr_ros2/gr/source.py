@@ -28,6 +28,7 @@ from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, Sender, SenderEvent, SentPacket
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
@@ -332,7 +333,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            level = logging.INFO if event.reason == "superseded" else logging.WARNING  # what `latest` is for
+            level = logging.INFO if event.reason == Row.SUPERSEDED else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

@@ -44,9 +44,9 @@ class Delivered:
 class Lost:
     """A message of which at least one fragment came will never be complete.
 
-    ``reason`` is a ledger row: ``lost_fragments`` (overtaken, contradicted, or behind an outage), ``expired``
-    (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E); or it is complete and
-    its codec says ``unknown_dictionary`` or ``damaged``.
+    ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
+    outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
+    or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int
@@ -77,7 +77,7 @@ class Accepted:
 class Refused:
     """A submitted message will not be sent, or not to its end.
 
-    ``reason`` is a ledger row: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
+    ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
     a message whose first fragments have left, ``abandoned``.
     """
 

@@ -14,6 +14,7 @@ from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
+from gr_ros2.link.outcome import ROWS, Row
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
@@ -101,7 +102,7 @@ class Receiver:
             if partial.last + self.config.reassembly_timeout > now:
                 break
             ended.append(partial)
-        return [self._abandon(partial, "expired") for partial in ended]
+        return [self._abandon(partial, Row.EXPIRED) for partial in ended]
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
@@ -155,7 +156,7 @@ class Receiver:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 ended = [partial for topic in source.topics.values() for partial in topic.reset()]
-                events += [self._forget(partial, packet.src_id, "lost_fragments") for partial in ended]
+                events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
@@ -168,7 +169,7 @@ class Receiver:
             missed = topic.missed_ids
             result, ended = topic.accept(entry, context)
             self.stats.message_loss_est += topic.missed_ids - missed
-            events += [self._forget(partial, packet.src_id, "lost_fragments") for partial in ended]
+            events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
             if isinstance(result, Partial):
                 grown = result.add(entry, now)
                 source.size += grown
@@ -188,12 +189,12 @@ class Receiver:
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
-            return [self._undone(packet, topic_id, entry_id, "unsupported")]
+            return [self._undone(packet, topic_id, entry_id, Row.UNSUPPORTED)]
         if packet.compressed and self._codec is not None:
             try:
                 payload = self._codec.decode(topic_id, payload)
             except CodecError as error:
-                return [self._undone(packet, topic_id, entry_id, error.row)]
+                return [self._undone(packet, topic_id, entry_id, ROWS[error.row])]
         if self.registry[topic_id].latched:
             if source.latched.get(topic_id) == payload:
                 self.stats.repeats += 1
@@ -202,9 +203,9 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: str) -> Lost:
+    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: Row) -> Lost:
         """Book a message that came whole, but cannot be read here."""
-        self.stats.lost[packet.src_id, topic_id, row] += 1
+        self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
     def _bound(self, source: _Source, src_id: int) -> list[ReceiverEvent]:
@@ -212,24 +213,24 @@ class Receiver:
         events: list[ReceiverEvent] = []
         while source.size > self.config.max_source_bytes:
             oldest = next(partial for partial, owner in self._partials.items() if owner == src_id)
-            events.append(self._abandon(oldest, "memory"))
+            events.append(self._abandon(oldest, Row.MEMORY))
         while self._size > self.config.max_bytes:
-            events.append(self._abandon(next(iter(self._partials)), "memory"))
+            events.append(self._abandon(next(iter(self._partials)), Row.MEMORY))
         return events
 
-    def _abandon(self, partial: Partial, reason: str) -> Lost:
+    def _abandon(self, partial: Partial, reason: Row) -> Lost:
         """Give up a message its topic still holds."""
         src_id = self._partials[partial]
         del self._sources[src_id].topics[partial.topic_id].partials[partial.entry_id]
         return self._forget(partial, src_id, reason)
 
-    def _forget(self, partial: Partial, src_id: int, reason: str) -> Lost:
+    def _forget(self, partial: Partial, src_id: int, reason: Row) -> Lost:
         """Book a message its topic no longer holds as lost."""
         source = self._sources[src_id]
         source.size -= partial.size
         self._size -= partial.size
         del self._partials[partial]
-        self.stats.lost[src_id, partial.topic_id, reason] += 1
+        self.stats.lost[src_id, partial.topic_id, reason.value] += 1
         self.stats.message_loss_est += 1
         return Lost(src_id, partial.topic_id, reason, partial.entry_id)
 

@@ -32,13 +32,7 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-
-DELIVERED = "delivered"
-LOST_FRAGMENTS = "lost_fragments"
-NOT_TAKEN = "not_taken"
-"""Every packet of the message arrived intact, yet the sink neither delivered it nor gave it up (not for us, …)."""
-IN_FLIGHT = "in_flight"
-"""Still in the source's queue, in the PHY, or behind the last packet that arrived."""
+from gr_ros2.link.outcome import Row
 
 _OPEN = 255
 
@@ -77,8 +71,9 @@ class TopicLedger:
 
     def book(self, position: int, row: str) -> None:
         """The message at this place of the arrays ends in this row."""
-        self.rows[row] += 1
-        self.row[position] = self.codes.setdefault(row, len(self.codes))
+        name = str(row)
+        self.rows[name] += 1
+        self.row[position] = self.codes.setdefault(name, len(self.codes))
 
 
 @dataclass(slots=True, eq=False)
@@ -221,7 +216,7 @@ class Ledger:
         """Messages sent and delivered so far."""
         with self._lock:
             topics = self._topics.values()
-            return sum(topic.sent for topic in topics), sum(topic.rows[DELIVERED] for topic in topics)
+            return sum(topic.sent for topic in topics), sum(topic.rows[Row.DELIVERED] for topic in topics)
 
     def rows(self) -> dict[tuple[int, int], Counter[str]]:
         """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
@@ -231,7 +226,7 @@ class Ledger:
             for source in self._sources.values():
                 for message in source.open.values():
                     key = (message.topic.src_id, message.topic.topic_id)
-                    rows[key][_final_row(source, message, drained=False)] += 1
+                    rows[key][str(_final_row(source, message, drained=False))] += 1
             return rows
 
     def unresolved(self) -> int:
@@ -327,7 +322,7 @@ class Ledger:
 
     def _deliver(self, source: _Source, message: _Open, now: float) -> float:
         message.topic.t_delivered[message.position] = now
-        self._close(source, message, DELIVERED)
+        self._close(source, message, Row.DELIVERED)
         return message.topic.t_sent[message.position]
 
     def _lost(self, event: Lost) -> None:
@@ -377,8 +372,8 @@ class Ledger:
             if topic.rows.total() != topic.sent or len(topic.t_sent) != topic.sent:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
-            if topic.rows[DELIVERED] != delivered:
-                self._faults.append(f"{name}: {topic.rows[DELIVERED]} delivered, {delivered} have a delivery time")
+            if topic.rows[Row.DELIVERED] != delivered:
+                self._faults.append(f"{name}: {topic.rows[Row.DELIVERED]} delivered, {delivered} have a delivery time")
         if self._faults:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
@@ -419,10 +414,13 @@ def _arrived(source: _Source, digest: bytes) -> int:
 
 
 def _final_row(source: _Source, message: _Open, drained: bool) -> str:
+    """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
+    the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
+    behind the last packet that arrived."""
     if message.reason:
         return message.reason
     if not message.all_sent:
-        return IN_FLIGHT
+        return Row.IN_FLIGHT
     if message.received >= message.total:
-        return NOT_TAKEN
-    return LOST_FRAGMENTS if drained or message.last_packet < source.last_received else IN_FLIGHT
+        return Row.NOT_TAKEN
+    return Row.LOST_FRAGMENTS if drained or message.last_packet < source.last_received else Row.IN_FLIGHT
