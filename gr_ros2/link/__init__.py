@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
@@ -22,6 +23,8 @@ __all__ = [
     "SCHEDULER",
     "Accepted",
     "Delivered",
+    "Endpoint",
+    "EndpointV0",
     "Lost",
     "Received",
     "Receiver",
