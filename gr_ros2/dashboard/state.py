@@ -7,12 +7,10 @@ Counts are exact while it runs; once the result is in, every number is the resul
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Hashable, Mapping
-from hashlib import blake2b
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from math import nan
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +29,7 @@ from gr_ros2.link.events import (
     SentPacket,
 )
 from gr_ros2.link.outcome import Row
+from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import Result, TopicResult
@@ -50,10 +49,6 @@ UNDER_WAY = 4096
 PACKETS_SHOWN = 12
 
 _PATH_STEP_S = 0.1
-_DIGEST_SIZE = 16
-
-
-_Away = tuple[int, Hashable, bytes]
 
 
 class _Topic:
@@ -80,18 +75,12 @@ class _Topic:
 
 
 class _Source:
-    """Messages of one sender on their way, so that a delivery finds its submission."""
+    """One sender."""
 
     def __init__(self) -> None:
         self.last_serial = -1
-        self.open: OrderedDict[int, tuple[int, float, bytes]] = OrderedDict()
-        """Serial -> topic id, time of submission, digest; until the first fragment leaves."""
-        self.away: OrderedDict[_Away, float] = OrderedDict()
-        """Topic id, the engine's key, digest -> time of submission."""
-        self.left_as: OrderedDict[int, _Away] = OrderedDict()
-        """Serial -> key in ``away``."""
-        self.repeats: OrderedDict[tuple[int, Hashable], int] = OrderedDict()
-        """Topic id and key whose latest use was a repeat -> serial of the message repeated."""
+        self.messages: Tracker[Tracked] = Tracker(UNDER_WAY)
+        """On their way, so that a delivery finds its submission."""
 
 
 class DashboardState:
@@ -145,7 +134,8 @@ class DashboardState:
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
                 self._packets_sent.add(event.now)
-                self._left(source, event)
+                for entry in event.entries:
+                    source.messages.left(entry)
             elif isinstance(event, Accepted):
                 self._accepted(source, src_id, event)
             else:
@@ -158,7 +148,7 @@ class DashboardState:
                 self._delivered(event, now)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
-                if source is None or (event.topic_id, event.key) not in source.repeats:
+                if source is None or not source.messages.repeats(event):
                     self._topic((event.src_id, event.topic_id)).ended[str(event.reason)] += 1
             else:
                 self._begin(now)
@@ -325,8 +315,7 @@ class DashboardState:
         topic.sent += 1
         source.last_serial = event.serial
         topic.sent_rate.add(event.now, len(event.payload))
-        source.open[event.serial] = (event.topic_id, event.now, _digest(event.payload))
-        _bound(source.open)
+        source.messages.add(Tracked.of(event))
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:
@@ -335,45 +324,30 @@ class DashboardState:
     def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
         topic = self._topic((src_id, event.topic_id))
         topic.ended[str(event.reason)] += 1
-        source.open.pop(event.serial, None)
+        message = source.messages.get(event.serial)
+        if message is not None:
+            source.messages.close(message)
         if event.serial > source.last_serial:  # refused before it was queued
             source.last_serial = event.serial
             topic.sent += 1
 
-    def _left(self, source: _Source, event: SentPacket) -> None:
-        for entry in event.entries:
-            if entry.repeat:
-                source.repeats[entry.topic_id, entry.key] = entry.serial
-                _bound(source.repeats)
-                continue
-            message = source.open.pop(entry.serial, None)
-            if message is not None:  # its first fragment
-                topic_id, t_sent, digest = message
-                source.repeats.pop((topic_id, entry.key), None)
-                source.left_as[entry.serial] = (topic_id, entry.key, digest)
-                source.away[topic_id, entry.key, digest] = t_sent
-                _bound(source.left_as)
-                _bound(source.away)
-
     def _delivered(self, event: Delivered, now: float) -> None:
         key = (event.src_id, event.topic_id)
         source = self._sources.get(event.src_id)
-        t_sent = None
+        message = None
         if source is not None:
-            digest = _digest(event.payload)
-            t_sent = source.away.pop((event.topic_id, event.key, digest), None)
-            repeated = source.repeats.get((event.topic_id, event.key))
-            if t_sent is None and repeated is not None:
-                t_sent = source.away.pop(source.left_as.get(repeated, (-1, None, b"")), None)
-                if t_sent is None:
-                    return
+            message = source.messages.find(event)
+            if message is not None:
+                source.messages.close(message)
+            elif source.messages.repeats(event):
+                return
         topic = self._topic(key)
         topic.delivered += 1
         topic.delivered_bytes += len(event.payload)
         topic.delivered_rate.add(now, len(event.payload))
-        if t_sent is not None:
-            topic.latencies.append(now - t_sent)
-            topic.age.delivered(t_sent, now)
+        if message is not None:
+            topic.latencies.append(now - message.t_sent)
+            topic.age.delivered(message.t_sent, now)
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:
@@ -410,12 +384,3 @@ def _final_view(place: int, key: Key, final: TopicResult) -> TopicView:
         path_error_m=final.path_error_m,
         rms_error_m=final.rms_error_m,
     )
-
-
-def _digest(payload: bytes) -> bytes:
-    return blake2b(payload, digest_size=_DIGEST_SIZE).digest()
-
-
-def _bound(index: OrderedDict[Any, Any]) -> None:
-    while len(index) > UNDER_WAY:
-        index.popitem(last=False)

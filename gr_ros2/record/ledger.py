@@ -13,12 +13,9 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter, deque
-from collections.abc import Hashable
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from math import isnan, nan
 from threading import Lock
-from typing import TypeVar
 
 from gr_ros2.errors import RunError
 from gr_ros2.link.events import (
@@ -33,6 +30,7 @@ from gr_ros2.link.events import (
     SentPacket,
 )
 from gr_ros2.link.outcome import Row
+from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
 
@@ -77,42 +75,26 @@ class TopicLedger:
 
 
 @dataclass(slots=True, eq=False)
-class _Open:
-    """A message whose fate is open. ``position`` is its place in the topic's arrays."""
+class _Open(Tracked):
+    """A message whose fate is open.
 
-    topic: TopicLedger
-    serial: int
-    position: int
-    digest: bytes
-    key: tuple[int, Hashable] | None = None
-    """Topic id and the engine's key, once its first fragment has left."""
-    total: int = 0
-    sent: int = 0
+    :ivar position: its place in the topic's arrays
+    :ivar received: of its fragments
+    :ivar last_packet: number of the last packet with one of its fragments
+    """
+
+    position: int = -1
     received: int = 0
     last_packet: int = -1
     reason: str = ""
 
-    @property
-    def all_sent(self) -> bool:
-        return self.sent >= self.total > 0
-
-
-_Key = TypeVar("_Key")
-_Shelf = dict[int, _Open]
-"""Open messages by serial, oldest first."""
-
 
 @dataclass(slots=True)
 class _Source:
-    """One sender: its open messages, found by serial, by key and by payload; and its packets in the air."""
+    """One sender: its open messages, and its packets in the air."""
 
     src_id: int
-    open: _Shelf = field(default_factory=dict)
-    by_key: dict[tuple[int, Hashable], _Shelf] = field(default_factory=dict)
-    """Topic id and key -> those that had it; a key may come round."""
-    by_digest: dict[tuple[int, bytes], _Shelf] = field(default_factory=dict)
-    repeats: dict[tuple[int, Hashable], int] = field(default_factory=dict)
-    """Topic id and key whose latest use was a repeat -> serial of the message repeated."""
+    messages: Tracker[_Open] = field(default_factory=Tracker)
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -158,7 +140,7 @@ class Ledger:
             if self._finished:
                 return None
             self._packets_handed_up += 1
-            digest = _digest(data)
+            digest = digest_of(data)
             for source in self._sources.values():
                 if digest in source.waiting:
                     return source.src_id, _arrived(source, digest)
@@ -193,7 +175,7 @@ class Ledger:
                 self._finished = True
                 self._match_late()
                 for source in self._sources.values():
-                    for message in list(source.open.values()):
+                    for message in list(source.messages.open):
                         self._close(source, message, _final_row(source, message, drained))
             self._check()
             return [self._topics[key] for key in sorted(self._topics)]
@@ -224,15 +206,14 @@ class Ledger:
         with self._lock:
             rows = {key: Counter(topic.rows) for key, topic in self._topics.items()}
             for source in self._sources.values():
-                for message in source.open.values():
-                    key = (message.topic.src_id, message.topic.topic_id)
-                    rows[key][str(_final_row(source, message, drained=False))] += 1
+                for message in source.messages.open:
+                    rows[source.src_id, message.topic_id][str(_final_row(source, message, drained=False))] += 1
             return rows
 
     def unresolved(self) -> int:
         """Messages accepted by the senders whose fate is open: neither delivered, refused nor given up."""
         with self._lock:
-            return sum(not message.reason for source in self._sources.values() for message in source.open.values())
+            return sum(not message.reason for source in self._sources.values() for message in source.messages.open)
 
     # -- sender -------------------------------------------------------------------------------------------------
 
@@ -255,13 +236,12 @@ class Ledger:
 
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
-        expected = event.payload if event.expected is None else event.expected
-        message = _Open(topic, event.serial, topic.sent - 1, _digest(expected))
-        source.open[event.serial] = message
-        source.by_digest.setdefault((event.topic_id, message.digest), {})[event.serial] = message
+        message = _Open.of(event)
+        message.position = topic.sent - 1
+        source.messages.add(message)
 
     def _refused(self, source: _Source, event: Refused) -> None:
-        message = source.open.get(event.serial)
+        message = source.messages.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
             topic.book(topic.sent - 1, event.reason)
@@ -272,67 +252,48 @@ class Ledger:
         ordinal = source.packets_sent
         source.packets_sent += 1
         for entry in event.entries:
-            key = (entry.topic_id, entry.key)
-            if entry.repeat:
-                source.repeats[key] = entry.serial
-                continue
-            message = source.open.get(entry.serial)
-            if message is None:  # delivered or dropped before its last fragment left
-                continue
-            message.total = entry.total
-            if message.key is None:
-                message.key = key
-                source.repeats.pop(key, None)
-                self._retire(source, key)
-                source.by_key.setdefault(key, {})[entry.serial] = message
-            message.sent += 1
-            message.last_packet = ordinal
-        digest = _digest(event.data)
+            message = source.messages.left(entry)
+            if message is not None:
+                message.last_packet = ordinal
+                if message.sent == 1:
+                    self._retire(source, message)
+        digest = digest_of(event.data)
         source.in_air.append((ordinal, digest))
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
-    def _retire(self, source: _Source, key: tuple[int, Hashable]) -> None:
-        """Settle what had this key before and cannot arrive any more: keys have come round since."""
+    def _retire(self, source: _Source, newer: _Open) -> None:
+        """Settle what had this message's key before and cannot arrive any more: keys have come round since."""
+        assert newer.key is not None
         horizon = source.last_received - REORDER_WINDOW
-        for message in [m for m in source.by_key.get(key, {}).values() if m.all_sent and m.last_packet < horizon]:
-            self._close(source, message, _final_row(source, message, drained=False))
+        for message in source.messages.under(*newer.key):
+            if message is not newer and message.all_sent and message.last_packet < horizon:
+                self._close(source, message, _final_row(source, message, drained=False))
 
     # -- receiver -----------------------------------------------------------------------------------------------
 
     def _delivered(self, event: Delivered, now: float) -> float | None:
-        digest = _digest(event.payload)
         source = self._sources.get(event.src_id)
         if source is not None:
-            key = (event.topic_id, event.key)
-            same = source.by_digest.get((event.topic_id, digest), {})
-            exact = (m for m in source.by_key.get(key, {}).values() if m.digest == digest)
-            message = next(exact, None)
-            if message is None and key in source.repeats:
-                repeated = source.open.get(source.repeats[key])
-                if repeated is None:
-                    self._topic(event.src_id, event.topic_id).repeats_delivered += 1
-                    return None
-                message = repeated if repeated.digest == digest else None
-            elif message is None:
-                message = next((m for m in same.values() if m.sent), None)
+            message = source.messages.find(event)
             if message is not None:
                 return self._deliver(source, message, now)
-        self._unmatched.append((event.src_id, event.topic_id, digest, now))
+            if source.messages.repeats(event) and source.messages.repeated(event) is None:
+                self._topic(event.src_id, event.topic_id).repeats_delivered += 1
+                return None
+        self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
         return None
 
     def _deliver(self, source: _Source, message: _Open, now: float) -> float:
-        message.topic.t_delivered[message.position] = now
+        self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
         self._close(source, message, Row.DELIVERED)
-        return message.topic.t_sent[message.position]
+        return message.t_sent
 
     def _lost(self, event: Lost) -> None:
         """Note the reason. It stands unless a delivery proves it wrong."""
         source = self._sources.get(event.src_id)
-        key = (event.topic_id, event.key)
-        if source is None or key in source.repeats:
+        if source is None or source.messages.repeats(event):
             return
-        shelf = source.by_key.get(key, {})
-        candidates = [m for m in shelf.values() if not m.reason]
+        candidates = [m for m in source.messages.under(event.topic_id, event.key) if not m.reason]
         seen = [m for m in candidates if m.received]  # the receiver held at least one fragment of it
         for message in (seen or candidates)[:1]:
             message.reason = event.reason
@@ -346,19 +307,14 @@ class Ledger:
         return self._topics[key]
 
     def _close(self, source: _Source, message: _Open, row: str) -> None:
-        topic_id, serial = message.topic.topic_id, message.serial
-        message.topic.book(message.position, row)
-        del source.open[serial]
-        _take(source.by_digest, (topic_id, message.digest), serial)
-        if message.key is not None:
-            _take(source.by_key, message.key, serial)
+        self._topic(source.src_id, message.topic_id).book(message.position, row)
+        source.messages.close(message)
 
     def _match_late(self) -> None:
         """Deliveries that matched nothing when they came: by their bytes alone, against all that is still open."""
         for src_id, topic_id, digest, now in self._unmatched:
             source = self._sources.get(src_id)
-            shelf = source.by_digest.get((topic_id, digest), {}) if source is not None else {}
-            message = next(iter(shelf.values()), None)
+            message = next(iter(source.messages.alike(topic_id, digest)), None) if source is not None else None
             if source is not None and message is not None:
                 self._deliver(source, message, now)
             else:
@@ -378,16 +334,6 @@ class Ledger:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
 
-def _digest(data: bytes) -> bytes:
-    return blake2b(data, digest_size=16).digest()
-
-
-def _take(index: dict[_Key, _Shelf], key: _Key, serial: int) -> None:
-    del index[key][serial]
-    if not index[key]:
-        del index[key]
-
-
 def _arrived(source: _Source, digest: bytes) -> int:
     """A packet of this source came in: the first one with these bytes that was sent after the newest received.
 
@@ -399,7 +345,7 @@ def _arrived(source: _Source, digest: bytes) -> int:
     if not copies:
         del source.waiting[digest]
     for entry in entries:
-        message = source.open.get(entry.serial)
+        message = source.messages.get(entry.serial)
         if message is not None and not entry.repeat:
             message.received += 1
     source.last_received = max(source.last_received, ordinal)
