@@ -74,7 +74,6 @@ def test_the_rows_of_an_open_ledger_add_up() -> None:
 
 def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
     audience, early, late = Audience(), Onlooker(), Onlooker()
-    audience.invite(early)
 
     class Invites(Onlooker):
         """Lets the late one in when the first message is delivered."""
@@ -88,8 +87,9 @@ def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
             """Not counted."""
 
     ends = ["ros_source.middleware=memory", "ros_sink.middleware=memory"]
-    watchers = [Invites(), audience]
-    result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), watchers=watchers).result
+    for watcher in (Invites(), early):
+        audience.invite(watcher)
+    result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), watchers=[audience]).result
     assert late.run is early.run
     assert late.result is early.result is result
     assert 0 < late.heard.count("Delivered") <= early.heard.count("Delivered") == result.topics[0].delivered
