@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import random
+from contextlib import suppress
+from functools import partial
 
-from fuzz.loop import main
+from fuzz.loop import main, within
 from gr_ros2.errors import WireError
 from gr_ros2.wire import decode
 from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
 
+BASE_S, BYTE_S = 5e-4, 5e-7
+"""s of processor time that a packet may take, and more for each byte of it."""
 _NO_SOURCE = 255
 """A source id that decoders take and encoders refuse."""
 
 
 def wire(data: bytes) -> None:
     """Decode the bytes as they are, and again with the CRC made right, which random bytes hardly ever are."""
-    check(data)
-    check(with_crc(data))
+    for packet in (data, with_crc(data)):
+        check(packet)
+        within(BASE_S + BYTE_S * len(packet), lambda: partial(_decoded, packet))  # noqa: B023 - called at once
+
+
+def _decoded(data: bytes) -> None:
+    with suppress(WireError):
+        decode(data, len(data))
 
 
 def check(data: bytes) -> None:

@@ -12,13 +12,20 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-import yaml
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.names import (
+    checked_frame_form,
+    checked_merged_topic,
+    checked_namespace,
+    checked_namespace_form,
+    checked_topic_form,
+)
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
-from gr_ros2.yaml_bounds import check_bounds, read_bounded
+from gr_ros2.yaml_bounds import read_bounded
+from gr_ros2.yaml_text import parse_yaml
 
 MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
 MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
@@ -43,8 +50,14 @@ RobotId = Annotated[int, Field(ge=-1, lt=BROADCAST)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+Namespace = Annotated[str, AfterValidator(checked_namespace)]
+NamespaceForm = Annotated[str, AfterValidator(checked_namespace_form)]
+TopicForm = Annotated[str, AfterValidator(checked_topic_form)]
+MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
+FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
+Kernels = Literal["auto", "numpy"]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -73,7 +86,7 @@ class TopicOptions:
     durability: Literal["volatile", "transient_local"] | None = None
     depth: Count | None = None
     queue_depth: Count | None = None
-    publish_as: str = ""
+    publish_as: TopicForm = ""
     queue: QueuePolicy | None = None
     deadline_ms: Annotated[float, Field(ge=0, le=3_600_000, allow_inf_nan=False)] = 0.0
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
@@ -119,7 +132,7 @@ class SourceConfig:
 
     registry: str = ""
     topics: tuple[str, ...] = ()
-    namespace: str = ""
+    namespace: Namespace = ""
     robot_id: RobotId = -1
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
@@ -200,7 +213,7 @@ class SinkConfig:
 
     registry: str = ""
     packet_len: PacketLen = 220
-    namespace_format: str = "/rx_robot_{src_id}"
+    namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Count = 10
     reassembly_timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     robot_id: RobotId = -1
@@ -211,19 +224,14 @@ class SinkConfig:
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     use_sim_time: bool = False
-    frame_prefix: str = ""
-    merge_tf: str = ""
+    frame_prefix: FrameForm = ""
+    merge_tf: MergedTopic = ""
     middleware: str = "dds"
     domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
     debug: bool = False
 
     @model_validator(mode="after")
-    def _formats(self) -> SinkConfig:
-        for key in ("namespace_format", "frame_prefix"):
-            try:
-                getattr(self, key).format(src_id=0)
-            except (KeyError, IndexError, ValueError) as error:
-                raise ValueError(f"{key} = {getattr(self, key)!r}: only {{src_id}} may stand in braces") from error
+    def _frames_stay_apart(self) -> SinkConfig:
         if self.merge_tf and not self.frame_prefix:
             raise ValueError(
                 f"merge_tf = {self.merge_tf!r}: frames of several robots would be mixed up; set frame_prefix, "
@@ -325,12 +333,15 @@ class PhyConfig:
     :param name: a name of ``gr_ros2.phy.PHY``
     :param sample_rate: samples/s; 0 = chosen by the experiment to carry ``headroom`` times the offered load
     :param headroom: capacity over offered load where sample_rate is 0
+    :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
+        numpy = the reference, several times slower
     :param options: settings of that PHY, by its constructor's parameter names
     """
 
     name: str = "ofdm"
     sample_rate: Seconds = 0.0
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    kernels: Kernels = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -442,17 +453,14 @@ def _class_at(cls: Any, loc: tuple[Any, ...]) -> Any:
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """One YAML file as a mapping.
 
-    :raises ConfigError: when it cannot be read, is no mapping, or is past what :mod:`gr_ros2.yaml_bounds` allows; names
-        file and line
+    :raises ConfigError: when it cannot be read, is no mapping, has a key twice, or is past what
+        :mod:`gr_ros2.yaml_bounds` allows; names file and line
     """
     try:
         text = read_bounded(Path(path))
-        check_bounds(text, str(path))
-        values = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: no YAML ({' '.join(str(error).split())})") from error
+    values = parse_yaml(text, str(path))
     if values is None:
         return {}
     if not isinstance(values, dict):

@@ -13,17 +13,19 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import overload
 
-from gr_ros2.config import TopicOptions, build
+from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
+from gr_ros2.names import filled, topic_fault
 from gr_ros2.wire import FORMATS
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
 
-_NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _LATCHED = frozenset({"tf_static", "map", "robot_description"})
 """Topics that ROS programs publish transient-local by convention."""
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+_LONGEST_ID = 255
 
 
 def normalize_type(text: str) -> str:
@@ -61,9 +63,9 @@ class Topic:
     def republished(self, namespace_format: str, src_id: int) -> str:
         """Absolute topic name of this row at a sink, for one sender."""
         if self.options.publish_as:
-            name = self.options.publish_as.format(src_id=src_id)
+            name = filled(self.options.publish_as, src_id)
         else:
-            name = f"{namespace_format.format(src_id=src_id).rstrip('/')}/{self.name.lstrip('/')}"
+            name = f"{filled(namespace_format, src_id).rstrip('/')}/{self.name.lstrip('/')}"
         return name if name.startswith("/") else f"/{name}"
 
     @property
@@ -170,6 +172,25 @@ class Registry(Sequence[Topic]):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def check_outputs(registry: Registry, sink: SinkConfig) -> None:
+    """Refuse settings with which a sink could not publish what it receives.
+
+    :raises ConfigError: where a topic would come out under a name that ROS does not allow, or two topics of different
+        types under one name, or ``topic_options`` has a topic that is not registered
+    """
+    types = dict.fromkeys(sink.merged_topics, _TF_TYPE)
+    for topic in registry.with_options(sink.topic_options):
+        name = topic.republished(sink.namespace_format, _LONGEST_ID)
+        remedy = "change its publish_as, or namespace_format"
+        if fault := topic_fault(name):
+            raise ConfigError(f"topic {topic.name!r} would come out as {name!r}: {fault}; {remedy}")
+        if types.setdefault(name, topic.type_name) != topic.type_name:
+            raise ConfigError(
+                f"topic {topic.name!r} would come out as {name!r} of type {topic.type_name}, where {types[name]} comes "
+                f"out already; {remedy}"
+            )
+
+
 def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator[Topic]:
     columns = ["name", "type"]
     first = True
@@ -211,16 +232,11 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
 
 
 def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:
-    if not _NAME.fullmatch(name):
-        raise ConfigError(
-            f"malformed topic name {name!r}; letters, digits and _ in parts joined by /, none starting with a digit"
-        )
+    if fault := topic_fault(name if name.startswith("/") else f"/{name}"):
+        raise ConfigError(f"malformed topic name {name!r}: {fault}")
     try:
         type_name = normalize_type(kind)
         topic_options = build(TopicOptions, options)
-        topic_options.publish_as.format(src_id=0)
     except ConfigError as error:
         raise ConfigError(f"topic {name!r}: {error}") from error
-    except (KeyError, IndexError, ValueError) as error:
-        raise ConfigError(f"topic {name!r}: publish_as may hold only {{src_id}} in braces") from error
     return Topic(topic_id, name, type_name, topic_options)

@@ -11,11 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gr_ros2.config import read_yaml
 from gr_ros2.errors import ConfigError
-from gr_ros2.yaml_bounds import check_bounds
+from gr_ros2.yaml_text import parse_yaml
 
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Where the built-in scenarios and registries lie."""
@@ -90,11 +88,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     value = value.strip()
     if _NUMBER.fullmatch(value):  # YAML 1.1 takes 2e5 for a string
         return keys, float(value)
-    try:
-        check_bounds(value, f"--set {'.'.join(keys)}")
-        parsed = yaml.safe_load(value) if value else ""
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {text}: the value is no YAML ({' '.join(str(error).split())})") from error
+    parsed = parse_yaml(value, f"--set {text}", "the value is ") if value else ""
     # Without braces a mapping was not meant: the colon belongs to a text such as bag:PATH.
     return keys, value if isinstance(parsed, dict) and not value.startswith("{") else parsed
 

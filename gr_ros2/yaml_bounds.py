@@ -42,15 +42,14 @@ def read_bounded(path: Path) -> str:
     return text
 
 
-def check_bounds(text: str, where: str) -> None:
+def check_bounds(text: str) -> None:
     """Refuse a text that would take too long to load, or too much memory.
 
-    :param where: what errors begin with
     :raises ConfigError: for a text that is too long, goes too deep, or whose aliases expand to too much
     :raises yaml.YAMLError: when it is no YAML
     """
     if len(text) > MOST_CHARACTERS:
-        raise ConfigError(f"{where}: longer than {MOST_CHARACTERS:,} characters; settings are not")
+        raise ConfigError(f"longer than {MOST_CHARACTERS:,} characters; settings are not")
     sizes: dict[str, int] = {}
     levels = [_Open(None)]
     for event in yaml.parse(text):  # events come one by one and build nothing
@@ -58,7 +57,7 @@ def check_bounds(text: str, where: str) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             levels.append(_Open(event.anchor))
             if len(levels) > MOST_LEVELS:
-                raise ConfigError(f"{where}: line {line}: more than {MOST_LEVELS} levels one within the other")
+                raise ConfigError(f"line {line}: more than {MOST_LEVELS} levels one within the other")
             continue
         if isinstance(event, yaml.CollectionEndEvent):
             closed = levels.pop()
@@ -67,7 +66,7 @@ def check_bounds(text: str, where: str) -> None:
             anchor, values = event.anchor, 1
         elif isinstance(event, yaml.AliasEvent):
             if any(level.anchor == event.anchor for level in levels):
-                raise ConfigError(f"{where}: line {line}: *{event.anchor} stands within &{event.anchor} itself")
+                raise ConfigError(f"line {line}: *{event.anchor} stands within &{event.anchor} itself")
             anchor, values = None, sizes.get(str(event.anchor), 1)
         else:
             continue
@@ -75,4 +74,4 @@ def check_bounds(text: str, where: str) -> None:
             sizes[anchor] = values
         levels[-1].values += values
         if levels[-1].values > MOST_VALUES:
-            raise ConfigError(f"{where}: line {line}: more than {MOST_VALUES:,} values with every alias written out")
+            raise ConfigError(f"line {line}: more than {MOST_VALUES:,} values with every alias written out")

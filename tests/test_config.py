@@ -223,6 +223,14 @@ def test_a_file_that_is_no_configuration(tmp_path: Path, data: bytes, says: str)
     assert "\n" not in str(caught.value)
 
 
+def test_a_key_that_stands_twice_is_named_with_its_lines(tmp_path: Path) -> None:
+    path = tmp_path / "link.yaml"
+    path.write_text("hop: 1\nros_source:\n  robot_id: 1\nros_source:\n  robot_id: 9\n")
+    with pytest.raises(ConfigError) as caught:
+        read_yaml(path)
+    assert str(caught.value) == f"{path}: key 'ros_source' stands twice, in line 2 and line 4; keep one"
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         read_yaml(tmp_path / "nowhere.yaml")

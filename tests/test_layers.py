@@ -18,7 +18,8 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
-    {"wire", "yaml_bounds"},
+    {"wire", "names", "yaml_bounds"},
+    {"yaml_text"},
     {"config", "backends", "backlog", "guard"},
     {"registry", "settings_file"},
     {"link"},

@@ -151,13 +151,13 @@ def test_no_bytes_raise_anything_but_a_registry_error(tmp_path_factory: pytest.T
 def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> None:
     text = (
         "topic,type,qos,queue_depth,publish_as,depth,durability,reliability\n"
-        "odom,nav_msgs/Odometry,latency,1,/fleet/{src_id}/odom,,,best_effort\n"
+        "odom,nav_msgs/Odometry,latency,1,/fleet/r{src_id}/odom,,,best_effort\n"
         "map,nav_msgs/OccupancyGrid,bulk,,,1,volatile\n"
         "scan,sensor_msgs/LaserScan\n"
     )
     odom, map_, scan = read(tmp_path, text)
     assert odom.options == TopicOptions(
-        qos="latency", queue_depth=1, publish_as="/fleet/{src_id}/odom", reliability="best_effort"
+        qos="latency", queue_depth=1, publish_as="/fleet/r{src_id}/odom", reliability="best_effort"
     )
     assert map_.options == TopicOptions(qos="bulk", depth=1, durability="volatile")
     assert scan.options == TopicOptions()
@@ -171,8 +171,10 @@ def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> N
         ("topic,type,qos", "odom,a/B,urgent", 2, "topic 'odom': qos = 'urgent'"),
         ("topic,type,depth", "odom,a/B,-1", 2, "topic 'odom': depth = '-1'"),
         ("topic,type,depth", "odom,a/B,many", 2, "topic 'odom': depth = 'many'"),
-        ("topic,type,publish_as", "odom,a/B,/x/{robot}", 2, "publish_as may hold only {src_id}"),
-        ("topic,type,publish_as", "odom,a/B,/x/{", 2, "publish_as may hold only {src_id}"),
+        ("topic,type,publish_as", "odom,a/B,/x/{robot}", 2, "publish_as = '/x/{robot}': only {src_id} may stand"),
+        ("topic,type,publish_as", "odom,a/B,/x/{", 2, "publish_as = '/x/{': only {src_id} may stand"),
+        ("topic,type,publish_as", "odom,a/B,/robot-1/odom", 2, "publish_as = '/robot-1/odom': '-' may not stand"),
+        ("topic,type,publish_as", "odom,a/B,/fleet/{src_id}/odom", 2, "part '255' must not begin with a digit"),
         ("topic,type,qos", "odom,a/B,bulk,4", 2, "4 columns where 3 were expected"),
     ],
 )

@@ -87,7 +87,8 @@ def _opening(running: Any) -> str:
     phy, front_end, source = running.phy, running.front_end, running.source
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
-    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}; Ctrl-C ends it"
+    runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
+    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{runs_on}; Ctrl-C ends it"
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:
@@ -122,6 +123,10 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
     if stats["phy"]["snr_db"] is not None:
         parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
+    if lost := sum(topic["lost_on_graph"] for topic in source["topics"].values()):
+        parts.append(f"{lost} messages lost on the ROS graph before they were sent")
+    if sink["publish_failed"]:
+        parts.append(f"{sink['publish_failed']} messages not published")
     troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
     quiet = ("name", "bursts_in", "bursts_out")
     parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]

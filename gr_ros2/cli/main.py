@@ -29,6 +29,7 @@ PACKET_COMMANDS: Commands = {
 }
 REGISTRY_COMMANDS: Commands = {
     "check": ("gr_ros2.cli.registry:check", "Validate a registry CSV; print its rows and digest."),
+    "from-bag": ("gr_ros2.cli.registry:from_bag", "Write a registry from the topics of a bag."),
     "from-graph": ("gr_ros2.cli.registry:from_graph", "Write a registry from the topics on the ROS graph."),
 }
 COMMANDS: Commands = {

@@ -1,11 +1,12 @@
-"""`gr-ros2 registry`: check a registry CSV, or write one from the topics on the ROS graph."""
+"""`gr-ros2 registry`: check a registry CSV, or write one from the topics of a ROS graph or a bag."""
 
 from __future__ import annotations
 
 import csv
 import io
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -16,12 +17,19 @@ from rich.table import Table
 
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
-from gr_ros2.middleware import MIDDLEWARE, Middleware, TopicInfo
+from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos, TopicInfo
+from gr_ros2.middleware.adapt import settle
+from gr_ros2.middleware.bag_files import bag_contents
+from gr_ros2.names import checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
 
 _INFRASTRUCTURE = ("/rosout", "/parameter_events")
 """Topics every ROS node has, which nobody wants on a radio by accident."""
+_NO_MESSAGES = {"srv": "a service", "action": "an action"}
+"""Of types: the middle part where it is not ``msg``, and what has such types."""
+_LATCHED = "durability"
+_QOS_COLUMNS = ("reliability", _LATCHED, "depth")
 
 _GRAPHS = [name for name in MIDDLEWARE if name in ("dds", "rclpy")]
 """Back-ends that join a live ROS graph."""
@@ -47,20 +55,132 @@ def check(file: str) -> None:
     print(f"digest {registry.digest}")
 
 
+_namespace = click.option(
+    "--namespace", default="", metavar="NS", help="Only topics of this namespace, named relative to it."
+)
+_topics = click.option("--topics", default="", metavar="A,B,…", help="Only these topics, in this order.")
+_out = click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write; default: print it.")
+
+
 @click.command("from-graph")
-@click.option("--namespace", default="", metavar="NS", help="Only topics of this namespace, named relative to it.")
-@click.option("--topics", default="", metavar="A,B,…", help="Only these topics, in this order.")
+@_namespace
+@_topics
 @click.option("--middleware", default="dds", show_default=True, type=click.Choice(_GRAPHS))
 @click.option("--domain-id", default=-1, type=click.IntRange(-1, 232), help="DDS domain; -1 takes ROS_DOMAIN_ID.")
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write; default: print it.")
+@_out
 def from_graph(*, namespace: str, topics: str, middleware: str, domain_id: int, wait: float, out: Path | None) -> None:
     """Write a registry from the topics that are published on the ROS graph."""
-    wanted = [name.strip() for name in topics.split(",") if name.strip()]
     with _participant(middleware, domain_id) as graph:
         time.sleep(wait)  # discovery has no way to say that it is complete
         found = graph.discover()
-    text = registry_csv(found, namespace, wanted)
+    _write(registry_csv(found, namespace, _names(topics)), unfit(found), out)
+
+
+@click.command("from-bag")
+@click.argument("bag", type=click.Path(path_type=Path))
+@_namespace
+@_topics
+@_out
+def from_bag(*, bag: Path, namespace: str, topics: str, out: Path | None) -> None:
+    """Write a registry from the topics of BAG, a folder or a bare .mcap or .db3 file.
+
+    Its QoS columns are what the publishers offered when the bag was recorded.
+    """
+    contents = bag_contents(bag)
+    found = [topic.info for topic in contents.topics.values()]
+    _write(registry_csv(found, namespace, _names(topics), bag), {**contents.left_out, **unfit(found)}, out)
+    for line in contents.differences:
+        print(line, file=sys.stderr)
+
+
+def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:
+    """Topics that no registry can have, by name, and why."""
+    types: dict[str, list[str]] = {}
+    for info in found:
+        types.setdefault(info.topic, []).append(info.type_name)
+    reasons = {}
+    for topic, names in types.items():
+        kind = names[0].split("/")[1] if names[0].count("/") == 2 else ""
+        if len(names) > 1:
+            reasons[topic] = f"it has several types, {' and '.join(sorted(names))}"
+        elif kind in _NO_MESSAGES or "/_action/" in topic:
+            reasons[topic] = f"it belongs to {_NO_MESSAGES.get(kind, 'an action')}, and a link carries topics alone"
+        elif kind != "msg":
+            reasons[topic] = f"{names[0]!r} is no message type of ROS"
+        elif fault := topic_fault(topic):
+            reasons[topic] = f"ROS allows no such name, {fault}"
+    return reasons
+
+
+def registry_csv(
+    found: Sequence[TopicInfo], namespace: str, wanted: Sequence[str] = (), bag: Path | None = None
+) -> str:
+    """The text of a registry CSV with header.
+
+    :param found: topics of the graph or the bag; those that nobody publishes are left out, and :func:`unfit` ones
+    :param namespace: only topics below it, by their names relative to it; '' takes all
+    :param wanted: only these names, in this order, with or without leading slash; [] takes all by name
+    :param bag: where the topics are from, which then get columns of the QoS their publishers offered; None: the graph,
+        which does not tell all of it, and where subscriptions adapt: a column of what is latched
+    :raises ConfigError: when nothing is left, a wanted topic is missing or unfit, the namespace is none of ROS, or more
+        than 16 topics remain
+    """
+    try:
+        checked_namespace(namespace)
+    except ValueError as error:
+        raise ConfigError(f"--namespace {namespace!r}: {error}") from error
+    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
+    reasons = unfit(found)
+    published = {
+        info.topic.removeprefix(prefix): info
+        for info in sorted(found, key=lambda info: info.topic)
+        if info.publishers and info.topic.startswith(prefix) and info.topic not in (*_INFRASTRUCTURE, *reasons)
+    }
+    names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or list(published)
+    seen = f"published below {prefix} are {', '.join(published) or 'no topics'}"
+    for name in names:
+        if why := reasons.get(f"{prefix}{name}"):
+            raise ConfigError(f"topic {name!r} cannot be registered: {why}")
+        if name not in published:
+            raise ConfigError(f"topic {name!r} is not {f'in {bag}' if bag else 'on the graph'}; {seen}")
+    if not names:
+        remedy = f"choose another namespace of {bag}" if bag else "is the robot running, and in this ROS domain?"
+        raise ConfigError(f"nothing to register: {seen}; {remedy}")
+    if len(names) > MAX_TOPICS:
+        raise ConfigError(
+            f"{len(names)} topics, a registry has at most {MAX_TOPICS}; choose with --namespace or --topics; {seen}"
+        )
+    offers = {name: _offered(published[name].publishers) for name in names}
+    columns: tuple[str, ...] = _QOS_COLUMNS
+    if bag is None:
+        offers = {
+            name: {_LATCHED: "" if offer[_LATCHED] == "volatile" else offer[_LATCHED]} for name, offer in offers.items()
+        }
+        columns = (_LATCHED,) if any(offer[_LATCHED] for offer in offers.values()) else ()
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["topic", "type", *columns])
+    for name, offer in offers.items():
+        writer.writerow([name, published[name].type_name, *(offer[column] for column in columns)])
+    return text.getvalue()
+
+
+def _offered(publishers: Sequence[Qos]) -> dict[str, str]:
+    """What all publishers of a topic offer, by column; of their depths the largest."""
+    qos = settle(Qos(), publishers)
+    depth = max(offer.depth for offer in publishers) if all(offer.depth for offer in publishers) else 0
+    return {"reliability": str(qos.reliability), "durability": str(qos.durability), "depth": str(depth)}
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _write(text: str, left_out: Mapping[str, str], out: Path | None) -> None:
+    """A registry to its file or to the terminal; what is not in it is said beside."""
+    for topic, why in left_out.items():
+        click.echo(f"gr-ros2: {topic} is left out: {why}", err=True)
     if out is None:
         print(text, end="")
         return
@@ -69,41 +189,6 @@ def from_graph(*, namespace: str, topics: str, middleware: str, domain_id: int, 
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
     print(f"{out}: {len(text.splitlines()) - 1} topics, digest {Registry.from_csv(out).digest}")
-
-
-def registry_csv(found: Sequence[TopicInfo], namespace: str, wanted: Sequence[str] = ()) -> str:
-    """The text of a registry CSV with header.
-
-    :param found: topics of the graph; those that nobody publishes are left out
-    :param namespace: only topics below it, by their names relative to it; '' takes all
-    :param wanted: only these names, in this order, with or without leading slash; [] takes all by name
-    :raises ConfigError: when nothing is left, a wanted topic is missing, or more than 16 remain
-    """
-    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
-    published = {
-        info.topic.removeprefix(prefix): info
-        for info in sorted(found, key=lambda info: info.topic)
-        if info.publishers and info.topic.startswith(prefix) and info.topic not in _INFRASTRUCTURE
-    }
-    names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or list(published)
-    missing = [name for name in names if name not in published]
-    seen = f"published below {prefix} are {', '.join(published) or 'no topics'}"
-    if missing:
-        raise ConfigError(f"topic {missing[0]!r} is not on the graph; {seen}")
-    if not names:
-        raise ConfigError(f"nothing to register: {seen}; is the robot running, and in this ROS domain?")
-    if len(names) > MAX_TOPICS:
-        raise ConfigError(
-            f"{len(names)} topics, a registry has at most {MAX_TOPICS}; choose with --namespace or --topics; {seen}"
-        )
-    latched = {name for name in names if all(qos.durability == "transient_local" for qos in published[name].publishers)}
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["topic", "type", *(["durability"] if latched else [])])
-    for name in names:
-        durability = ["transient_local" if name in latched else ""] if latched else []
-        writer.writerow([name, published[name].type_name, *durability])
-    return text.getvalue()
 
 
 def _participant(middleware: str, domain_id: int) -> Middleware:

@@ -164,7 +164,7 @@ def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
         )
         console.print(
             f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a packet of {scenario.packet_len} B takes "
-            f"{phy['airtime_samples']} samples, {phy['airtime_s'] * 1e3:.2f} ms",
+            f"{phy['airtime_samples']} samples, {phy['airtime_s'] * 1e3:.2f} ms; runs on {phy['runs_on']}",
             soft_wrap=True,
         )
     packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())

@@ -21,6 +21,7 @@ from gr_ros2.link.events import (
     Accepted,
     Delivered,
     Lost,
+    Missed,
     Received,
     ReceiverEvent,
     Refused,
@@ -138,6 +139,10 @@ class DashboardState:
                     source.messages.left(entry)
             elif isinstance(event, Accepted):
                 self._accepted(source, src_id, event)
+            elif isinstance(event, Missed):
+                topic = self._topic((src_id, event.topic_id))
+                topic.sent += event.count
+                topic.ended[Row.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
 

@@ -14,6 +14,7 @@ from rosbags.interfaces import Nodetype
 
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.type_definitions import DAMAGED, known, typestore
+from gr_ros2.names import filled
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 MAX_STATIC = 4096
@@ -64,7 +65,7 @@ class FramePrefix:
         if message is None:
             self._counters["frame_damaged"] += 1
             return payload
-        _rename(message, plan, self._form.format(src_id=src_id))
+        _rename(message, plan, filled(self._form, src_id))
         return _encode(type_name, message, payload)
 
 

@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from gr_ros2.config import DiagnosticsConfig
+from gr_ros2.link.outcome import Row
 
 Stats = Mapping[str, Any]
 
@@ -54,6 +55,13 @@ class Status:
             self.level = max(self.level, level)
             self.problems.append(f"{what} {value:.3g} {unit}".strip())
 
+    def warn(self, what: str, count: int, before: int) -> None:
+        """Add a count of what should never happen, and warn of what is new of it."""
+        self.values[what] = str(count)
+        if count > before:
+            self.level = max(self.level, Level.WARN)
+            self.problems.append(f"{count - before} {what}")
+
 
 class _Look(NamedTuple):
     """The counters that matter at one moment; of a topic, messages delivered and messages lost."""
@@ -63,6 +71,8 @@ class _Look(NamedTuple):
     received: int
     missing: int
     rejected: int
+    lost_on_graph: int
+    unpublished: int
     topics: dict[str, tuple[int, int]]
     front_end: dict[str, int]
 
@@ -94,7 +104,11 @@ class LinkHealth:
         front_end = self._front_end(look, self._looks[-1].front_end if self._looks else {})
         self._looks.append(look)
         topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
-        return [self._receiver(stats, before, look), self._transmitter(stats, before, look), *front_end, *topics]
+        receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
+        first = before is look
+        receiver.warn("messages not published", look.unpublished, 0 if first else before.unpublished)
+        transmitter.warn("messages lost on the ROS graph", look.lost_on_graph, 0 if first else before.lost_on_graph)
+        return [receiver, transmitter, *front_end, *topics]
 
     def _receiver(self, stats: Stats, before: _Look, look: _Look) -> Status:
         status, limits = Status(f"{self._name}: receiver"), self._config
@@ -141,11 +155,7 @@ class LinkHealth:
         """What the front end counts; a warning of what it lost since the last look. None where it counts nothing."""
         status = Status(f"{self._name}: front end")
         for name, count in look.front_end.items():
-            status.values[name.replace("_", " ")] = str(count)
-            new = count - before.get(name, 0)
-            if new > 0 and name not in _NO_LOSS:
-                status.level = Level.WARN
-                status.problems.append(f"{new} {name.replace('_', ' ')}")
+            status.warn(name.replace("_", " "), count, count if name in _NO_LOSS else before.get(name, 0))
         return [status] if status.values else []
 
     def _topic(self, name: str, topic: Stats, before: _Look, look: _Look) -> Status:
@@ -171,7 +181,18 @@ def _look(stats: Stats, now: float) -> _Look:
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
     front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
-    return _Look(now, stats["packets"]["out"], sink["packets"], sink["packet_loss_est"], rejected, topics, front_end)
+    lost_on_graph = sum(topic[Row.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    return _Look(
+        now=now,
+        sent=stats["packets"]["out"],
+        received=sink["packets"],
+        missing=sink["packet_loss_est"],
+        rejected=rejected,
+        lost_on_graph=lost_on_graph,
+        unpublished=sink[Row.PUBLISH_FAILED],
+        topics=topics,
+        front_end=front_end,
+    )
 
 
 def _rate(count: int, before: _Look, look: _Look) -> float:

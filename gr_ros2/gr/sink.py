@@ -2,7 +2,8 @@
 
 Laws: a thin shell, all behaviour is in ``link.Receiver``, which one lock guards; only the bytes of a PDU are trusted;
 neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph seems
-alive; messages are published in completion order; everything not published is counted by name.
+alive; messages are published in completion order; what counts as delivered was published, and everything else is
+counted by name.
 """
 
 from __future__ import annotations
@@ -17,26 +18,26 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import GrRos2Error, MiddlewareError
+from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
-from gr_ros2.link import Delivered, Lost, Received, Receiver, ReceiverEvent, Rejected
+from gr_ros2.link import Delivered, Received, Receiver, ReceiverEvent, Rejected
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, check_outputs
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
-    *("not_a_pair", "not_u8", "publish_failed", "handler_failed"),
+    *("not_a_pair", "not_u8", Row.PUBLISH_FAILED.value, "handler_failed"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -69,6 +70,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         super().__init__("ros2_sink", None, None)
         self.config = settings(SinkConfig, values, registry, middleware)
         rows = read_registry(registry)
+        check_outputs(rows, self.config)
         self._receiver = Receiver(rows, self.config, codec=message_codec(self.config, rows))
         self.registry = self._receiver.registry
         self._observer = observer
@@ -88,6 +90,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         # discovered anew. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
+        self._published: Counter[tuple[int, int]] = Counter()
         self._delivered_at: dict[tuple[int, int], float] = {}
         self._stamped = [has_header(topic.type_name) for topic in self.registry]
         self._sim_time: float | None = None
@@ -205,7 +208,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return {
             "src_id": key[0],
             "topic_id": key[1],
-            "delivered": stats.delivered[key],
+            "delivered": self._published[key],
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
             "latency_s": None,
             "recent_latency_s": None,
@@ -257,18 +260,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
         topic = self.registry[event.topic_id]
-        payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
         try:
+            payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
             publisher = self._publishers.get(key) or self._advertise(key)
             publisher.publish(payload)
-        except MiddlewareError as error:
+        except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
+            self._tell_first(Row.PUBLISH_FAILED.value, f"a message of {self._name(key)} was not published", error)
             with self._lock:
-                self._counters["publish_failed"] += 1
-                first = self._counters["publish_failed"] == 1
-            if first:
-                self._log.warning("ros2_sink: a message was not published: %s", error)
-            return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
+                return self._receiver.unpublished(event)
         with self._lock:
+            self._published[key] += 1
             self._delivered_at[key] = self._clock()
         if self._stamped[event.topic_id]:
             self._measure(key, event.payload)
@@ -279,12 +280,17 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
         try:
             transforms.add(payload, static=static)
-        except MiddlewareError as error:
-            with self._lock:
-                self._counters["tf_failed"] += 1
-                first = self._counters["tf_failed"] == 1
-            if first:
-                self._log.warning("ros2_sink: transforms were not merged: %s", error)
+        except Exception as error:  # noqa: BLE001 - the message they came in is published and counts as delivered
+            self._tell_first("tf_failed", "transforms were not merged", error)
+
+    def _tell_first(self, counter: str, what: str, error: Exception) -> None:
+        """Count something that failed, and tell of the first: how it came about where it is no error of ours."""
+        with self._lock:
+            self._counters[counter] += 1
+            first = self._counters[counter] == 1
+        if first:
+            trace = None if isinstance(error, GrRos2Error) else error
+            self._log.warning("ros2_sink: %s: %s", what, error, exc_info=trace)
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
         topic = self.registry[key[1]]

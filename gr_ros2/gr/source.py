@@ -97,7 +97,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._said: set[tuple[int, str]] = set()
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: dict[int, Subscription] = {}
         self.message_port_register_out(PDUS)
         self._publish = self.message_port_pub  # found through two proxies otherwise, for every packet
         self.message_port_register_in(CREDIT)
@@ -134,7 +134,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions)
+        return all(subscription.matched() for subscription in self._subscriptions.values())
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -156,6 +156,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def stop(self) -> bool:
         with self._lock:
             self._running = False
+            self._take_losses()
             self._work.notify_all()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
@@ -168,8 +169,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._closed = True
             self._room.notify_all()
-        for subscription in self._subscriptions:
+        for subscription in self._subscriptions.values():
             subscription.close()
+        with self._lock:
+            self._take_losses()
         self._subscriptions.clear()
         LOOP_GUARD.remove(self)
         self._finalizer()
@@ -177,12 +180,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def stats(self) -> dict[str, Any]:
         """A snapshot: packets and messages, per topic and in all."""
         with self._lock:
+            self._take_losses()
             stats = self._sender.stats
             queued = self._sender.queued()
             topics = {
                 name: {
                     "topic_id": topic.topic_id,
                     "submitted": stats.submitted[topic.topic_id],
+                    Row.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
                     "queue": self._sender.queue(topic.topic_id)[0],
@@ -253,7 +258,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             qos = Qos(options.reliability, options.durability, depth)
             callback = partial(self._take, topic.topic_id)
             subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
-            self._subscriptions.append(subscription)
+            self._subscriptions[topic.topic_id] = subscription
             subscription.follow(partial(self._follow, topic))
         if self._graph.owned:
             self.middleware.start()
@@ -278,12 +283,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
+            if topic_id in self._subscriptions:
+                self._sender.missed(topic_id, self._subscriptions[topic_id].lost)
             # A robot that comes late gets the newest message of a topic, which then has to hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             self._sender.submit(topic_id, whole or payload, self._clock())
             if not self._sender.out_of_credit:  # waking the pump for nothing would cost as much as a packet
                 self._work.notify()
+
+    def _take_losses(self) -> None:
+        """What the ROS graph has lost before it reached us is part of what was sent. Called with the lock held."""
+        for topic_id, subscription in self._subscriptions.items():
+            self._sender.missed(topic_id, subscription.lost)
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1

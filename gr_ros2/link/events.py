@@ -88,6 +88,17 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
+class Missed:
+    """Messages of a topic that the source's ROS graph lost before they were submitted, as far as it tells.
+
+    They end in the ledger row ``lost_on_graph``. Nothing but their number is known: they have no serial and no time.
+    """
+
+    topic_id: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
 class SentEntry:
     """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
@@ -113,4 +124,4 @@ class SentPacket:
     now: float
 
 
-SenderEvent = Accepted | Refused | SentPacket
+SenderEvent = Accepted | Refused | Missed | SentPacket

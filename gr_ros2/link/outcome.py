@@ -18,6 +18,7 @@ class Row(str, Enum):
     """
 
     DELIVERED = "delivered", "sink", "#2a9d5c", "delivered"
+    LOST_ON_GRAPH = "lost_on_graph", "source", "#5b5b9a", "lost by the ROS graph of the source before the link had them"
     TOO_LARGE = "too_large", "source", "#c9a08a", "too large for the packet length"
     QUEUE_BOUND = "queue_bound", "source", "#f0a330", "dropped at the bound of the source's queue"
     SUPERSEDED = "superseded", "source", "#88ccee", "replaced by a newer one before the first packet"
@@ -30,7 +31,7 @@ class Row(str, Enum):
     UNSUPPORTED = "unsupported", "sink", "#17becf", "coded or encrypted in a way the sink cannot undo"
     UNKNOWN_DICTIONARY = "unknown_dictionary", "sink", "#999933", "coded with a dictionary the sink does not have"
     DAMAGED = "damaged", "sink", "#882255", "complete but not decodable"
-    PUBLISH_FAILED = "publish_failed", "sink", "#cc79a7", "complete but refused by the receiving graph"
+    PUBLISH_FAILED = "publish_failed", "sink", "#6b1d1d", "received whole but not published on the sink's ROS graph"
     NOT_TAKEN = "not_taken", "link", "#8c564b", "received whole but not taken by the sink"
     IN_FLIGHT = "in_flight", "link", "#9db8d9", "still in flight at the end"
 

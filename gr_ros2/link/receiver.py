@@ -30,9 +30,10 @@ class ReceiverStats:
     """What arrived and what did not, since the start.
 
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic;
-    ``delivered`` by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason); ``packet_loss_est`` from gaps in
-    sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given up are estimates;
-    ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known of what was lost.
+    ``delivered``, what was given out, by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason);
+    ``packet_loss_est`` from gaps in sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given
+    up are estimates; ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known
+    of what was lost.
     """
 
     packets: int = 0
@@ -109,6 +110,14 @@ class Receiver:
         for partial in self._partials:
             return partial.last + self.config.reassembly_timeout
         return None
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+        source = self._sources.get(event.src_id)
+        if source is not None and source.latched.get(event.topic_id) == event.payload:
+            del source.latched[event.topic_id]
+        self.stats.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
         """Whether a sender has a place at present."""

@@ -19,7 +19,7 @@ from gr_ros2.config import QueuePolicy, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.events import Accepted, Refused, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.outcome import Row
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
@@ -39,11 +39,15 @@ Observer = Callable[[SenderEvent], None]
 
 @dataclass(slots=True)
 class SenderStats:
-    """What left and what did not, since the start. ``refused`` is keyed by (topic_id, reason)."""
+    """What left and what did not, since the start.
+
+    ``refused`` is keyed by (topic_id, reason); ``missed`` are messages that the ROS graph lost before ``submit``.
+    """
 
     submitted: Counter[int] = field(default_factory=Counter)
     refused: Counter[tuple[int, str]] = field(default_factory=Counter)
     sent: Counter[int] = field(default_factory=Counter)
+    missed: Counter[int] = field(default_factory=Counter)
     repeats: int = 0
     packets: int = 0
     entries: int = 0
@@ -127,6 +131,16 @@ class Sender:
         if topic.latched:
             self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.config.repeat_s
+
+    def missed(self, topic_id: int, total: int) -> None:
+        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted.
+
+        :param total: since the start; what is new of it is observed
+        """
+        new = total - self.stats.missed[topic_id]
+        if new > 0:
+            self.stats.missed[topic_id] = total
+            self._observe(Missed(topic_id, new))
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""

@@ -19,10 +19,10 @@ from rosbags.interfaces import Qos as Profile
 from rosbags.rosbag2 import StoragePlugin
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
-from gr_ros2.middleware.bag_files import explained
+from gr_ros2.middleware.bag_files import RecordedTopic, explained
 from gr_ros2.middleware.bag_mcap import BagWriter, TwoTimes
 from gr_ros2.middleware.base import Qos
-from gr_ros2.middleware.type_definitions import definition
+from gr_ros2.middleware.type_definitions import Definition, definition, recorded_definition
 
 BACKLOG = 10_000
 """Messages that may wait for the disk before publishing blocks."""
@@ -58,7 +58,7 @@ class BagRecorder:
 
     :param path: folder that does not exist yet
     :param storage: ``mcap`` or ``sqlite3``
-    :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
+    :param definitions: ``.msg`` texts by type name; of other types ROS's
     :param count: ``Middleware.count``
     :param lossless: publishing waits while ``BACKLOG`` messages are behind; else those that come then are counted
     :raises ConfigError: no such storage
@@ -86,7 +86,7 @@ class BagRecorder:
         self._writer = BagWriter(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
         # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
         self._writer.set_custom_data("recorded_by", "gr_ros2")
-        self._channels: dict[tuple[str, Qos], BagChannel] = {}
+        self._channels: dict[tuple[str, tuple[Profile, ...]], BagChannel] = {}
         self._closed = False
         self._lock = threading.Lock()
         self._queue: queue.Queue[_Message | _Job | None] = queue.Queue(BACKLOG)
@@ -107,19 +107,36 @@ class BagRecorder:
 
         :raises ConfigError: the topic is being written with another type
         """
-        text, digest = definition(type_name, self._definitions)
+        return self._channel(
+            topic, type_name, definition(type_name, self._definitions.get(type_name)), (_profile(qos),)
+        )
+
+    def copy(self, topic: RecordedTopic) -> BagChannel:
+        """Where messages of a topic of another bag go, which is named, defined and offered here as it is there.
+
+        :raises ConfigError: the topic is being written with another type
+        """
+        type_name = topic.info.type_name
+        text = recorded_definition(type_name, topic.definition.data, topic.digest)
+        return self._channel(topic.recorded_as, type_name, text, topic.profiles)
+
+    def _channel(self, topic: str, type_name: str, definition: Definition, profiles: tuple[Profile, ...]) -> BagChannel:
         with self._lock:
             for other in self._channels.values():
                 if other.topic == topic and other.type_name != type_name:
                     raise ConfigError(f"bag {self.path}: {topic} is {other.type_name}, not {type_name}")
-            if (topic, qos) not in self._channels:
+            if (topic, profiles) not in self._channels:
                 connection = self._ask(
                     lambda: self._writer.add_connection(
-                        topic, type_name, msgdef=text, rihs01=digest, offered_qos_profiles=[_profile(qos)]
+                        topic,
+                        type_name,
+                        msgdef=definition.text,
+                        rihs01=definition.digest,
+                        offered_qos_profiles=profiles,
                     )
                 )
-                self._channels[topic, qos] = BagChannel(topic, type_name, connection)
-            return self._channels[topic, qos]
+                self._channels[topic, profiles] = BagChannel(topic, type_name, connection)
+            return self._channels[topic, profiles]
 
     def write(self, channel: BagChannel, stamp_ns: int, payload: bytes, sent_ns: int | None = None) -> None:
         """Queue one message.

@@ -86,7 +86,12 @@ class Publisher(ABC):
 
 
 class Subscription(ABC):
-    """A topic we listen to."""
+    """A topic we listen to.
+
+    :ivar lost: messages published on it that were lost before they reached the callback, as far as the graph tells
+    """
+
+    lost: int = 0
 
     @abstractmethod
     def matched(self) -> int:
@@ -145,6 +150,12 @@ class Middleware(ABC):
             self.counters[key] += n
         if first:
             _log.log(level, "%s (counted as %s, not logged again)", text, key)
+
+    def count_lost(self, subscription: Subscription, topic: str, text: str, n: int = 1) -> None:
+        """Count messages that a subscription was to hear and will not, from any thread."""
+        self.count(f"samples_lost:{topic}", text, n)
+        with self._counting:
+            subscription.lost += n
 
     def deliver(self, topic: str, callback: MessageCallback, payload: bytes) -> None:
         """Call back with one message; a callback that raises is counted and logged, and the thread lives on."""

@@ -118,6 +118,7 @@ class DdsSubscription(Subscription):
                 return
             if self._reader:
                 _log.info("%s: asking for %s, %s from now on", self.topic, qos.reliability, qos.durability)
+                self._count_lost(self._reader)
                 self._outdated.append((time.monotonic() + OVERLAP_S, self._reader))
             self._reader = self._middleware.make_reader(self, qos)
             self._qos = qos
@@ -166,9 +167,7 @@ class DdsSubscription(Subscription):
     def _serve(self, reader: RawReader) -> int:
         if self._closed:
             return 0
-        lost = reader.lost()
-        if lost:
-            self._middleware.count(f"samples_lost:{self.topic}", f"{self.topic}: the DDS lost messages", lost)
+        self._count_lost(reader)
         self._middleware.count_incompatible(self.topic, reader.incompatible(), self._open_policies)
         samples = batch = reader.take()
         while self._wanted.depth and len(batch) == BATCH:
@@ -178,13 +177,19 @@ class DdsSubscription(Subscription):
         excess = len(fresh) - self._wanted.depth
         if self._wanted.depth and excess > 0 and not reader.latched:
             text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest go"
-            self._middleware.count(f"samples_lost:{self.topic}", text, excess)
+            self._middleware.count_lost(self, self.topic, text, excess)
             fresh = fresh[excess:]
         for sample in fresh:
             if self._closed:
                 break
             self._middleware.deliver(self.topic, self._callback, sample.payload)
         return len(samples)
+
+    def _count_lost(self, reader: RawReader) -> None:
+        """Of outdated readers only what they lost before they were: what they miss from then on, another may have."""
+        lost = reader.lost()
+        if lost and reader is self._reader:
+            self._middleware.count_lost(self, self.topic, f"{self.topic}: the DDS lost messages", lost)
 
     def _is_next(self, sample: Sample, reader: RawReader) -> bool:
         """Whether a message is to be delivered: neither had by another reader nor overtaken by a later one.

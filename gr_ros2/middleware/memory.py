@@ -148,7 +148,7 @@ class MemorySubscription(Subscription):
             self.waiting.popleft()
             self.waiting.append(payload)
             text = f"{self.topic}: depth {self.qos.depth} is full, the oldest message goes"
-            self.middleware.count(f"samples_lost:{self.topic}", text)
+            self.middleware.count_lost(self, self.topic, text)
         else:
             self.waiting.append(payload)
             self.middleware.call(self.take)

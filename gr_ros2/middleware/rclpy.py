@@ -439,9 +439,8 @@ class _RclpySubscription(Subscription):
         )
 
     def _on_lost(self, event: Any) -> None:
-        self._middleware.count(
-            f"samples_lost:{self._topic}", f"{self._topic}: the RMW lost messages", event.total_count_change
-        )
+        text = f"{self._topic}: the RMW lost messages"
+        self._middleware.count_lost(self, self._topic, text, event.total_count_change)
 
 
 class _RclpyPublisher(Publisher):

@@ -13,6 +13,24 @@ import struct
 from collections.abc import Mapping, Sequence
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.names import check_node, check_topic
+
+__all__ = [
+    "DISCOVERY_TOPIC",
+    "DISCOVERY_TYPE",
+    "MAX_DOMAIN_ID",
+    "PARTICIPANT_USER_DATA",
+    "check_node",
+    "check_topic",
+    "dds_topic",
+    "dds_type",
+    "gid_size",
+    "localhost_only",
+    "participant_entities_info",
+    "resolve_domain_id",
+    "ros_topic",
+    "ros_type",
+]
 
 MAX_DOMAIN_ID = 232
 """Highest domain whose UDP ports fit 16 bits (RTPS 2.2, section 9.6.1)."""
@@ -21,37 +39,9 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 PARTICIPANT_USER_DATA = b"enclave=/;"
 
-_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
 _CDR_LE = b"\x00\x01\x00\x00"
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
-
-
-def check_topic(topic: str) -> str:
-    """An absolute ROS topic name, unchanged.
-
-    :raises ConfigError: when it is none
-    """
-    if not _TOPIC.fullmatch(topic):
-        raise ConfigError(
-            f"topic {topic!r}: not an absolute topic name; write /name or /namespace/name of letters, digits and _, "
-            "no part starting with a digit"
-        )
-    return topic
-
-
-def check_node(node_name: str, namespace: str) -> tuple[str, str]:
-    """Node name and absolute namespace ('' is the root).
-
-    :raises ConfigError: when either is malformed
-    """
-    namespace = "/" + namespace.strip("/")
-    if not _NODE.fullmatch(node_name):
-        raise ConfigError(f"node_name {node_name!r}: letters, digits and _, not starting with a digit")
-    if namespace != "/":
-        check_topic(namespace)
-    return node_name, namespace
 
 
 def dds_topic(topic: str) -> str:

@@ -222,7 +222,7 @@ class ZenohMiddleware(Middleware):
         else:
             topic = subscription.entity.topic
             text = f"{topic}: callbacks do not keep up, depth {depth} is full, the oldest go"
-            self.count(f"samples_lost:{topic}", text)
+            self.count_lost(subscription, topic, text)
 
     # Internals
 
@@ -417,7 +417,7 @@ class _ZenohSubscription(Subscription):
         if newest is not None and sequence > newest + 1:
             missing = sequence - newest - 1
             topic = self.entity.topic
-            self._middleware.count(f"samples_lost:{topic}", f"{topic}: messages were lost on the way", missing)
+            self._middleware.count_lost(self, topic, f"{topic}: messages were lost on the way", missing)
         if newest is None or sequence > newest:
             self._newest[gid] = sequence
 

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import build
+from gr_ros2.config import Kernels, build
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 
@@ -26,8 +26,8 @@ class DirectPhy(Phy):
     name = "direct"
     has_samples = False
 
-    def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
-        super().__init__(packet_len, sample_rate)
+    def __init__(self, packet_len: int, sample_rate: float = 0.0, kernels: Kernels = "auto", **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, kernels)
         build(DirectOptions, options, "phy direct")
 
     def airtime_samples(self) -> int:

@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import build
+from gr_ros2.config import Kernels, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.burst import Frame
-from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import Layout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
@@ -64,8 +64,8 @@ class OfdmPhy(BurstPhy):
 
     name = "ofdm"
 
-    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
-        super().__init__(packet_len, sample_rate)
+    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, kernels)
         self.options = chosen = build(OfdmOptions, options, "phy ofdm")
         fft_len = chosen.fft_len
         cp_len = fft_len // 4 if chosen.cp_len is None else chosen.cp_len
@@ -121,6 +121,12 @@ class OfdmPhy(BurstPhy):
         order = 1 << self.layout.bits_per_carrier
         error = psk_symbol_error(order, snr) if order <= 8 else qam_symbol_error(order, snr)
         return packet_success(error, self.frame_bits() // self.layout.bits_per_carrier)
+
+    def runs_on(self) -> str:
+        return super().runs_on() if self._stock is None else STOCK
+
+    def leaves_tags(self) -> bool:
+        return self._stock is not None
 
     def prefer_latency(self) -> None:
         if self._stock is not None:

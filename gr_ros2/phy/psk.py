@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import build
+from gr_ros2.config import Kernels, build
 from gr_ros2.phy.burst import Frame, Samples
 from gr_ros2.phy.burst_blocks import BurstOptions
 from gr_ros2.phy.linear import LinearModem, LinearPhy, shape
@@ -75,7 +75,7 @@ class PskPhy(LinearPhy):
 
     name = "psk"
 
-    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
         self.options = build(PskOptions, options, "phy psk")
         modem = PskModem(Frame(packet_len, self.options.fec), self.options)
-        super().__init__(packet_len, sample_rate, modem, self.options)
+        super().__init__(packet_len, sample_rate, kernels, modem, self.options)

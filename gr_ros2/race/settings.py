@@ -19,7 +19,7 @@ from gr_ros2.config import PacketLen, Seconds
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics, read_bag
+from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
 from gr_ros2.sim.fleet import Fleet
@@ -169,10 +169,12 @@ def read_recording(settings: RaceSettings, folder: Path) -> Recording:
         path = record_sim(folder, settings)
     else:
         path = Path(settings.source.removeprefix("bag:").strip()).expanduser()
-    found = {info.topic: info.type_name for info in bag_topics(path)}
-    topic = settings.topic or next(iter(found), "")
+    contents = bag_contents(path)
+    found = {name: topic.info.type_name for name, topic in contents.topics.items()}
+    topic = f"/{settings.topic.lstrip('/')}" if settings.topic else next(iter(found), "")
     if topic not in found or (len(found) > 1 and not settings.topic):
-        raise ConfigError(f"topic = {settings.topic!r}: name one that {path} has: {', '.join(found) or 'it has none'}")
+        has = "; ".join([", ".join(found) or "it has none", *contents.remarks])
+        raise ConfigError(f"topic = {settings.topic!r}: name one that {path} has: {has}")
     payloads: list[bytes] = []
     stamps: list[int] = []
     for message in read_bag(path, [topic]):

@@ -18,7 +18,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
 
 
@@ -82,8 +82,11 @@ class LinkConfig:
         """The registry every robot works with.
 
         :raises RegistryError: file, line, what is wrong
+        :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
-        return Registry.from_csv(self.registry)
+        registry = Registry.from_csv(self.registry)
+        check_outputs(registry, self.ros_sink)
+        return registry
 
 
 def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:

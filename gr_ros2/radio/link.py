@@ -20,7 +20,7 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import MIDDLEWARE, Middleware
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import configured
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
@@ -70,7 +70,7 @@ class RobotLink(Flowgraph):
 
     def _open(self, middleware: Middleware | None, observer: LinkObserver | None) -> None:
         config = self.config
-        self.phy: Phy = PHY.load(config.phy.name)(config.packet_len, config.phy.sample_rate, **config.phy.options)
+        self.phy = configured(config.phy, config.packet_len, config.phy.sample_rate)
         self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
         self._stack.callback(self.front_end.close)
         self.radio = Radio(

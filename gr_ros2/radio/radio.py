@@ -86,8 +86,8 @@ class Radio(PacketPath, HierBlock):
             self.connect(self._transmit(self._gate), front_end.sink)
         if front_end.source is None:
             return
-        # The channel stops tags too: the transmitter's would overrule what the receiver reads in a packet's header.
-        faded = front_end.loops_back or bool(self.channel.on_samples()) or self._simulated
+        # The channel stops tags too.
+        faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
         # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
         heard = self._receive(front_end.source, faded=faded, shown=instrumented, aside=not front_end.ends)
         if record:

@@ -22,6 +22,7 @@ from gr_ros2.link.events import (
     Accepted,
     Delivered,
     Lost,
+    Missed,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -40,9 +41,10 @@ REORDER_WINDOW = 1024
 
 @dataclass(slots=True)
 class TopicLedger:
-    """What became of one topic of one source. The arrays run in parallel, one item per sent message, by submission.
+    """What became of one topic of one source. The arrays run in parallel, one item per message handed to the source, by
+    submission.
 
-    :param sent: messages handed to the source, repeats excluded
+    :param sent: messages for this link: handed to the source, or lost by its ROS graph before; repeats excluded
     :param corrupt: deliveries that match no message; 0 unless something is badly wrong
     :param repeats_delivered: deliveries of repeats whose message had its row already
     :param rows: ledger row -> messages
@@ -128,6 +130,10 @@ class Ledger:
                 self._sent(source, event)
             elif isinstance(event, Accepted):
                 self._accepted(source, event)
+            elif isinstance(event, Missed):
+                topic = self._topic(src_id, event.topic_id)
+                topic.sent += event.count
+                topic.rows[Row.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, event)
 
@@ -237,14 +243,14 @@ class Ledger:
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
         message = _Open.of(event)
-        message.position = topic.sent - 1
+        message.position = len(topic.serial) - 1
         source.messages.add(message)
 
     def _refused(self, source: _Source, event: Refused) -> None:
         message = source.messages.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
-            topic.book(topic.sent - 1, event.reason)
+            topic.book(len(topic.serial) - 1, event.reason)
         else:
             self._close(source, message, event.reason)
 
@@ -325,7 +331,8 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            if topic.rows.total() != topic.sent or len(topic.t_sent) != topic.sent:
+            submitted = topic.sent - topic.rows[Row.LOST_ON_GRAPH.value]
+            if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
             if topic.rows[Row.DELIVERED] != delivered:

@@ -53,6 +53,7 @@ class TopicResult:
     :param latency_clock: submit, stamp_wall or stamp_sim; None where there is no latency
     :param path_error_m: mean distance of the paths along their length, None where the type has no position
     :param rms_error_m: RMS distance at equal times, likewise
+    :param sent: messages for this link: handed to the source, or lost by its ROS graph before (``lost_on_graph``)
     :param ledger: row -> messages; the rows add up to ``sent``
     :param left_out_sent, left_out_received: messages sent, and messages received, that are in no path and in no error
         of it: their position is not finite or beyond 1e9 m, or cannot be read
@@ -95,8 +96,8 @@ class Result:
     :param duration_s: s during which messages were submitted
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
-    :param phy: name, channels (one per direction), sample_rate, airtime_s (of one packet), airtime_per_message_s and
-        airtime_per_byte_s (of all packets sent, per delivered message and byte), …
+    :param phy: name, channels (one per direction), sample_rate, runs_on (what worked on samples), airtime_s (of one
+        packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why

@@ -1,6 +1,6 @@
 """What happened in a run, message by message and packet by packet: three tables beside `result.json`.
 
-    messages.csv, messages.parquet   one line per message sent, in the order of submission
+    messages.csv, messages.parquet   one line per message submitted, in the order of submission
     packets.parquet                  one line per entry of every packet sent, in the order of sending
     paths.parquet                    one line per position sent or received, where a topic has positions
 
@@ -343,7 +343,7 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be made ({error.strerror or error}); choose another folder") from error
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
     return path
 
 
@@ -366,8 +366,8 @@ def _write_parquet(table: Any, path: Path) -> None:
 
 def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]:
     return {
-        "topic": np.full(book.sent, topic, dtype=object),
-        "src_id": np.full(book.sent, book.src_id),
+        "topic": np.full(len(book.serial), topic, dtype=object),
+        "src_id": np.full(len(book.serial), book.src_id),
         "serial": np.array(book.serial, dtype=np.int64),
         "t_sent": np.array(book.t_sent) - t0,
         "t_delivered": np.array(book.t_delivered) - t0,

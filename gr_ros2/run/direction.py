@@ -12,17 +12,15 @@ from dataclasses import replace
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import MIDDLEWARE, Middleware
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import source_names
+from gr_ros2.run.load import recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 
 _QUIET_S = 0.3
@@ -101,7 +99,7 @@ class Direction:
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""
         format_ = self.scenario.ros_sink.namespace_format
-        rows = [self.registry[topic_id] for topic_id in self.topics.values()]
+        rows = [self.sink.registry[topic_id] for topic_id in self.topics.values()]
         return {topic.republished(format_, self.src_id): topic.type_name for topic in rows}
 
     def empty(self, unresolved: bool) -> bool:
@@ -127,7 +125,5 @@ class Direction:
         path = self.scenario.bag_path
         if path is None:
             return open_graph(self.scenario, self.scenario.ros_source, "source")
-        found = [info.topic for info in bag_topics(path)]
-        if not set(found) & set(self.topics):
-            raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
+        recorded_names(self.scenario, self.registry)  # refuses a recording with nothing for this link
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)

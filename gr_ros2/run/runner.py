@@ -25,7 +25,7 @@ from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, Result, write_result
 from gr_ros2.record.trace import make_folder, write_trace, write_whole
 from gr_ros2.run.direction import Direction, open_graph
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
@@ -47,21 +47,25 @@ class Listener:
     """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
 
     :param graphs: name and type of the topics to hear, by graph
+    :param definitions: ``.msg`` texts of types by name; ROS's where missing
     """
 
-    def __init__(self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path) -> None:
+    def __init__(
+        self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path, definitions: Mapping[str, str]
+    ) -> None:
         self.received: Counter[str] = Counter()
+        self._closed = False
         self._guard = Guard("bag of delivered messages")
         # A reader that waits for the disk would make DDS hold up the link's own publisher.
-        self._bag = BagMiddleware(path=bag, mode="write", lossless=False)
+        self._bag = BagMiddleware(path=bag, mode="write", definitions=definitions, lossless=False)
         self._publishers = {
             name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
         }
-        self._subscriptions = [
-            graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
+        self._subscriptions = {
+            name: graph.subscribe(name, kind, Qos("reliable", None, 0), partial(self._take, name))
             for graph, topics in graphs.items()
             for name, kind in topics.items()
-        ]
+        }
 
     def _take(self, name: str, payload: bytes) -> None:
         self.received[name] += 1
@@ -69,13 +73,19 @@ class Listener:
 
     def matched(self) -> bool:
         """Whether every topic has found its publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions)
+        return all(subscription.matched() for subscription in self._subscriptions.values())
+
+    def lost(self) -> dict[str, int]:
+        """Messages of each topic that were published and that the graph lost on the way here; {} where none was."""
+        return {name: subscription.lost for name, subscription in self._subscriptions.items() if subscription.lost}
 
     def close(self) -> None:
         """Stop listening and finish the bag. Idempotent."""
-        while self._subscriptions:
-            self._subscriptions.pop().close()
-        self._guard.last(self._bag.close)
+        if not self._closed:
+            self._closed = True
+            for subscription in self._subscriptions.values():
+                subscription.close()
+            self._guard.last(self._bag.close)
 
     def told(self) -> list[str]:
         """What is missing in the bag, as one line; none where nothing is. To be asked when it is closed."""
@@ -207,7 +217,7 @@ class _Run:
             stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
             for way in self.directions
         }
-        listener = Listener(graphs, out / DELIVERED_BAG)
+        listener = Listener(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
 
@@ -321,4 +331,10 @@ class _Run:
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)
         heard = {} if self.listener is None else dict(self.listener.received)
-        return {**there, **({"back": back[0]} if back else {}), "listener": heard}
+        unheard = {} if self.listener is None else self.listener.lost()
+        return {
+            **there,
+            **({"back": back[0]} if back else {}),
+            "listener": heard,
+            **({"listener_lost": unheard} if unheard else {}),
+        }

@@ -29,7 +29,7 @@ from gr_ros2.config import (
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.sim.settings import SimSettings
 
@@ -156,8 +156,12 @@ class Scenario:
         """The registry both ends work with.
 
         :raises RegistryError: file, line, what is wrong
+        :raises ConfigError: when a sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
-        return Registry.from_csv(self.registry)
+        registry = Registry.from_csv(self.registry)
+        for way in self.directions():
+            check_outputs(registry, way.ros_sink)
+        return registry
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import message_codec
-from gr_ros2.link import Accepted, Delivered, ReceiverEvent, Refused, SenderEvent, SenderStats, SentPacket
+from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
@@ -30,7 +30,7 @@ from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.settings import SimSettings
@@ -87,13 +87,14 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
     :raises ConfigError: for a recording played as fast as the link takes it, which has no times
     :raises BagError: for one whose times leap by more than 30 days
     """
-    names = source_names(scenario, registry)
     if scenario.bag_path is None:
+        names = source_names(scenario, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
     if not scenario.bag_speed:
         raise ConfigError("bag_speed = 0: a recording as fast as the link takes it cannot be simulated; set it above 0")
+    names = recorded_names(scenario, registry)
     first = last = None
     for message in read_bag(scenario.bag_path, names):
         first = message.stamp_ns if first is None else first
@@ -166,9 +167,9 @@ def simulate(
 def tell(observer: LinkObserver, happening: Happening, overhead_s: float = 0.0) -> None:
     """Let an observer hear of what happened."""
     now, way, event = happening
-    if isinstance(event, Accepted | Refused | SentPacket):
+    if isinstance(event, SenderEvent):
         observer.sender_event(way.src_id, event)
-    elif not isinstance(event, Landed):
+    elif isinstance(event, ReceiverEvent):
         observer.receiver_event(event, now + overhead_s if isinstance(event, Delivered) else now)
 
 

@@ -8,6 +8,7 @@ samples, as in a run in real time, so neither noise nor fading moves on in it.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +25,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from gr_ros2.phy.measure import Passage
 
 _REPORT_S = 0.05
+
+_log = logging.getLogger(__name__)
 
 
 def run_simulated(
@@ -63,7 +66,10 @@ def run_simulated(
     with ExitStack() as stack:
         if bag is None and out is not None:
             origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
-            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns))
+            source = recording(scenario)
+            for line in source.differences:
+                _log.warning(line)
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
@@ -75,7 +81,7 @@ def run_simulated(
         )
         onlookers = onlookers or Onlookers(apart=False)
         ears = Observers[LinkObserver]()
-        recording = ears.add(recorder, needed=True)
+        recorded = ears.add(recorder, needed=True)
         ears.add(onlookers)
         ends = make_ends(ways, registry)
         directions = [
@@ -87,11 +93,11 @@ def run_simulated(
         for happening in _whole(directions):
             clock.now = happening[0]
             tell(ears, happening)
-            recording.check()
+            recorded.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *recorder.progress()))
-        recording.check()
+        recorded.check()
     played = max(direction.way.duration_s for direction in directions)
     topics = recorder.finish(played, played, all(direction.way.empty for direction in directions))
     there, *back = (direction.counters() for direction in directions)
@@ -246,9 +252,8 @@ def _whole(directions: Sequence[_Direction]) -> Iterator[Happening]:
 def _published_as(way: Scenario, registry: Registry) -> dict[str, str]:
     """Name of every topic at the sink, by its name at the source."""
     format_, src_id = way.ros_sink.namespace_format, way.ros_source.src_id()
-    return {
-        name: registry[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()
-    }
+    rows = registry.with_options(way.ros_sink.topic_options)
+    return {name: rows[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()}
 
 
 def _live_run(scenario: Scenario, registry: Registry, recorder: Recorder, clock: Callable[[], float]) -> LiveRun:

@@ -16,6 +16,7 @@ from gr_ros2.backlog import Backlog
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import RunError
 from gr_ros2.gr import RosSource
+from gr_ros2.guard import Guard
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
@@ -112,9 +113,10 @@ class Audience(Observers[Watcher]):
     def invite(self, watcher: Watcher) -> None:
         """Let one more look on, from now."""
         with self._lock:
+            guard = Guard(name_of(watcher))
             if self._run is not None:
-                watcher.run_started(self._run)
-            self.add(watcher)
+                guard(watcher.run_started, self._run)
+            self._guarded += ((watcher, guard),)
 
     def run_started(self, run: LiveRun) -> None:
         with self._lock:

@@ -18,7 +18,7 @@ from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.freshness import TURN
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
@@ -200,7 +200,7 @@ class Planner:
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
-        phy: Phy = PHY.load(scenario.phy.name)(scenario.packet_len, self.phy.sample_rate, **scenario.phy.options)
+        phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
         codec = self._codec(scenario.ros_source.compression)
         duration = scenario.duration_s or self._messages[-1].t

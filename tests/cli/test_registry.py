@@ -1,17 +1,22 @@
-"""`registry check` and `registry from-graph`."""
+"""`registry check`, `registry from-graph` and `registry from-bag`."""
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
+from rosbags.interfaces import Qos as BagQos
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from gr_ros2.cli.main import run
-from gr_ros2.cli.registry import registry_csv
+from gr_ros2.cli.registry import registry_csv, unfit
+from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import Qos, TopicInfo
 from gr_ros2.registry import Registry
+from tests.domains import domain
+from tests.waiting import wait_for
 
 LATCHED = Qos("reliable", "transient_local")
 FOUND = [
@@ -85,12 +90,112 @@ def test_from_the_dds_graph(
     dds = pytest.importorskip("gr_ros2.middleware.dds")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     out = tmp_path / "r.csv"
-    arguments = ["registry", "from-graph", "--namespace", "robot_1", "--domain-id", "93", "--wait", "0.5"]
-    with dds.DdsMiddleware(domain_id=93) as robot:
+    arguments = ["registry", "from-graph", "--namespace", "robot_1", "--domain-id", str(domain()), "--wait", "0.5"]
+    with dds.DdsMiddleware(domain_id=domain()) as robot:
         robot.advertise("/robot_1/odom", "nav_msgs/msg/Odometry", Qos())
-        deadline = time.monotonic() + 30
-        while run([*arguments, "--out", str(out)]) != 0:
-            assert "is the robot running" in capsys.readouterr().err
-            assert time.monotonic() < deadline, "the topic was never discovered"
+
+        def written() -> bool:
+            status = run([*arguments, "--out", str(out)])
+            assert status == 0 or "is the robot running" in capsys.readouterr().err
+            return status == 0
+
+        wait_for(written, "the topic to be discovered")
     assert out.read_text() == "topic,type\nodom,nav_msgs/msg/Odometry\n"
     assert capsys.readouterr().out == f"{out}: 1 topics, digest {Registry.from_csv(out).digest}\n"
+
+
+SERVICE = TopicInfo("/add/_service_event", "example_interfaces/srv/AddTwoInts_Event", (Qos(),))
+FEEDBACK = TopicInfo("/fib/_action/feedback", "example_interfaces/action/Fibonacci_FeedbackMessage", (Qos(),))
+STATUS = TopicInfo("/fib/_action/status", "action_msgs/msg/GoalStatusArray", (LATCHED,))
+TWO = [TopicInfo("/n", f"std_msgs/msg/{name}", (Qos("reliable"),)) for name in ("String", "Int32")]
+
+
+def test_what_no_registry_can_have_is_left_out_with_the_reason() -> None:
+    found = [*FOUND, SERVICE, FEEDBACK, STATUS, *TWO, TopicInfo("/robot-1/odom", "nav_msgs/msg/Odometry", (Qos(),))]
+    assert unfit(FOUND) == {}
+    assert unfit(found) == {
+        SERVICE.topic: "it belongs to a service, and a link carries topics alone",
+        FEEDBACK.topic: "it belongs to an action, and a link carries topics alone",
+        STATUS.topic: "it belongs to an action, and a link carries topics alone",
+        "/n": "it has several types, std_msgs/msg/Int32 and std_msgs/msg/String",
+        "/robot-1/odom": "ROS allows no such name, '-' may not stand in a ROS name; letters, digits, _ and / may",
+    }
+    assert registry_csv(found, "") == registry_csv(FOUND, "")
+    with pytest.raises(ConfigError, match="topic 'n' cannot be registered: it has several types"):
+        registry_csv(found, "", ["n"])
+    with pytest.raises(ConfigError, match="--namespace '/robot-1': '-' may not stand"):
+        registry_csv(found, "/robot-1")
+
+
+def test_the_qos_of_a_bag_is_what_all_its_publishers_offer() -> None:
+    some = [
+        TopicInfo(
+            "/odom", "nav_msgs/msg/Odometry", (Qos("reliable", "volatile", 10), Qos("reliable", "volatile", 100))
+        ),
+        TopicInfo("/scan", "sensor_msgs/msg/LaserScan", (Qos("best_effort", "volatile", 5), LATCHED)),
+        TopicInfo("/map", "nav_msgs/msg/OccupancyGrid", (Qos("reliable", "transient_local", 0), LATCHED)),
+    ]
+    assert registry_csv(some, "", ["odom", "scan", "map"], Path("b")).splitlines() == [
+        "topic,type,reliability,durability,depth",
+        "odom,nav_msgs/msg/Odometry,reliable,volatile,100",
+        "scan,sensor_msgs/msg/LaserScan,best_effort,volatile,10",
+        "map,nav_msgs/msg/OccupancyGrid,reliable,transient_local,0",
+    ]
+
+
+def write_bag(path: Path, storage: StoragePlugin) -> Path:
+    """A recording as ROS makes it, of which a service and an action were recorded too."""
+
+    def profile(reliability: QosReliability, durability: QosDurability, depth: int) -> BagQos:
+        never = QosTime(0, 0)
+        liveliness = QosLiveliness.AUTOMATIC
+        return BagQos(QosHistory.KEEP_LAST, depth, reliability, durability, never, never, liveliness, never, False)
+
+    best_effort = profile(QosReliability.BEST_EFFORT, QosDurability.VOLATILE, 5)
+    latched = profile(QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, 1)
+    with Writer(path, version=8, storage_plugin=storage) as writer:
+        for topic, type_name, qos in (
+            ("/robot_1/scan", "sensor_msgs/msg/LaserScan", best_effort),
+            ("/robot_1/tf_static", "tf2_msgs/msg/TFMessage", latched),
+            ("/rosout", "rcl_interfaces/msg/Log", latched),
+            (SERVICE.topic, SERVICE.type_name, best_effort),
+            (FEEDBACK.topic, FEEDBACK.type_name, best_effort),
+        ):
+            connection = writer.add_connection(
+                topic, type_name, msgdef="int32 x\n", rihs01="RIHS01_" + 64 * "0", offered_qos_profiles=[qos]
+            )
+            writer.write(connection, 1, b"\0\1\0\0" + bytes(4))
+    return path
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_from_a_bag(storage: StoragePlugin, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, out = write_bag(tmp_path / "bag", storage), tmp_path / "r.csv"
+    text = (
+        "topic,type,reliability,durability,depth\n"
+        "scan,sensor_msgs/msg/LaserScan,best_effort,volatile,5\n"
+        "tf_static,tf2_msgs/msg/TFMessage,reliable,transient_local,1\n"
+    )
+    assert run(["registry", "from-bag", str(bag), "--namespace", "robot_1"]) == 0
+    said = capsys.readouterr()
+    assert said.out == text
+    for topic in (SERVICE.topic, FEEDBACK.topic):
+        assert f"{topic} is left out: " in said.err
+    bare = next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
+    assert run(["registry", "from-bag", str(bare), "--topics", "robot_1/tf_static", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}: 1 topics, digest {Registry.from_csv(out).digest}\n"
+    assert Registry.from_csv(out)[0].options == TopicOptions(
+        reliability="reliable", durability="transient_local", depth=1
+    )
+
+
+def test_a_bag_that_gives_no_registry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = str(write_bag(tmp_path / "bag", StoragePlugin.MCAP))
+    for arguments, says in (
+        ([str(tmp_path / "none")], "there is no such file or folder"),
+        ([bag, "--namespace", "robot_7"], f"are no topics; choose another namespace of {bag}"),
+        ([bag, "--topics", "odom"], f"topic 'odom' is not in {bag}; published below / are robot_1/scan"),
+        ([bag, "--out", str(tmp_path / "none" / "r.csv")], "cannot be written"),
+    ):
+        assert run(["registry", "from-bag", *arguments]) == 2
+        assert says in capsys.readouterr().err

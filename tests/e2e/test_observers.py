@@ -30,8 +30,8 @@ from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.run.watch import LiveRun
 from tests.e2e.support import COMMAND, check_complete
-from tests.middleware.support import wait_for
 from tests.radio.robots import ROOT, Robot, link_command
+from tests.waiting import wait_for
 
 MEMORY = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
 FULL = "No space left on device"
@@ -146,6 +146,21 @@ def test_one_that_raises_when_a_run_begins_and_ends(passing: str) -> None:
     result = run_scenario(scenario(0.5, f"time={passing}"), watchers=[Fails()]).result
     check_complete(result)
     assert result.incomplete[0].startswith("onlooker: ended (ValueError: onlooker); ")
+
+
+def test_a_late_one_that_raises_is_left_out_alone() -> None:
+    audience, late = watch.Audience(), Fails()
+    invited: list[bool] = []
+
+    def invite() -> None:
+        if not invited:
+            invited.append(True)
+            audience.invite(late)
+
+    result = run_scenario(scenario(0.5), watchers=[Onlooker(invite), audience]).result
+    check_complete(result)
+    (line,) = result.incomplete
+    assert line.startswith("onlooker: ended (ValueError: onlooker); ")
 
 
 def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,7 +402,7 @@ def test_a_read_only_disk_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     with disk(tmp_path / "disk", "ro") as fixed:
         for passing in ("real", "packets"):
             assert as_command(fixed / "out", "--set", f"time={passing}", duration_s=0.5) == 2
-            said = f"gr-ros2: {fixed / 'out'}: cannot be made (Read-only file system); choose another folder"
+            said = f"gr-ros2: {fixed / 'out'}: cannot be written (Read-only file system); choose another folder"
             assert [line for line in capsys.readouterr().err.splitlines() if line] == [said]
 
 

@@ -1,4 +1,4 @@
-"""What tests of flowgraphs share: a block that posts and collects PDUs, and waiting for a condition."""
+"""What tests of flowgraphs share: a block that posts and collects PDUs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,6 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.link import ReceiverEvent, SenderEvent
-
-PATIENCE_S = 30.0
-
-
-def wait_for(condition: Callable[[], Any], what: str = "condition", patience: float = PATIENCE_S) -> None:
-    """Return once a condition holds; fail after a time that only a hang takes."""
-    deadline = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {patience} s for {what}"
-        time.sleep(0.002)
 
 
 class Hears:

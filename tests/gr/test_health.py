@@ -14,7 +14,7 @@ def stats(**changes: Any) -> dict[str, Any]:
     """What a link would say after a quiet start."""
     values: dict[str, Any] = {
         "out": 0, "packets": 0, "missing": 0, "rejected": 0, "delivered": 0, "lost": 0, "latency": None, "age": None,
-        "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, **changes,
+        "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, "lost_on_graph": 0, "unpublished": 0, **changes,
     }  # fmt: skip
     latency = None if values["latency"] is None else {"p50": values["latency"], "p95": 2 * values["latency"]}
     return {
@@ -25,8 +25,15 @@ def stats(**changes: Any) -> dict[str, Any]:
                     "queue": values["queue"],
                     "queue_depth": values["depth"],
                     "refused": {"stale": 3},
+                    "lost_on_graph": values["lost_on_graph"],
                 },
-                "/map": {"queued": values["queued"], "queue": "fifo", "queue_depth": 1000, "refused": {}},
+                "/map": {
+                    "queued": values["queued"],
+                    "queue": "fifo",
+                    "queue_depth": 1000,
+                    "refused": {},
+                    "lost_on_graph": 0,
+                },
             }
         },
         "sink": {
@@ -34,6 +41,7 @@ def stats(**changes: Any) -> dict[str, Any]:
             "packet_loss_est": values["missing"],
             "rejected": {"crc": values["rejected"]},
             "held_bytes": 0,
+            "publish_failed": values["unpublished"],
             "topics": {
                 "/rx_robot_2/odom": {
                     "delivered": values["delivered"],
@@ -148,6 +156,24 @@ def test_what_a_front_end_loses_warns_once_and_is_named() -> None:
     assert (grown.level, grown.message) == (Level.WARN, "2 underflows; 1 sequence errors")
     assert grown.values == {"underflows": "2", "sequence errors": "1", "bursts out": "9", "blanked": "700"}
     assert front_end(underflows=2, sequence_errors=1, bursts_out=12, blanked=900).level == Level.OK
+
+
+def test_what_the_ros_graph_lost_and_what_was_not_published_warn_while_they_are_new() -> None:
+    health = make(window_s=10)
+    told = [
+        parts(health, now, lost_on_graph=lost, unpublished=lost // 2)[:2]
+        for now, lost in ((0, 2), (5, 2), (9, 6), (30, 6))
+    ]
+    assert [transmitter.message for _, transmitter in told] == [
+        "2 messages lost on the ROS graph", "OK", "4 messages lost on the ROS graph", "OK",
+    ]  # fmt: skip
+    assert [receiver.message for receiver, _ in told] == [
+        "1 messages not published", "OK", "2 messages not published", "OK",
+    ]  # fmt: skip
+    assert [transmitter.level for _, transmitter in told] == [Level.WARN, Level.OK, Level.WARN, Level.OK]
+    receiver, transmitter = told[-1]
+    assert transmitter.values["messages lost on the ROS graph"] == "6"
+    assert receiver.values["messages not published"] == "3"
 
 
 def test_what_a_front_end_lost_before_the_first_look_is_told() -> None:

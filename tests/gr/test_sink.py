@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import random
+import re
 import struct
 import threading
 import time
@@ -25,7 +26,8 @@ from gr_ros2.link import Delivered, Lost, Received, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
-from tests.gr.probe import Hears, Probe, wait_for
+from tests.gr.probe import Hears, Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows(
     {"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid", "cmd_vel": "geometry_msgs/Twist"}
@@ -182,7 +184,87 @@ def test_a_failed_publication_is_counted_and_observed(rig: Rig) -> None:
     rig.probe.post(packets((0, stamped(5)[:40]))[0])
     wait_for(lambda: len(events) == 2)
     assert events[1] == Lost(1, 0, "publish_failed", events[0].packet.entries[0].entry_id)
-    assert sink.stats()["publish_failed"] == 1
+    stats = sink.stats()
+    assert stats["publish_failed"] == 1
+    topic = stats["topics"]["/rx_robot_1/odom"]
+    assert (topic["delivered"], topic["lost"], topic["age_s"]) == (0, {"publish_failed": 1}, None)
+
+
+@pytest.mark.parametrize("error", [ConfigError("no such type"), RuntimeError("the back-end's own")])
+def test_what_was_not_published_is_not_delivered_whatever_the_reason(rig: Rig, error: Exception) -> None:
+    class Refusing(MemoryMiddleware):
+        def advertise(self, topic: str, type_name: str, qos: Qos) -> Any:
+            if topic.endswith("/cmd_vel"):
+                raise error
+            return super().advertise(topic, type_name, qos)
+
+    events: list[Any] = []
+    with Refusing(domain_id=DOMAIN) as middleware:
+        sink = rig.make(middleware=middleware, observer=Hears(events.append))
+        rig.start()
+        for data in packets((2, stamped(5)[:40]), (0, stamped(6)[:40]), (2, stamped(7)[:40])):
+            rig.probe.post(data)
+        wait_for(lambda: len(events) == 6)
+        stats = sink.stats()
+        rig.sink.close()
+    told = [event for event in events if not isinstance(event, Received)]
+    assert sorted((event.topic_id, type(event)) for event in told) == [(0, Delivered), (2, Lost), (2, Lost)]
+    refused, passed = stats["topics"]["/rx_robot_1/cmd_vel"], stats["topics"]["/rx_robot_1/odom"]
+    assert (refused["delivered"], refused["lost"]) == (0, {"publish_failed": 2})
+    assert (passed["delivered"], passed["lost"]) == (1, {})
+    assert (stats["publish_failed"], stats["handler_failed"]) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"namespace_format": "/rx-{src_id}"}, "namespace_format = '/rx-{src_id}'"),
+        ({"namespace_format": "/{src_id.__class__}"}, "namespace_format = '/{src_id.__class__}'"),
+        ({"topic_options": {"odom": {"publish_as": "/robot-1/odom"}}}, "topic_options.odom.publish_as"),
+        (
+            {"topic_options": {"odom": {"publish_as": "/x"}, "map": {"publish_as": "/x"}}},
+            "'map' would come out as '/x'",
+        ),
+    ],
+)
+def test_names_that_ros_refuses_are_refused_before_the_graph_is_joined(
+    rig: Rig, settings: dict[str, Any], key: str
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(key)):
+        rig.make(middleware="no such", **settings)
+
+
+def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
+    class NoMerging(MemoryMiddleware):
+        def advertise(self, topic: str, type_name: str, qos: Qos) -> Any:
+            publisher = super().advertise(topic, type_name, qos)
+            if topic == "/tf":
+
+                def fail(_payload: bytes) -> None:
+                    raise RuntimeError("merged")
+
+                publisher.publish = fail
+            return publisher
+
+    rows = Registry.from_rows({"tf": "tf2_msgs/TFMessage"})
+    events: list[Any] = []
+    with NoMerging(domain_id=DOMAIN) as middleware:
+        rig.sink = RosSink(
+            rows,
+            middleware=middleware,
+            packet_len=PACKET_LEN,
+            frame_prefix="r{src_id}/",
+            merge_tf="/tf",
+            observer=Hears(events.append),
+        )
+        rig.start("/rx_robot_1/tf", "tf2_msgs/TFMessage")
+        rig.probe.post(packets((0, b"\0\1\0\0" + bytes(4)))[0])
+        wait_for(lambda: len(events) == 2)
+        stats = rig.sink.stats()
+        rig.sink.close()
+    assert isinstance(events[1], Delivered)
+    assert (stats["tf_failed"], stats["handler_failed"]) == (1, 0)
+    assert stats["topics"]["/rx_robot_1/tf"]["delivered"] == 1
 
 
 def test_a_failing_observer_does_not_end_reception(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:

@@ -17,13 +17,15 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link import Accepted, Refused, SentPacket
+from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.record.recorder import Recorder
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0
-from tests.e2e.support import free_domains
-from tests.gr.probe import Hears, Probe, wait_for
+from tests.domains import free_domains
+from tests.gr.probe import Hears, Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61
@@ -127,6 +129,43 @@ def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
     rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
     wait_for(lambda: bool(refused))
     assert refused[0].reason == "stale"
+
+
+def test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up(rig: Rig) -> None:
+    """Messages published while the source is held up, into a subscription of five."""
+    recorder = Recorder(REGISTRY, {1: "/robot_1"}, {1: [0]})
+    held, release = threading.Event(), threading.Event()
+
+    def observe(event: SenderEvent) -> None:
+        recorder.sender_event(1, event)
+        held.set()
+        release.wait(20)
+
+    source = rig.make(topics=["odom"], subscriber_depth=5, observer=Hears(observe))
+    rig.publish(bytes(40))
+    wait_for(held.is_set)
+    rig.publish(bytes(40), count=29)
+    release.set()
+    wait_for(lambda: source.stats()["topics"]["/robot_1/odom"]["submitted"] == 6)
+    topic = source.stats()["topics"]["/robot_1/odom"]
+    assert topic["lost_on_graph"] == 24
+    (result,) = recorder.finish(1.0, time.monotonic())
+    assert result.sent == sum(result.ledger.values()) == 30
+    assert result.ledger == {"in_flight": 6, "lost_on_graph": 24}
+
+
+def test_what_the_graph_loses_last_is_told_when_the_source_stops(rig: Rig) -> None:
+    events: list[SenderEvent] = []
+    source = rig.make(observer=Hears(events.append))
+    rig.start()
+    subscription = source._subscriptions[0]
+    source.middleware.count_lost(subscription, "/robot_1/odom", "lost", 3)
+    rig.top.stop()
+    rig.top.wait()
+    assert events == [Missed(0, 3)]
+    source.middleware.count_lost(subscription, "/robot_1/odom", "lost")
+    source.close()
+    assert events == [Missed(0, 3), Missed(0, 1)]
 
 
 def test_all_topics_or_a_subset(rig: Rig) -> None:

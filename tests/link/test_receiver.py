@@ -166,6 +166,17 @@ def test_a_repeat_of_a_transient_local_message_is_not_delivered_again() -> None:
     assert sink.stats.repeats == 1
 
 
+def test_what_was_not_published_is_lost_and_its_repeat_comes_out() -> None:
+    sink = receiver(packet_len=64, topic_options={"t0": TopicOptions(durability="transient_local")})
+    (event,) = take(sink, packet(0, Entry(0, 0, 0, 1, b"A")), 0.0)
+    assert isinstance(event, Delivered)
+    assert sink.unpublished(event) == Lost(1, 0, "publish_failed", 0)
+    assert sink.stats.lost == Counter({(1, 0, "publish_failed"): 1})
+    assert take(sink, packet(1, Entry(0, 1, 0, 1, b"A")), 0.0) == [Delivered(1, 0, b"A", 0, 1)]
+    assert take(sink, packet(2, Entry(0, 2, 0, 1, b"A")), 0.0) == []
+    assert (sink.stats.delivered[1, 0], sink.stats.repeats) == (2, 1)
+
+
 def test_loss_estimates_come_from_gaps() -> None:
     engine, sink = sender(packet_len=64, queue_depth=0), receiver(packet_len=64)
     for _ in range(100):
@@ -203,6 +214,7 @@ def test_garbage_is_rejected_by_name_and_loses_nothing_else(garbage: list[bytes]
     assert len(rejected) == sum(sink.stats.rejected.values()) == len(garbage)
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_forged_packets_never_raise_and_memory_stays_bounded(data: st.DataObject) -> None:
     sink = receiver(topics=4, packet_len=40, max_source_bytes=4096, max_bytes=8192, max_sources=3)

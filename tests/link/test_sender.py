@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError
-from gr_ros2.link import Accepted, Receiver, Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Accepted, Missed, Receiver, Refused, Sender, SenderEvent, SentPacket
 from gr_ros2.link.freshness import Queues
 from gr_ros2.link.schedule import PaperScheduler
 from gr_ros2.registry import Registry
@@ -348,6 +348,16 @@ def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> No
     assert events[0].payload == message
     sink = Receiver(registry(2), SinkConfig(packet_len=64), codec=Halving())
     assert delivered(sink.receive(data, 0.0)) == [message]
+
+
+def test_what_the_graph_lost_before_submission_is_observed_once() -> None:
+    events: list[SenderEvent] = []
+    engine = Sender(registry(2), build(SourceConfig, {"robot_id": 1}), rng=random.Random(0), observer=events.append)
+    for total in (0, 2, 2, 5):
+        engine.missed(1, total)
+    assert events == [Missed(1, 2), Missed(1, 3)]
+    assert (engine.stats.missed, engine.stats.submitted) == ({1: 5}, {})
+    assert engine.idle
 
 
 def test_a_message_that_fits_only_coded_is_sent() -> None:

@@ -16,7 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, TopicInfo, bag_recorder
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
-from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, wait_for
+from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 HUSKY = Path(__file__).parents[3] / "shared" / "data" / "husky_outdoor"
 Storage = Literal["mcap", "sqlite3"]

@@ -20,19 +20,9 @@ from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_domains import POOL
-from tests.middleware.support import (
-    ADAPT,
-    BEST_EFFORT,
-    CUSTOM,
-    LATCHED,
-    RELIABLE,
-    STRING,
-    Peer,
-    domain,
-    message,
-    same,
-    wait_for,
-)
+from tests.domains import domain
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, Peer, message, same
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).parents[2]
 PEER = [sys.executable, "-m", "tests.middleware.dds_peer"]
@@ -251,6 +241,7 @@ def test_depth_bounds_what_waits_and_drops_are_counted(join: Callable[..., DdsMi
     wait_for(lambda: len(received) == depth + 1, "what was kept")
     assert received == [message(i) for i in (0, *range(201 - depth, 201))]
     assert here.counters == {"samples_lost:/a": 200 - depth}
+    assert subscription.lost == 200 - depth
 
 
 def test_a_subscriber_that_does_not_keep_up_blocks_for_a_second_at_most(

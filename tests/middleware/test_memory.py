@@ -10,7 +10,8 @@ import pytest
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, wait_for
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -50,16 +51,18 @@ def test_depth_bounds_what_waits_and_drops_are_counted(ends: Ends) -> None:
         reached.set()
         release.wait(20)
 
-    ends[0].subscribe("/a", STRING, Qos(depth=3), callback)
+    subscription = ends[0].subscribe("/a", STRING, Qos(depth=3), callback)
     publisher = ends[1].advertise("/a", STRING, RELIABLE)
     publisher.publish(message(0))
     wait_for(reached.is_set, "the first callback")
+    assert subscription.lost == 0
     for i in range(1, 11):
         publisher.publish(message(i))
     release.set()
     wait_for(lambda: len(received) == 4, "what was kept")
     assert received == [message(i) for i in (0, 8, 9, 10)]
     assert ends[0].counters == {"samples_lost:/a": 7}
+    assert subscription.lost == 7
 
 
 def test_late_joiner_gets_as_much_as_the_publisher_keeps(ends: Ends) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,9 +24,11 @@ from std_msgs.msg import Header, String
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.rclpy import RclpyMiddleware, message_class
+from tests.domains import domain
+from tests.waiting import wait_for
 
 STRING = "std_msgs/msg/String"
-DOMAIN = 101 + os.getpid() % 60
+DOMAIN, ELSEWHERE = domain(4), domain(5)
 RELIABLE = Qos("reliable", "volatile")
 BEST_EFFORT = Qos("best_effort", "volatile")
 LATCHED = Qos("reliable", "transient_local")
@@ -41,13 +42,6 @@ def text(message: str) -> bytes:
 
 def unpadded(payload: bytes) -> bytes:
     return payload.rstrip(b"\0")
-
-
-def wait_for(condition: Callable[[], Any], what: str = "") -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain {what}"
-        time.sleep(0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -231,6 +225,15 @@ def test_unbounded_depth_loses_nothing(start: Start) -> None:
     wait_for(lambda: len(received) == 200)
 
 
+def test_what_the_rmw_says_it_lost_is_counted(start: Start) -> None:
+    """The event as rclpy gives it: a loss cannot be had at will."""
+    here = start()
+    subscription = here.subscribe("/x", STRING, RELIABLE, print)
+    subscription._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    subscription._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    assert subscription.lost == here.counters["samples_lost:/x"] == 5
+
+
 def test_type_that_cannot_be_imported_names_type_and_remedy(start: Start) -> None:
     one = start()
     for use in (lambda: one.subscribe("/x", "no_such_msgs/msg/Nothing", Qos(), print),
@@ -270,7 +273,7 @@ def test_host_application_keeps_its_signals_and_context(start: Start) -> None:
 
 def test_node_is_listed_on_its_domain_only(start: Start, host: rclpy.node.Node) -> None:
     start(node_name="here", namespace="/robot_1")
-    start(node_name="elsewhere", domain_id=DOMAIN + 1)
+    start(node_name="elsewhere", domain_id=ELSEWHERE)
     wait_for(lambda: ("here", "/robot_1") in host.get_node_names_and_namespaces())
     assert "elsewhere" not in host.get_node_names()
 

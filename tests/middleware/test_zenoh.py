@@ -22,7 +22,9 @@ from gr_ros2.middleware.zenoh_graph import (
     tokens_of,
     topic_key,
 )
-from tests.middleware.support import ADAPT, CUSTOM, LATCHED, RELIABLE, STRING, domain, message, wait_for
+from tests.domains import domain
+from tests.middleware.support import ADAPT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TALKER = (
@@ -124,7 +126,7 @@ def test_a_bare_peer_is_heard(ours: ZenohMiddleware, theirs: Any) -> None:
         publisher.put(message(number), attachment=attachment(number, 1, bytes(16)))
     wait_for(lambda: len(heard) == 3, "three messages")
     assert heard == [message(number) for number in (1, 2, 5)]
-    assert ours.counters["samples_lost:/chatter"] == 2
+    assert ours.counters["samples_lost:/chatter"] == subscription.lost == 2
     (info,) = ours.discover()
     assert (info.topic, info.type_name, info.publishers) == ("/chatter", STRING, (other.qos,))
     token.undeclare()

@@ -14,8 +14,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
-from tests.middleware.support import wait_for
 from tests.radio.robots import RATE, Robot, config
+from tests.waiting import wait_for
 
 
 def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gr_ros2.link.events import Accepted, Delivered, Received, Refused, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Missed, Received, Refused, SentEntry, SentPacket
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result, write_result
@@ -82,9 +82,11 @@ def recorded() -> Recorder:
     return recorder
 
 
-def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = True) -> Run:
-    """The run, written into a folder."""
+def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = True, missed: int = 0) -> Run:
+    """The run, written into a folder; before, the ROS graph lost ``missed`` odometry messages besides."""
     recorder = recorded()
+    if missed:
+        recorder.sender_event(1, Missed(0, missed))
     topics = recorder.finish(DURATION_S, T0 + DURATION_S)
     result = Result(
         scenario=scenario,

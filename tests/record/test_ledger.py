@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from array import array
+from collections import Counter
 from math import isnan
 
 import pytest
@@ -14,7 +15,7 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions
 from gr_ros2.errors import CrcError, PadError, RunError
 from gr_ros2.link import Receiver, Sender
-from gr_ros2.link.events import Accepted, Delivered, Lost, Refused, Rejected, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Lost, Missed, Refused, Rejected, SenderEvent, SentEntry, SentPacket
 from gr_ros2.record.ledger import REORDER_WINDOW, Ledger, TopicLedger
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire.v0 import Packet
@@ -69,6 +70,15 @@ def test_refusals_before_and_after_queueing() -> None:
     book = only(ledger.finish())
     assert (book.sent, book.rows) == (3, {"too_large": 1, "queue_bound": 1, "in_flight": 1})
     assert isnan(book.t_sent[0])
+
+
+def test_what_the_sources_graph_lost_is_sent_and_has_a_row() -> None:
+    ledger = feed(Missed(0, 2), accepted(0), Missed(0, 3), Refused(1, 0, "too_large"))
+    assert ledger.totals() == (7, 0)
+    assert ledger.rows() == {(SRC, 0): {"lost_on_graph": 5, "too_large": 1, "in_flight": 1}}
+    book = only(ledger.finish())
+    assert (book.sent, book.rows) == (7, {"lost_on_graph": 5, "too_large": 1, "in_flight": 1})
+    assert list(book.serial) == [0, 1]
 
 
 def test_what_lies_behind_the_last_packet_received_is_in_flight() -> None:
@@ -235,6 +245,7 @@ _EVENTS = st.lists(
         st.tuples(
             st.sampled_from(["accept", "refuse", "deliver", "lose"]), st.integers(0, 2), st.integers(0, 3), _NONE
         ),
+        st.tuples(st.just("miss"), st.integers(0, 2), st.integers(1, 3), _NONE),
         st.tuples(st.sampled_from(["drop", "arrive", "noise"]), st.integers(0, 20), st.just(0), _NONE),
         st.tuples(st.sampled_from(["send", "repeat"]), st.just(0), st.integers(0, 3), _SERIALS),
     ),
@@ -251,6 +262,7 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
     gone: set[int] = set()  # serials that were refused or have started, and so cannot be dropped
     refused: set[int] = set()
     packets: list[bytes] = []
+    missed: Counter[int] = Counter()
     for now, (kind, first, second, many) in enumerate(events):
         if kind == "accept":
             ledger.sender_event(SRC, Accepted(len(topics), first, b"payload %d" % second, now))
@@ -260,6 +272,9 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
             refused.add(len(topics))
             ledger.sender_event(SRC, Refused(len(topics), first, "too_large"))
             topics.append(first)
+        elif kind == "miss":
+            missed[first] += second
+            ledger.sender_event(SRC, Missed(first, second))
         elif kind == "drop" and first < len(topics) and first not in gone:
             gone.add(first)
             refused.add(first)
@@ -279,8 +294,10 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
         elif kind == "lose":
             ledger.receiver_event(Lost(SRC, first, "expired", second), now)
     books = {book.topic_id: book for book in ledger.finish(drained)}
-    for topic_id in set(topics):
-        assert books[topic_id].sent == topics.count(topic_id) == books[topic_id].rows.total()
+    for topic_id in {*topics, *missed}:
+        assert books[topic_id].sent == topics.count(topic_id) + missed[topic_id] == books[topic_id].rows.total()
+        assert books[topic_id].rows["lost_on_graph"] == missed[topic_id]
+        assert len(books[topic_id].serial) == topics.count(topic_id)
     assert all(book.rows["delivered"] == sum(not isnan(t) for t in book.t_delivered) for book in books.values())
     assert ledger.unresolved() == 0
 

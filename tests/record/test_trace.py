@@ -142,7 +142,7 @@ def test_a_folder_with_an_equals_sign_adds_no_column(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="cannot be made"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         write_trace(empty_trace(), tmp_path / "file")
 
 

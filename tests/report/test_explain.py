@@ -30,6 +30,14 @@ def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
     assert trend.endswith("it stayed the same.")
 
 
+def test_what_the_sources_graph_lost_is_told(tmp_path: Path) -> None:
+    run = make_run(tmp_path, missed=51)
+    assert explanation(run.result, run.trace)[0].startswith("Of 100 messages sent: 33 (33%) delivered, ")
+    assert (
+        "51 (51%) lost by the ROS graph of the source before the link had them" in explanation(run.result, run.trace)[0]
+    )
+
+
 def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5})

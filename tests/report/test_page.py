@@ -72,6 +72,7 @@ def _goodput(directory: Path) -> str:
     return f"{read_runs([directory])[0].result.topics[0].goodput_Bps:.1f}"
 
 
+@pytest.mark.slow
 def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     before = write_report([run], tmp_path / "a")
@@ -81,6 +82,7 @@ def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
             assert one.read_bytes() == other.read_bytes(), one.name
 
 
+@pytest.mark.slow
 def test_several_runs_share_a_report(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "paper-ofdm")
     make_run(tmp_path / "b", "paper-direct", paced=False)
@@ -96,6 +98,7 @@ def test_several_runs_share_a_report(tmp_path: Path) -> None:
     assert pa_csv.read_csv(tmp_path / "out" / "summary.csv").column_names == table.column_names
 
 
+@pytest.mark.slow
 def test_runs_of_one_scenario_are_called_after_their_folders(tmp_path: Path) -> None:
     paths = [tmp_path / "x" / "one", tmp_path / "x" / "two", tmp_path / "y" / "one"]
     for path in paths:
@@ -122,6 +125,14 @@ def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a" / "result.json").write_text(text.replace("/robot_1/odom", "/robot_2/odom"))
     with pytest.raises(ConfigError, match=r"messages.parquet: /robot_2/odom has 0 messages, .* says 40 and 25"):
         read_runs([tmp_path / "a"])
+
+
+def test_what_the_sources_graph_lost_is_in_every_part(tmp_path: Path) -> None:
+    make_run(tmp_path, missed=51)
+    page, *_ = write_report(read_runs([tmp_path]), tmp_path)
+    assert "lost by the ROS graph of the source" in page.read_text()
+    summary = pa_csv.read_csv(tmp_path / "summary.csv").to_pylist()[0]
+    assert (summary["sent"], summary["ledger_lost_on_graph"]) == (ODOM + 51, 51)
 
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:

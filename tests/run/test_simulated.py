@@ -53,6 +53,7 @@ def numbers(result: Result) -> Any:
     return json.loads(TypeAdapter(Result).dump_json(replace(result, wall_s=None)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", BOTH)
 def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     time: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -77,6 +78,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     assert numbers(run("paper-ofdm-paced", time, *NOISY, seed=1).result)["topics"] != first["topics"]
 
 
+@pytest.mark.slow
 def test_without_noise_real_time_samples_and_packets_agree() -> None:
     patient = "ros_source.queue_depth=100"  # a busy computer may hold up real time, which must not lose messages
     real = run_scenario(scenario("paper-ofdm-paced", patient, duration_s=3.0)).result
@@ -92,6 +94,7 @@ def test_without_noise_real_time_samples_and_packets_agree() -> None:
     assert simulated.p50 < there.p50 < simulated.p50 + 1
 
 
+@pytest.mark.slow
 def test_in_noise_packets_lose_what_samples_lose(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(losstable, "PACKETS", 2000)
     monkeypatch.setattr(losstable, "BUILTIN_DIR", Path("none"))
@@ -164,6 +167,13 @@ def test_what_is_delivered_is_kept_with_both_times(tmp_path: Path) -> None:
     assert stamps == [1_000_000_000_000 + round(t * 1e9) for t in odom.t_delivered.tolist()]
     with pytest.raises(ConfigError, match="holds a run already"):
         run_scenario(load_scenario("paper-ofdm-paced", settings), tmp_path / "out")
+
+
+def test_what_is_delivered_is_kept_under_the_name_the_sinks_options_give_it(tmp_path: Path) -> None:
+    settings = ["time=packets", "ros_sink.topic_options={odom: {publish_as: '/fleet/r{src_id}/pose'}}"]
+    outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=1.0), tmp_path / "out")
+    assert [info.topic for info in bag_topics(tmp_path / "out" / DELIVERED_BAG)] == ["/fleet/r1/pose"]
+    assert list(outcome.result.counters["listener"]) == ["/fleet/r1/pose"]
 
 
 class Onlooker:

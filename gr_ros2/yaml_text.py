@@ -1,0 +1,46 @@
+"""YAML as this program reads it: plain values, and every key once.
+
+Law: whatever YAML comes in, from a file or the command line, is read here. A key that stands twice in one mapping is an
+error: YAML 1.2 (section 3.2.1.3) forbids it, and PyYAML would take the last without a word.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.yaml_bounds import check_bounds
+
+
+class _Loader(yaml.SafeLoader):
+    """Sees keys as they are written: what ``<<`` merges in, and the mapping overrides, is no duplicate."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        first: dict[tuple[str, str], Any] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                before = first.setdefault((key.tag, key.value), key)
+                if before is not key:
+                    lines = f"line {before.start_mark.line + 1} and line {key.start_mark.line + 1}"
+                    raise ConfigError(f"key {key.value!r} stands twice, in {lines}; keep one")
+        return node
+
+
+def parse_yaml(text: str, where: str, what: str = "") -> Any:
+    """The value of a YAML text.
+
+    :param where: what errors begin with, for instance the file name
+    :param what: of which errors speak, where that is not the whole of ``where``
+    :raises ConfigError: when it is no YAML, is past what :mod:`gr_ros2.yaml_bounds` allows,
+        or has a key twice; names the key and its lines
+    """
+    try:
+        check_bounds(text)
+        return yaml.load(text, _Loader)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where}: {what}no YAML ({' '.join(str(error).split())})") from error
