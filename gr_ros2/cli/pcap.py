@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import click
 
 from gr_ros2.errors import ConfigError, RunError
-from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 
 if TYPE_CHECKING:
     from gr_ros2.record.result import Result
@@ -86,12 +86,10 @@ class PacketCapture:
         if isinstance(event, SentPacket):
             self._write(_SENT, event.data, event.now)
 
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Write a packet that arrived; see above."""
-        self._write(_RECEIVED, data, now)
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What became of packets is not in a capture."""
+        """Write a packet that arrived, whatever it is; see above."""
+        if isinstance(event, Received | Rejected):
+            self._write(_RECEIVED, event.data, now)
 
     def close(self) -> None:
         """Idempotent. A write that hangs, as into a pipe nobody reads, is left behind."""

@@ -93,10 +93,6 @@ class Desk:
         if self._state is not None:
             self._state.sender_event(src_id, event)
 
-    def packet_received(self, data: bytes, now: float) -> None:
-        if self._state is not None:
-            self._state.packet_received(data, now)
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         if self._state is not None:
             self._state.receiver_event(event, now)

@@ -6,18 +6,18 @@ Law: whatever the bytes, there is a view of them; what is no packet says why.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 
 from gr_ros2.dashboard.views import PacketView, SpanView
+from gr_ros2.link.events import Received, Rejected
 from gr_ros2.registry import Registry
-from gr_ros2.wire import QOS_NAMES, Packet, Span, WireError, decode, format_of
+from gr_ros2.wire import QOS_NAMES, Span, format_of
 
 NO_COLOUR = -1
 """Of a topic that is not ours."""
 
 
 def packet_views(
-    packets: Iterable[tuple[float, bytes]],
+    events: Iterable[tuple[float, Received | Rejected]],
     packet_len: int,
     registry: Registry,
     colours: Mapping[tuple[int, int], int],
@@ -25,17 +25,16 @@ def packet_views(
 ) -> tuple[PacketView, ...]:
     """Packets as they came, each with how many of its source went missing since the one before.
 
-    :param packets: time, s, and bytes
+    :param events: time, s, and the packet
     :param colours: place in the palette by source id and topic id
     :param start: s on the same clock, when the run began
     """
     views, last_seq = [], dict[int, int]()
-    for t, data in packets:
-        try:
-            packet = _decode(data, packet_len)
-        except WireError as error:
-            views.append(PacketView(t - start, len(data), refused=f"{error.kind}: {error}"))
+    for t, event in events:
+        if isinstance(event, Rejected):
+            views.append(PacketView(t - start, len(event.data), refused=f"{event.error.kind}: {event.error}"))
             continue
+        packet = event.packet
         wire = format_of(packet.version)
         before = last_seq.get(packet.src_id)
         missing = 0 if before is None else (packet.seq - before - 1) % (1 << wire.number_bits)
@@ -43,7 +42,7 @@ def packet_views(
         views.append(
             PacketView(
                 t - start,
-                len(data),
+                len(event.data),
                 version=packet.version,
                 qos=QOS_NAMES[packet.qos],
                 compressed=packet.compressed,
@@ -71,8 +70,3 @@ def _span(span: Span, src_id: int, registry: Registry, colours: Mapping[tuple[in
     name = registry[entry.topic_id].name if entry.topic_id < len(registry) else f"topic {entry.topic_id}"
     text = f"{name} {entry.label} {len(entry.payload)} B"
     return SpanView(span.kind, span.size, text, colours.get((src_id, entry.topic_id), NO_COLOUR))
-
-
-@lru_cache(maxsize=64)
-def _decode(data: bytes, packet_len: int) -> Packet:
-    return decode(data, packet_len)

@@ -7,12 +7,10 @@ Counts are exact while it runs; once the result is in, every number is the resul
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from hashlib import blake2b
 from math import nan
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -20,18 +18,19 @@ from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
 from gr_ros2.link.events import (
-    LOST_ON_GRAPH,
     Accepted,
     Delivered,
     Lost,
     Missed,
+    Received,
     ReceiverEvent,
     Refused,
     Rejected,
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT
+from gr_ros2.link.outcome import Row
+from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import Result, TopicResult
@@ -51,7 +50,6 @@ UNDER_WAY = 4096
 PACKETS_SHOWN = 12
 
 _PATH_STEP_S = 0.1
-_DIGEST_SIZE = 16
 
 
 class _Topic:
@@ -72,24 +70,18 @@ class _Topic:
 
     def rows(self) -> dict[str, int]:
         """What the events alone say: who sees both ends asks the ledger instead."""
-        rows = {row: count for row, count in {DELIVERED: self.delivered, **self.ended}.items() if count}
+        rows = {row: count for row, count in {Row.DELIVERED.value: self.delivered, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
-        return {**rows, IN_FLIGHT: rest} if rest > 0 else rows
+        return {**rows, Row.IN_FLIGHT.value: rest} if rest > 0 else rows
 
 
 class _Source:
-    """Messages of one sender on their way, so that a delivery finds its submission."""
+    """One sender."""
 
     def __init__(self) -> None:
         self.last_serial = -1
-        self.open: OrderedDict[int, tuple[int, float, bytes]] = OrderedDict()
-        """Serial -> topic id, time of submission, digest; until the first fragment leaves."""
-        self.away: OrderedDict[tuple[int, int, bytes], float] = OrderedDict()
-        """Topic id, entry id, digest -> time of submission."""
-        self.left_as: OrderedDict[int, tuple[int, int, bytes]] = OrderedDict()
-        """Serial -> key in ``away``."""
-        self.repeats: OrderedDict[Key, int] = OrderedDict()
-        """Topic id and entry id whose latest use was a repeat -> serial of the message repeated."""
+        self.messages: Tracker[Tracked] = Tracker(UNDER_WAY)
+        """On their way, so that a delivery finds its submission."""
 
 
 class DashboardState:
@@ -126,7 +118,7 @@ class DashboardState:
         self._start: float | None = None
         self._sources: dict[int, _Source] = {}
         self._topics: dict[Key, _Topic] = {}
-        self._received: deque[tuple[float, bytes]] = deque(maxlen=PACKETS_SHOWN + 1)
+        self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
         self._packets_sent, self._packets_received = Rate(RATE_S), Rate(RATE_S)
         self._phase = "waiting"
@@ -143,23 +135,16 @@ class DashboardState:
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
                 self._packets_sent.add(event.now)
-                self._left(source, event)
+                for entry in event.entries:
+                    source.messages.left(entry)
             elif isinstance(event, Accepted):
                 self._accepted(source, src_id, event)
             elif isinstance(event, Missed):
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
-                topic.ended[LOST_ON_GRAPH] += event.count
+                topic.ended[Row.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Bytes the PHY handed to the sink, whatever they are."""
-        with self._lock:
-            self._begin(now)
-            self._packets["handed_up"] += 1
-            self._packets_received.add(now)
-            self._received.append((now, data))
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports."""
@@ -168,11 +153,16 @@ class DashboardState:
                 self._delivered(event, now)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
-                if source is None or (event.topic_id, event.entry_id) not in source.repeats:
-                    self._topic((event.src_id, event.topic_id)).ended[event.reason] += 1
-            elif isinstance(event, Rejected):
-                self._packets[f"rejected_{event.error.kind}"] += 1
-                self._packets["rejected"] += 1
+                if source is None or not source.messages.repeats(event):
+                    self._topic((event.src_id, event.topic_id)).ended[str(event.reason)] += 1
+            else:
+                self._begin(now)
+                self._packets["handed_up"] += 1
+                self._packets_received.add(now)
+                self._received.append((now, event))
+                if isinstance(event, Rejected):
+                    self._packets[f"rejected_{event.error.kind}"] += 1
+                    self._packets["rejected"] += 1
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
         """It is over; without a result where a run failed, and where there was one end of a link only."""
@@ -253,7 +243,7 @@ class DashboardState:
         # What the ledger knows wins: it has heard every event, also those from before there was a state.
         rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
         sent, delivered = (
-            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(DELIVERED, 0))
+            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(Row.DELIVERED, 0))
         )
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
@@ -330,8 +320,7 @@ class DashboardState:
         topic.sent += 1
         source.last_serial = event.serial
         topic.sent_rate.add(event.now, len(event.payload))
-        source.open[event.serial] = (event.topic_id, event.now, _digest(event.payload))
-        _bound(source.open)
+        source.messages.add(Tracked.of(event))
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:
@@ -339,46 +328,31 @@ class DashboardState:
 
     def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
         topic = self._topic((src_id, event.topic_id))
-        topic.ended[event.reason] += 1
-        source.open.pop(event.serial, None)
+        topic.ended[str(event.reason)] += 1
+        message = source.messages.get(event.serial)
+        if message is not None:
+            source.messages.close(message)
         if event.serial > source.last_serial:  # refused before it was queued
             source.last_serial = event.serial
             topic.sent += 1
 
-    def _left(self, source: _Source, event: SentPacket) -> None:
-        for entry in event.entries:
-            if entry.repeat:
-                source.repeats[entry.topic_id, entry.entry_id] = entry.serial
-                _bound(source.repeats)
-                continue
-            message = source.open.pop(entry.serial, None)
-            if message is not None:  # its first fragment
-                topic_id, t_sent, digest = message
-                source.repeats.pop((topic_id, entry.entry_id), None)
-                source.left_as[entry.serial] = (topic_id, entry.entry_id, digest)
-                source.away[topic_id, entry.entry_id, digest] = t_sent
-                _bound(source.left_as)
-                _bound(source.away)
-
     def _delivered(self, event: Delivered, now: float) -> None:
         key = (event.src_id, event.topic_id)
         source = self._sources.get(event.src_id)
-        t_sent = None
+        message = None
         if source is not None:
-            digest = _digest(event.payload)
-            t_sent = source.away.pop((event.topic_id, event.entry_id, digest), None)
-            repeated = source.repeats.get((event.topic_id, event.entry_id))
-            if t_sent is None and repeated is not None:
-                t_sent = source.away.pop(source.left_as.get(repeated, (-1, -1, b"")), None)
-                if t_sent is None:
-                    return
+            message = source.messages.find(event)
+            if message is not None:
+                source.messages.close(message)
+            elif source.messages.repeats(event):
+                return
         topic = self._topic(key)
         topic.delivered += 1
         topic.delivered_bytes += len(event.payload)
         topic.delivered_rate.add(now, len(event.payload))
-        if t_sent is not None:
-            topic.latencies.append(now - t_sent)
-            topic.age.delivered(t_sent, now)
+        if message is not None:
+            topic.latencies.append(now - message.t_sent)
+            topic.age.delivered(message.t_sent, now)
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:
@@ -415,12 +389,3 @@ def _final_view(place: int, key: Key, final: TopicResult) -> TopicView:
         path_error_m=final.path_error_m,
         rms_error_m=final.rms_error_m,
     )
-
-
-def _digest(payload: bytes) -> bytes:
-    return blake2b(payload, digest_size=_DIGEST_SIZE).digest()
-
-
-def _bound(index: OrderedDict[Any, Any]) -> None:
-    while len(index) > UNDER_WAY:
-        index.popitem(last=False)

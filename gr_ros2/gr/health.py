@@ -14,8 +14,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from gr_ros2.config import DiagnosticsConfig
-from gr_ros2.link.events import LOST_ON_GRAPH
-from gr_ros2.link.receiver import PUBLISH_FAILED
+from gr_ros2.link.outcome import Row
 
 Stats = Mapping[str, Any]
 
@@ -182,7 +181,7 @@ def _look(stats: Stats, now: float) -> _Look:
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
     front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
-    lost_on_graph = sum(topic[LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    lost_on_graph = sum(topic[Row.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
         sent=stats["packets"]["out"],
@@ -190,7 +189,7 @@ def _look(stats: Stats, now: float) -> _Look:
         missing=sink["packet_loss_est"],
         rejected=rejected,
         lost_on_graph=lost_on_graph,
-        unpublished=sink[PUBLISH_FAILED],
+        unpublished=sink[Row.PUBLISH_FAILED],
         topics=topics,
         front_end=front_end,
     )

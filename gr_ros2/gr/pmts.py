@@ -11,6 +11,7 @@ from typing import Any
 import pmt
 
 from gr_ros2.phy.pdus import octets, u8vector
+from gr_ros2.wire import Packet
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
 _CACHED_HEADERS = 4096
@@ -20,15 +21,15 @@ class PduMaker:
     """Makes PDUs of packets; remembers the metadata that repeats."""
 
     def __init__(self) -> None:
-        self._metadata: dict[bytes, Any] = {}
+        self._metadata: dict[tuple[int, ...], Any] = {}
 
-    def pdu(self, data: bytes, wall: float) -> Any:
+    def pdu(self, packet: Packet, data: bytes, wall: float) -> Any:
         """One packet as a PDU.
 
-        :param data: the packet, header first
+        :param data: its bytes
         :param wall: s since 1970, for ``t_src_wall``
         """
-        header = data[:4]
+        header = (packet.src_id, packet.dst_id, packet.seq, packet.qos)
         metadata = self._metadata.get(header)
         if metadata is None:
             if len(self._metadata) >= _CACHED_HEADERS:
@@ -48,8 +49,8 @@ def packet_of(pdu: Any) -> tuple[bytes, str]:
     return octets(vector), ""
 
 
-def _header_metadata(header: bytes) -> Any:
+def _header_metadata(header: tuple[int, ...]) -> Any:
     metadata = pmt.make_dict()
-    for key, value in zip((_SRC, _DST, _SEQ, _QOS), (*header[1:4], header[0] >> 2 & 3), strict=True):
+    for key, value in zip((_SRC, _DST, _SEQ, _QOS), header, strict=True):
         metadata = pmt.dict_add(metadata, key, pmt.from_long(value))
     return metadata

@@ -9,13 +9,16 @@ from __future__ import annotations
 import logging
 import sys
 
-from gr_ros2.errors import WireError
+from gr_ros2.link import Received, Rejected, SentPacket
 from gr_ros2.registry import Registry
-from gr_ros2.wire import QOS_NAMES, Packet, decode
+from gr_ros2.wire import QOS_NAMES
 
 
-def describe(packet: Packet, registry: Registry) -> str:
-    """Header fields, then each entry as topic#entry_id[index/total] and its size."""
+def describe(event: SentPacket | Received | Rejected, registry: Registry) -> str:
+    """Header fields, then each entry as topic#entry_id[index/total] and its size; or why it is no packet."""
+    if isinstance(event, Rejected):
+        return f"refused ({event.error.kind}): {event.error}"
+    packet = event.packet
     entries = " ".join(
         f"{_topic(entry.topic_id, registry)}{entry.label}={len(entry.payload)}B" for entry in packet.entries
     )
@@ -24,14 +27,6 @@ def describe(packet: Packet, registry: Registry) -> str:
         f"v{packet.version} qos={QOS_NAMES[packet.qos]} flags={flags or '-'} src={packet.src_id} dst={packet.dst_id} "
         f"seq={packet.seq} hop={packet.hop} entries={len(packet.entries)}: {entries}"
     )
-
-
-def describe_bytes(data: bytes, packet_len: int, registry: Registry) -> str:
-    """The same from bytes; what is no packet is said to be none."""
-    try:
-        return describe(decode(data, packet_len), registry)
-    except WireError as error:
-        return f"refused ({error.kind}): {error}"
 
 
 def debug_logger(name: str, debug: bool) -> logging.Logger:

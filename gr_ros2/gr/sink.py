@@ -23,10 +23,11 @@ from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, set
 from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
-from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
-from gr_ros2.link import Delivered, Receiver, ReceiverEvent
-from gr_ros2.link.receiver import PUBLISH_FAILED
+from gr_ros2.link import Delivered, Received, Receiver, ReceiverEvent, Rejected
+from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
@@ -36,7 +37,7 @@ _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
-    *("not_a_pair", "not_u8", PUBLISH_FAILED, "handler_failed"),
+    *("not_a_pair", "not_u8", Row.PUBLISH_FAILED.value, "handler_failed"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -50,9 +51,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     :param registry: CSV path or Registry, the same as at the source
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
-    :param observer: called with every ReceiverEvent, in order; with Delivered after it was published
-    :param packet_observer: called with the bytes of every PDU before they are read; when one of the two raises, neither
-        is told anything more
+    :param observer: hears every ReceiverEvent, in order, and Delivered after it was published; when it raises, it is
+        told nothing more
     :param clock: s, monotonic
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
     :raises ConfigError: naming key, value and what is allowed
@@ -63,8 +63,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         registry: str | Registry = "",
         *,
         middleware: str | Middleware | None = None,
-        observer: Callable[[ReceiverEvent], None] | None = None,
-        packet_observer: Callable[[bytes], None] | None = None,
+        observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         **values: Any,
     ) -> None:
@@ -75,7 +74,6 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._receiver = Receiver(rows, self.config, codec=message_codec(self.config, rows))
         self.registry = self._receiver.registry
         self._observer = observer
-        self._packet_observer = packet_observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
@@ -241,10 +239,6 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if first:
                 self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
             return
-        if self._packet_observer is not None:
-            self._guard(self._packet_observer, data)
-        if self.config.debug:
-            self._log.debug("rx %s", describe_bytes(data, self.config.packet_len, self.registry))
         with self._lock:
             events = self._receiver.receive(data, self._clock())
             if self._timer_idle and self._receiver.next_timeout() is not None:
@@ -255,9 +249,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         """Do what each event asks for, then tell the observer."""
         for event in events:
             try:
+                if self.config.debug and isinstance(event, Received | Rejected):
+                    self._log.debug("rx %s", describe(event, self.registry))
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
-                    self._guard(self._observer, result)
+                    self._guard(self._observer.receiver_event, result, self._clock())
             except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
                 self._failed(error)
 
@@ -269,7 +265,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             publisher = self._publishers.get(key) or self._advertise(key)
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
-            self._tell_first(PUBLISH_FAILED, f"a message of {self._name(key)} was not published", error)
+            self._tell_first(Row.PUBLISH_FAILED.value, f"a message of {self._name(key)} was not published", error)
             with self._lock:
                 return self._receiver.unpublished(event)
         with self._lock:

@@ -24,10 +24,11 @@ from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
 from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
-from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
-from gr_ros2.link import Refused, Sender, SenderEvent
-from gr_ros2.link.events import LOST_ON_GRAPH
+from gr_ros2.link import Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
@@ -65,7 +66,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         registry: str | Registry = "",
         *,
         middleware: str | Middleware | None = None,
-        observer: Callable[[SenderEvent], None] | None = None,
+        observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
         **values: Any,
@@ -80,6 +81,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._guard = Guard(f"observer of ros2_source {self._sender.src_id}")
         self._clock = clock
         self._pdus = PduMaker()
+        self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
         self._lock = threading.Lock()
         self._work = threading.Condition(self._lock)
@@ -185,7 +187,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 name: {
                     "topic_id": topic.topic_id,
                     "submitted": stats.submitted[topic.topic_id],
-                    LOST_ON_GRAPH: stats.missed[topic.topic_id],
+                    Row.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
                     "queue": self._sender.queue(topic.topic_id)[0],
@@ -312,15 +314,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 if first:
                     self._log.exception("ros2_source %d: %s", self.src_id, error)
 
-    def _compose(self) -> list[bytes]:
+    def _compose(self) -> list[SentPacket]:
         """The packets that may go now; if there are none, nothing, after waiting for a reason to look again."""
-        packets: list[bytes] = []
         with self._lock:
+            packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                data = self._sender.next_packet(self._clock())
-                if data is None:
+                if self._sender.next_packet(self._clock()) is None:
                     break
-                packets.append(data)
             if packets:
                 self._room.notify_all()
             elif self._running:
@@ -328,22 +328,24 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
         return packets
 
-    def _emit(self, packets: list[bytes]) -> None:
+    def _emit(self, packets: list[SentPacket]) -> None:
         wall = time.time()
-        for data in packets:
+        for sent in packets:
             if self.config.debug:
-                self._log.debug("tx %s", describe_bytes(data, self.config.packet_len, self.registry))
-            self._publish(PDUS, self._pdus.pdu(data, wall))
+                self._log.debug("tx %s", describe(sent, self.registry))
+            self._publish(PDUS, self._pdus.pdu(sent.packet, sent.data, wall))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)
 
     def _observe(self, event: SenderEvent) -> None:
-        if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
+        if isinstance(event, SentPacket):
+            self._composed.append(event)
+        elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            level = logging.INFO if event.reason == "superseded" else logging.WARNING  # what `latest` is for
+            level = logging.INFO if event.reason == Row.SUPERSEDED else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
-            self._guard(self._observer, event)
+            self._guard(self._observer.sender_event, self.src_id, event)

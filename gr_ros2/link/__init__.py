@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
     Lost,
     Missed,
+    Received,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -22,8 +24,11 @@ __all__ = [
     "SCHEDULER",
     "Accepted",
     "Delivered",
+    "Endpoint",
+    "EndpointV0",
     "Lost",
     "Missed",
+    "Received",
     "Receiver",
     "ReceiverEvent",
     "ReceiverStats",

@@ -1,46 +1,61 @@
-"""What the engines tell their shells: values only, no behaviour."""
+"""What the engines tell their shells: values only, no behaviour.
+
+A message is named by its source, its topic and a ``key``: a hashable value that the engine makes and only compares. A
+key may come round, but never while the message that had it before can still arrive.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from gr_ros2.errors import WireError
+from gr_ros2.wire import Packet
 
 
 @dataclass(frozen=True, slots=True)
-class Delivered:
-    """A message is complete. ``qos`` is the class of the packet that completed it; ``entry_id`` names it on the air."""
+class Received:
+    """A packet came in: its bytes and what they say. What it completes or ends is told behind it."""
 
-    src_id: int
-    topic_id: int
-    payload: bytes
-    qos: int
-    entry_id: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """A message of which at least one fragment came will never be complete.
-
-    ``reason`` is a ledger row: ``lost_fragments`` (overtaken, contradicted, or behind an outage), ``expired``
-    (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E); or it is complete and
-    its codec says ``unknown_dictionary`` or ``damaged``, or it could not be published (``publish_failed``).
-    """
-
-    src_id: int
-    topic_id: int
-    reason: str
-    entry_id: int = 0
+    data: bytes
+    packet: Packet
 
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
     """Bytes from the PHY that are no packet of ours."""
 
+    data: bytes
     error: WireError
 
 
-ReceiverEvent = Delivered | Lost | Rejected
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """A message is complete. ``qos`` is the class of the packet that completed it."""
+
+    src_id: int
+    topic_id: int
+    payload: bytes
+    qos: int
+    key: Hashable = None
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A message of which at least one fragment came will never be complete.
+
+    ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
+    outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
+    or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
+    """
+
+    src_id: int
+    topic_id: int
+    reason: str
+    key: Hashable = None
+
+
+ReceiverEvent = Received | Rejected | Delivered | Lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +77,7 @@ class Accepted:
 class Refused:
     """A submitted message will not be sent, or not to its end.
 
-    ``reason`` is a ledger row: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
+    ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
     a message whose first fragments have left, ``abandoned``.
     """
 
@@ -70,10 +85,6 @@ class Refused:
     topic_id: int
     reason: str
     detail: str = ""
-
-
-LOST_ON_GRAPH = "lost_on_graph"
-"""Ledger row of messages that were published for the link and lost by the ROS graph before the link had them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +100,15 @@ class Missed:
 
 @dataclass(frozen=True, slots=True)
 class SentEntry:
-    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial``.
+    """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
-    ``repeat`` says that the message has been sent before, and is sent again for robots that come late.
+    ``total`` fragments are all of it; 0 while a message is cut as it goes. ``repeat`` says that the message has been
+    sent before, and is sent again for robots that come late.
     """
 
     serial: int
     topic_id: int
-    entry_id: int
+    key: Hashable
     index: int
     total: int
     repeat: bool = False
@@ -104,9 +116,10 @@ class SentEntry:
 
 @dataclass(frozen=True, slots=True)
 class SentPacket:
-    """A packet that left the sender."""
+    """A packet that left the sender: its bytes, what they say, and of which messages its entries are, in order."""
 
     data: bytes
+    packet: Packet
     entries: tuple[SentEntry, ...]
     now: float
 

@@ -21,11 +21,8 @@ class LinkObserver(Protocol):
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """What the sender with this source id reports."""
 
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Bytes the PHY handed to the sink, before the sink reads them."""
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports; of a delivery once it is republished."""
+        """What the receiver reports, packets included; of a delivery once it is republished."""
 
 
 _Observer = TypeVar("_Observer", bound=LinkObserver)
@@ -51,10 +48,6 @@ class Observers(Generic[_Observer]):
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         for observer, guard in self._guarded:
             guard(observer.sender_event, src_id, event)
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        for observer, guard in self._guarded:
-            guard(observer.packet_received, data, now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         for observer, guard in self._guarded:

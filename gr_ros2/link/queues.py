@@ -15,6 +15,7 @@ from math import inf
 
 from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.outcome import Row
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +23,7 @@ class Dropped:
     """A message that will not be sent: its ledger row, and why in words."""
 
     message: Outgoing
-    row: str
+    row: Row
     detail: str
 
 
@@ -64,11 +65,11 @@ class TopicQueue(deque[Outgoing]):
         dropped: list[Dropped] = []
         if self.policy == "latest":
             while self and not self[-1].started:
-                dropped.append(Dropped(self.pop(), "superseded", "a newer message came before it could start"))
+                dropped.append(Dropped(self.pop(), Row.SUPERSEDED, "a newer message came before it could start"))
         elif depth and len(self) >= depth:
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
-                dropped.append(Dropped(victim, "queue_bound", f"{depth} messages were waiting"))
+                dropped.append(Dropped(victim, Row.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
         self.append(message)
         return dropped
@@ -110,13 +111,13 @@ class TopicQueue(deque[Outgoing]):
     def _expiry(self, message: Outgoing) -> float:
         return message.submitted + self.deadline_s if self.deadline_s else inf
 
-    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[str, str]:
+    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[Row, str]:
         limit = f"{self.deadline_s * 1e3:g} ms"
         if message.started:
-            return "abandoned", f"{message.remaining} bytes could not follow within {limit}"
+            return Row.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:
-            return "stale", f"it waited longer than {limit}"
-        return "cannot_complete", f"{needs * 1e3:.0f} ms on the air end after {limit}"
+            return Row.STALE, f"it waited longer than {limit}"
+        return Row.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
 def queue_for(

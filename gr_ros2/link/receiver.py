@@ -7,13 +7,14 @@ name; memory is bounded per source and in all; time is an argument and never goe
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, Rejected
+from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
+from gr_ros2.link.outcome import ROWS, Row
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
@@ -22,11 +23,6 @@ from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
 """A source silent for so long gives its place to a new one when ``max_sources`` are known."""
-
-PUBLISH_FAILED = "publish_failed"
-"""Ledger row of a message that arrived complete and did not come onto the ROS graph."""
-
-Observer = Callable[[ReceiverEvent], None]
 
 
 @dataclass(slots=True)
@@ -65,7 +61,6 @@ class Receiver:
     """Reassembles the messages of every source heard.
 
     :param registry: says which topic ids exist and which are transient-local
-    :param observer: called with every ReceiverEvent, in order
     :param codec: decodes messages from packets with C = 1, which without it are ``unsupported``
     """
 
@@ -74,13 +69,11 @@ class Receiver:
         registry: Registry,
         config: SinkConfig,
         *,
-        observer: Observer | None = None,
         codec: MessageCodec | None = None,
     ) -> None:
         self.config = config
         self.registry = registry.with_options(config.topic_options)
         self.stats = ReceiverStats()
-        self._observer = observer
         self._codec = codec
         self._sources: dict[int, _Source] = {}
         self._partials: OrderedDict[Partial, int] = OrderedDict()
@@ -94,11 +87,13 @@ class Receiver:
             packet = V0.decode(data, self.config.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
-            return self._report(events, [Rejected(error)])
+            events.append(Rejected(data, error))
+            return events
         self.stats.packets += 1
+        events.append(Received(data, packet))
         source = self._admit(packet, now)
         if source is not None:
-            self._report(events, self._take(source, packet, data, now))
+            events += self._take(source, packet, data, now)
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
@@ -108,7 +103,7 @@ class Receiver:
             if partial.last + self.config.reassembly_timeout > now:
                 break
             ended.append(partial)
-        return self._report([], [self._abandon(partial, "expired") for partial in ended])
+        return [self._abandon(partial, Row.EXPIRED) for partial in ended]
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
@@ -121,8 +116,8 @@ class Receiver:
         source = self._sources.get(event.src_id)
         if source is not None and source.latched.get(event.topic_id) == event.payload:
             del source.latched[event.topic_id]
-        self.stats.lost[event.src_id, event.topic_id, PUBLISH_FAILED] += 1
-        return Lost(event.src_id, event.topic_id, PUBLISH_FAILED, event.entry_id)
+        self.stats.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
         """Whether a sender has a place at present."""
@@ -170,7 +165,7 @@ class Receiver:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 ended = [partial for topic in source.topics.values() for partial in topic.reset()]
-                events += [self._forget(partial, packet.src_id, "lost_fragments") for partial in ended]
+                events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
@@ -183,7 +178,7 @@ class Receiver:
             missed = topic.missed_ids
             result, ended = topic.accept(entry, context)
             self.stats.message_loss_est += topic.missed_ids - missed
-            events += [self._forget(partial, packet.src_id, "lost_fragments") for partial in ended]
+            events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
             if isinstance(result, Partial):
                 grown = result.add(entry, now)
                 source.size += grown
@@ -203,12 +198,12 @@ class Receiver:
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
-            return [self._undone(packet, topic_id, entry_id, "unsupported")]
+            return [self._undone(packet, topic_id, entry_id, Row.UNSUPPORTED)]
         if packet.compressed and self._codec is not None:
             try:
                 payload = self._codec.decode(topic_id, payload)
             except CodecError as error:
-                return [self._undone(packet, topic_id, entry_id, error.row)]
+                return [self._undone(packet, topic_id, entry_id, ROWS[error.row])]
         if self.registry[topic_id].latched:
             if source.latched.get(topic_id) == payload:
                 self.stats.repeats += 1
@@ -217,9 +212,9 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: str) -> Lost:
+    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: Row) -> Lost:
         """Book a message that came whole, but cannot be read here."""
-        self.stats.lost[packet.src_id, topic_id, row] += 1
+        self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
     def _bound(self, source: _Source, src_id: int) -> list[ReceiverEvent]:
@@ -227,24 +222,24 @@ class Receiver:
         events: list[ReceiverEvent] = []
         while source.size > self.config.max_source_bytes:
             oldest = next(partial for partial, owner in self._partials.items() if owner == src_id)
-            events.append(self._abandon(oldest, "memory"))
+            events.append(self._abandon(oldest, Row.MEMORY))
         while self._size > self.config.max_bytes:
-            events.append(self._abandon(next(iter(self._partials)), "memory"))
+            events.append(self._abandon(next(iter(self._partials)), Row.MEMORY))
         return events
 
-    def _abandon(self, partial: Partial, reason: str) -> Lost:
+    def _abandon(self, partial: Partial, reason: Row) -> Lost:
         """Give up a message its topic still holds."""
         src_id = self._partials[partial]
         del self._sources[src_id].topics[partial.topic_id].partials[partial.entry_id]
         return self._forget(partial, src_id, reason)
 
-    def _forget(self, partial: Partial, src_id: int, reason: str) -> Lost:
+    def _forget(self, partial: Partial, src_id: int, reason: Row) -> Lost:
         """Book a message its topic no longer holds as lost."""
         source = self._sources[src_id]
         source.size -= partial.size
         self._size -= partial.size
         del self._partials[partial]
-        self.stats.lost[src_id, partial.topic_id, reason] += 1
+        self.stats.lost[src_id, partial.topic_id, reason.value] += 1
         self.stats.message_loss_est += 1
         return Lost(src_id, partial.topic_id, reason, partial.entry_id)
 
@@ -254,10 +249,3 @@ class Receiver:
         source.size -= partial.size
         self._size -= partial.size
         del source.topics[partial.topic_id].partials[partial.entry_id]
-
-    def _report(self, events: list[ReceiverEvent], more: Iterable[ReceiverEvent]) -> list[ReceiverEvent]:
-        for event in more:
-            events.append(event)
-            if self._observer is not None:
-                self._observer(event)
-        return events

@@ -21,6 +21,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.outcome import Row
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.registry import Registry, Topic
@@ -119,7 +120,7 @@ class Sender:
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
-            self._refuse(serial, topic_id, "too_large", self._too_large(len(payload)))
+            self._refuse(serial, topic_id, Row.TOO_LARGE, self._too_large(len(payload)))
             return
         topic = self.registry[topic_id]
         options = topic.options
@@ -339,7 +340,7 @@ class Sender:
         stats.packets += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
-        self._observe(SentPacket(data, tuple(record), now))
+        self._observe(SentPacket(data, packet, tuple(record), now))
         return data
 
     def _take_id(self, topic_id: int) -> int:
@@ -370,8 +371,8 @@ class Sender:
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
         return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
 
-    def _refuse(self, serial: int, topic_id: int, reason: str, detail: str) -> None:
-        self.stats.refused[topic_id, reason] += 1
+    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+        self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))
 
     def _observe(self, event: SenderEvent) -> None:

@@ -19,7 +19,7 @@ from gnuradio import gr
 from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, TopicOptions
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.pmts import packet_of
-from gr_ros2.link import SenderEvent
+from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.phy import PHY, Phy
@@ -126,7 +126,7 @@ class RosAir:
             source = RosSource(
                 registry,
                 middleware=graphs[0],
-                observer=self._observe,
+                observer=self,
                 seed=radio.seed,
                 robot_id=SOURCE_ID,
                 scheduler="freshness",
@@ -167,9 +167,13 @@ class RosAir:
     ) -> None:
         self.close()
 
-    def _observe(self, event: SenderEvent) -> None:
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
+        """Note a packet that leaves."""
         if isinstance(event, SentPacket):
             self._log.note(event.now, self._size, self._airtime)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """The sink is not observed."""
 
 
 class IpAir:

@@ -1,8 +1,8 @@
 """One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
 
-Laws: the two directions share nothing but the front end and the ROS graph, so that one cannot hold up the other;
-packets leave at the pace of the air, and are composed just before; a robot does not take its own packets, except from
-a front end that loops back; everything opened is given back by `stop`, also when opening failed half-way.
+Laws: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a robot
+does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`, also
+when opening failed half-way.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig
@@ -81,7 +80,7 @@ class RobotLink(Flowgraph):
         self.source = RosSource(
             self.registry,
             middleware=graphs[0],
-            observer=None if observer is None else partial(observer.sender_event, config.ros_source.src_id()),
+            observer=observer,
             clock=self._clock,
             **own_settings(config.ros_source),
         )
@@ -89,8 +88,7 @@ class RobotLink(Flowgraph):
         self.sink = RosSink(
             self.registry,
             middleware=graphs[1],
-            observer=None if observer is None else lambda event: observer.receiver_event(event, self._clock()),
-            packet_observer=None if observer is None else lambda data: observer.packet_received(data, self._clock()),
+            observer=observer,
             clock=self._clock,
             **own_settings(self._sink_config()),
         )

@@ -1,8 +1,7 @@
 """PHY and front end as one GNU Radio block: packets to the air and back.
 
-Laws: packets leave at the pace of the air, and each credit asks for one just before it is due; the two directions share
-nothing but the front end, so that one cannot hold up the other; what is received can be impaired and looked at only
-where no real channel does it already.
+Laws: packets leave at the pace of the air, and each credit asks for one just before it is due; neither direction waits
+for the other; what is received can be impaired and looked at only where no real channel does it already.
 """
 
 from __future__ import annotations

@@ -14,14 +14,11 @@ from __future__ import annotations
 from array import array
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from math import isnan, nan
 from threading import Lock
-from typing import TypeVar
 
 from gr_ros2.errors import RunError
 from gr_ros2.link.events import (
-    LOST_ON_GRAPH,
     Accepted,
     Delivered,
     Lost,
@@ -33,13 +30,8 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-
-DELIVERED = "delivered"
-LOST_FRAGMENTS = "lost_fragments"
-NOT_TAKEN = "not_taken"
-"""Every packet of the message arrived intact, yet the sink neither delivered it nor gave it up (not for us, …)."""
-IN_FLIGHT = "in_flight"
-"""Still in the source's queue, in the PHY, or behind the last packet that arrived."""
+from gr_ros2.link.outcome import Row
+from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
 
@@ -79,45 +71,32 @@ class TopicLedger:
 
     def book(self, position: int, row: str) -> None:
         """The message at this place of the arrays ends in this row."""
-        self.rows[row] += 1
-        self.row[position] = self.codes.setdefault(row, len(self.codes))
+        name = str(row)
+        self.rows[name] += 1
+        self.row[position] = self.codes.setdefault(name, len(self.codes))
 
 
 @dataclass(slots=True, eq=False)
-class _Open:
-    """A message whose fate is open. ``position`` is its place in the topic's arrays."""
+class _Open(Tracked):
+    """A message whose fate is open.
 
-    topic: TopicLedger
-    serial: int
-    position: int
-    digest: bytes
-    entry_id: int = -1
-    total: int = 0
-    sent: int = 0
+    :ivar position: its place in the topic's arrays
+    :ivar received: of its fragments
+    :ivar last_packet: number of the last packet with one of its fragments
+    """
+
+    position: int = -1
     received: int = 0
     last_packet: int = -1
     reason: str = ""
 
-    @property
-    def all_sent(self) -> bool:
-        return self.sent >= self.total > 0
-
-
-_Key = TypeVar("_Key")
-_Shelf = dict[int, _Open]
-"""Open messages by serial, oldest first."""
-
 
 @dataclass(slots=True)
 class _Source:
-    """One sender: its open messages, found by serial, by entry id and by payload; and its packets in the air."""
+    """One sender: its open messages, and its packets in the air."""
 
     src_id: int
-    open: _Shelf = field(default_factory=dict)
-    by_entry_id: dict[tuple[int, int], _Shelf] = field(default_factory=dict)
-    by_digest: dict[tuple[int, bytes], _Shelf] = field(default_factory=dict)
-    repeats: dict[tuple[int, int], int] = field(default_factory=dict)
-    """(topic id, entry id) whose latest use was a repeat -> serial of the message repeated."""
+    messages: Tracker[_Open] = field(default_factory=Tracker)
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -154,7 +133,7 @@ class Ledger:
             elif isinstance(event, Missed):
                 topic = self._topic(src_id, event.topic_id)
                 topic.sent += event.count
-                topic.rows[LOST_ON_GRAPH] += event.count
+                topic.rows[Row.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, event)
 
@@ -167,7 +146,7 @@ class Ledger:
             if self._finished:
                 return None
             self._packets_handed_up += 1
-            digest = _digest(data)
+            digest = digest_of(data)
             for source in self._sources.values():
                 if digest in source.waiting:
                     return source.src_id, _arrived(source, digest)
@@ -202,7 +181,7 @@ class Ledger:
                 self._finished = True
                 self._match_late()
                 for source in self._sources.values():
-                    for message in list(source.open.values()):
+                    for message in list(source.messages.open):
                         self._close(source, message, _final_row(source, message, drained))
             self._check()
             return [self._topics[key] for key in sorted(self._topics)]
@@ -225,7 +204,7 @@ class Ledger:
         """Messages sent and delivered so far."""
         with self._lock:
             topics = self._topics.values()
-            return sum(topic.sent for topic in topics), sum(topic.rows[DELIVERED] for topic in topics)
+            return sum(topic.sent for topic in topics), sum(topic.rows[Row.DELIVERED] for topic in topics)
 
     def rows(self) -> dict[tuple[int, int], Counter[str]]:
         """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
@@ -233,15 +212,14 @@ class Ledger:
         with self._lock:
             rows = {key: Counter(topic.rows) for key, topic in self._topics.items()}
             for source in self._sources.values():
-                for message in source.open.values():
-                    key = (message.topic.src_id, message.topic.topic_id)
-                    rows[key][_final_row(source, message, drained=False)] += 1
+                for message in source.messages.open:
+                    rows[source.src_id, message.topic_id][str(_final_row(source, message, drained=False))] += 1
             return rows
 
     def unresolved(self) -> int:
         """Messages accepted by the senders whose fate is open: neither delivered, refused nor given up."""
         with self._lock:
-            return sum(not message.reason for source in self._sources.values() for message in source.open.values())
+            return sum(not message.reason for source in self._sources.values() for message in source.messages.open)
 
     # -- sender -------------------------------------------------------------------------------------------------
 
@@ -264,13 +242,12 @@ class Ledger:
 
     def _accepted(self, source: _Source, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
-        expected = event.payload if event.expected is None else event.expected
-        message = _Open(topic, event.serial, len(topic.serial) - 1, _digest(expected))
-        source.open[event.serial] = message
-        source.by_digest.setdefault((event.topic_id, message.digest), {})[event.serial] = message
+        message = _Open.of(event)
+        message.position = len(topic.serial) - 1
+        source.messages.add(message)
 
     def _refused(self, source: _Source, event: Refused) -> None:
-        message = source.open.get(event.serial)
+        message = source.messages.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
             topic.book(len(topic.serial) - 1, event.reason)
@@ -281,66 +258,48 @@ class Ledger:
         ordinal = source.packets_sent
         source.packets_sent += 1
         for entry in event.entries:
-            key = (entry.topic_id, entry.entry_id)
-            if entry.repeat:
-                source.repeats[key] = entry.serial
-                continue
-            message = source.open.get(entry.serial)
-            if message is None:  # delivered or dropped before its last fragment left
-                continue
-            if message.entry_id < 0:
-                message.entry_id = entry.entry_id
-                message.total = entry.total
-                source.repeats.pop(key, None)
-                self._retire(source, key)
-                source.by_entry_id.setdefault(key, {})[entry.serial] = message
-            message.sent += 1
-            message.last_packet = ordinal
-        digest = _digest(event.data)
+            message = source.messages.left(entry)
+            if message is not None:
+                message.last_packet = ordinal
+                if message.sent == 1:
+                    self._retire(source, message)
+        digest = digest_of(event.data)
         source.in_air.append((ordinal, digest))
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
-    def _retire(self, source: _Source, key: tuple[int, int]) -> None:
-        """Settle what had this entry id before and cannot arrive any more; 256 ids have passed since."""
+    def _retire(self, source: _Source, newer: _Open) -> None:
+        """Settle what had this message's key before and cannot arrive any more: keys have come round since."""
+        assert newer.key is not None
         horizon = source.last_received - REORDER_WINDOW
-        for message in [m for m in source.by_entry_id.get(key, {}).values() if m.all_sent and m.last_packet < horizon]:
-            self._close(source, message, _final_row(source, message, drained=False))
+        for message in source.messages.under(*newer.key):
+            if message is not newer and message.all_sent and message.last_packet < horizon:
+                self._close(source, message, _final_row(source, message, drained=False))
 
     # -- receiver -----------------------------------------------------------------------------------------------
 
     def _delivered(self, event: Delivered, now: float) -> float | None:
-        digest = _digest(event.payload)
         source = self._sources.get(event.src_id)
         if source is not None:
-            key = (event.topic_id, event.entry_id)
-            same = source.by_digest.get((event.topic_id, digest), {})
-            exact = (m for m in source.by_entry_id.get(key, {}).values() if m.digest == digest)
-            message = next(exact, None)
-            if message is None and key in source.repeats:
-                repeated = source.open.get(source.repeats[key])
-                if repeated is None:
-                    self._topic(event.src_id, event.topic_id).repeats_delivered += 1
-                    return None
-                message = repeated if repeated.digest == digest else None
-            elif message is None:
-                message = next((m for m in same.values() if m.sent), None)
+            message = source.messages.find(event)
             if message is not None:
                 return self._deliver(source, message, now)
-        self._unmatched.append((event.src_id, event.topic_id, digest, now))
+            if source.messages.repeats(event) and source.messages.repeated(event) is None:
+                self._topic(event.src_id, event.topic_id).repeats_delivered += 1
+                return None
+        self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
         return None
 
     def _deliver(self, source: _Source, message: _Open, now: float) -> float:
-        message.topic.t_delivered[message.position] = now
-        self._close(source, message, DELIVERED)
-        return message.topic.t_sent[message.position]
+        self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
+        self._close(source, message, Row.DELIVERED)
+        return message.t_sent
 
     def _lost(self, event: Lost) -> None:
         """Note the reason. It stands unless a delivery proves it wrong."""
         source = self._sources.get(event.src_id)
-        if source is None or (event.topic_id, event.entry_id) in source.repeats:
+        if source is None or source.messages.repeats(event):
             return
-        shelf = source.by_entry_id.get((event.topic_id, event.entry_id), {})
-        candidates = [m for m in shelf.values() if not m.reason]
+        candidates = [m for m in source.messages.under(event.topic_id, event.key) if not m.reason]
         seen = [m for m in candidates if m.received]  # the receiver held at least one fragment of it
         for message in (seen or candidates)[:1]:
             message.reason = event.reason
@@ -354,19 +313,14 @@ class Ledger:
         return self._topics[key]
 
     def _close(self, source: _Source, message: _Open, row: str) -> None:
-        topic_id, serial = message.topic.topic_id, message.serial
-        message.topic.book(message.position, row)
-        del source.open[serial]
-        _take(source.by_digest, (topic_id, message.digest), serial)
-        if message.entry_id >= 0:
-            _take(source.by_entry_id, (topic_id, message.entry_id), serial)
+        self._topic(source.src_id, message.topic_id).book(message.position, row)
+        source.messages.close(message)
 
     def _match_late(self) -> None:
         """Deliveries that matched nothing when they came: by their bytes alone, against all that is still open."""
         for src_id, topic_id, digest, now in self._unmatched:
             source = self._sources.get(src_id)
-            shelf = source.by_digest.get((topic_id, digest), {}) if source is not None else {}
-            message = next(iter(shelf.values()), None)
+            message = next(iter(source.messages.alike(topic_id, digest)), None) if source is not None else None
             if source is not None and message is not None:
                 self._deliver(source, message, now)
             else:
@@ -377,24 +331,14 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            submitted = topic.sent - topic.rows[LOST_ON_GRAPH]
+            submitted = topic.sent - topic.rows[Row.LOST_ON_GRAPH.value]
             if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
-            if topic.rows[DELIVERED] != delivered:
-                self._faults.append(f"{name}: {topic.rows[DELIVERED]} delivered, {delivered} have a delivery time")
+            if topic.rows[Row.DELIVERED] != delivered:
+                self._faults.append(f"{name}: {topic.rows[Row.DELIVERED]} delivered, {delivered} have a delivery time")
         if self._faults:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
-
-
-def _digest(data: bytes) -> bytes:
-    return blake2b(data, digest_size=16).digest()
-
-
-def _take(index: dict[_Key, _Shelf], key: _Key, serial: int) -> None:
-    del index[key][serial]
-    if not index[key]:
-        del index[key]
 
 
 def _arrived(source: _Source, digest: bytes) -> int:
@@ -408,7 +352,7 @@ def _arrived(source: _Source, digest: bytes) -> int:
     if not copies:
         del source.waiting[digest]
     for entry in entries:
-        message = source.open.get(entry.serial)
+        message = source.messages.get(entry.serial)
         if message is not None and not entry.repeat:
             message.received += 1
     source.last_received = max(source.last_received, ordinal)
@@ -423,10 +367,13 @@ def _arrived(source: _Source, digest: bytes) -> int:
 
 
 def _final_row(source: _Source, message: _Open, drained: bool) -> str:
+    """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
+    the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
+    behind the last packet that arrived."""
     if message.reason:
         return message.reason
     if not message.all_sent:
-        return IN_FLIGHT
+        return Row.IN_FLIGHT
     if message.received >= message.total:
-        return NOT_TAKEN
-    return LOST_FRAGMENTS if drained or message.last_packet < source.last_received else IN_FLIGHT
+        return Row.NOT_TAKEN
+    return Row.LOST_FRAGMENTS if drained or message.last_packet < source.last_received else Row.IN_FLIGHT

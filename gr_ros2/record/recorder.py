@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
-from math import nan
 from typing import Any
 
-from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.record.ledger import Ledger, TopicLedger
 from gr_ros2.record.metrics import TopicMetrics, topic_metrics
 from gr_ros2.record.path import path_error, rms_error
@@ -63,15 +62,13 @@ class Recorder:
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
 
-    def packet_received(self, data: bytes, now: float = nan) -> None:
-        """Bytes the PHY handed to the sink, before the sink reads them, at ``now`` on the sender's clock."""
-        packet = self.ledger.packet_received(data)
-        if packet is not None:
-            src_id, number = packet
-            self._packets[src_id].received(number, now)
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What the receiver reports; of a delivery once it is republished, at ``now`` on the sender's clock."""
+        if isinstance(event, Received | Rejected):
+            packet = self.ledger.packet_received(event.data)
+            if packet is not None:
+                src_id, number = packet
+                self._packets[src_id].received(number, now)
         submitted = self.ledger.receiver_event(event, now)
         if isinstance(event, Delivered):
             if self._on_delivery is not None:

@@ -53,7 +53,7 @@ SCHEMAS = {
         {
             "packet": pa.int64(),  # from 0 per source
             "src_id": pa.uint8(),
-            "seq": pa.uint8(),  # on the wire
+            "seq": pa.uint16(),  # on the wire
             "t_sent": pa.float64(),
             "t_received": pa.float64(),  # null: it did not reach the sink intact
             "topic": _TEXT,
@@ -96,22 +96,22 @@ class PacketLog:
 
     def __init__(self) -> None:
         self._t_sent, self._t_received = array("d"), array("d")
-        self._seq, self._entries = array("B"), array("B")
+        self._seq, self._entries = array("H"), array("B")
         self._serial = array("q")
         self._topic_id = array("B")
-        self._entry_id, self._index, self._total = array("H"), array("H"), array("H")
+        self._name, self._index, self._total = array("H"), array("L"), array("L")
 
     def sent(self, event: SentPacket) -> None:
         """A packet left the sender."""
-        for entry in event.entries:
+        for entry, written in zip(event.entries, event.packet.entries, strict=True):
             self._serial.append(-1 if entry.repeat else entry.serial)
             self._topic_id.append(entry.topic_id)
-            self._entry_id.append(entry.entry_id)
+            self._name.append(written.name)
             self._index.append(entry.index)
             self._total.append(entry.total)
         self._t_sent.append(event.now)
         self._t_received.append(nan)
-        self._seq.append(event.data[3])
+        self._seq.append(event.packet.seq)
         self._entries.append(len(event.entries))
 
     def received(self, number: int, now: float) -> None:
@@ -132,7 +132,7 @@ class PacketLog:
             "t_received": np.array(self._t_received)[packet] - t0,
             "topic": _named(np.array(self._topic_id, dtype=np.int64)[entries], names),
             "serial": np.array(self._serial, dtype=np.int64)[entries],
-            "entry_id": np.array(self._entry_id, dtype=np.int64)[entries],
+            "entry_id": np.array(self._name, dtype=np.int64)[entries],
             "index": np.array(self._index, dtype=np.int64)[entries],
             "total": np.array(self._total, dtype=np.int64)[entries],
         }

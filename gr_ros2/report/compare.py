@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gr_ros2.link.outcome import Row
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
 from gr_ros2.report.figures import latency_figure, ledger_figure, row_order
@@ -56,7 +57,7 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
                 *(_DASH if topic is None else str(topic.ledger.get(row, 0)) for topic in found),
             )
             for row in rows
-            if row != "delivered"
+            if row != Row.DELIVERED
         ]
         sections.append(lines)
     results = [run.result for run in runs]

@@ -12,9 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gr_ros2.link.events import LOST_ON_GRAPH
-from gr_ros2.link.receiver import PUBLISH_FAILED
-from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS
+from gr_ros2.link.outcome import ROWS, Row
 from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.figures import row_order
@@ -22,17 +20,6 @@ from gr_ros2.report.table import milliseconds
 
 _TREND = 1.5
 """A latency that changed by less than this factor from the first to the last deliveries is called steady."""
-
-_ROWS = {
-    IN_FLIGHT: "still in flight at the end",
-    LOST_FRAGMENTS: "lost for want of a fragment",
-    "queue_bound": "dropped at the bound of the source's queue",
-    LOST_ON_GRAPH: "lost by the ROS graph of the source before the link had them",
-    "too_large": "too large for the packet length",
-    "expired": "given up incomplete after the reassembly timeout",
-    PUBLISH_FAILED: "received whole but not published on the sink's ROS graph",
-    "not_taken": "received whole but not taken by the sink",
-}
 
 
 def explanation(result: Result, trace: Trace) -> list[str]:
@@ -56,8 +43,8 @@ def _outcome(result: Result) -> Iterator[str]:
         yield "No message was sent."
         return
     parts = [
-        f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {_ROWS.get(row, row.replace('_', ' '))}"
-        for row in dict.fromkeys([DELIVERED, *row_order([ledger])])
+        f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {ROWS[row].words if row in ROWS else row.replace('_', ' ')}"
+        for row in dict.fromkeys([Row.DELIVERED, *row_order([ledger])])
     ]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
@@ -67,7 +54,7 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     airtime = result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("pace") == "flow" or not len(packets.packet):
         return
-    needed = sum((m.row != "too_large").sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
+    needed = sum((m.row != Row.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
     channels = result.phy.get("channels", 1)
     share = needed * airtime / result.duration_s / channels
@@ -114,7 +101,7 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
     waiting = under_way = gone = 0
     counts = Counter(zip(packets.src_id.tolist(), packets.serial.tolist(), strict=True))
     for messages in trace.messages():
-        for serial in messages.serial[messages.row == IN_FLIGHT].tolist():
+        for serial in messages.serial[messages.row == Row.IN_FLIGHT].tolist():
             key = (messages.src_id, serial)
             sent = counts.get(key, 0)
             if not sent:

@@ -17,9 +17,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.events import LOST_ON_GRAPH
-from gr_ros2.link.receiver import PUBLISH_FAILED
-from gr_ros2.record.ledger import DELIVERED, IN_FLIGHT, LOST_FRAGMENTS, NOT_TAKEN
+from gr_ros2.link.outcome import ROWS, Row
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
@@ -32,20 +30,6 @@ COLOURS = (
 )
 """Of topics and runs in their order; told apart by colour-blind readers as far as sixteen can be."""
 
-_ROW_COLOURS = {
-    DELIVERED: "#2a9d5c",
-    IN_FLIGHT: "#9db8d9",
-    LOST_FRAGMENTS: "#d62728",
-    NOT_TAKEN: "#8c564b",
-    "queue_bound": "#f0a330",
-    "too_large": "#c9a08a",
-    "expired": "#b565a7",
-    "memory": "#7f7f7f",
-    "unsupported": "#17becf",
-    LOST_ON_GRAPH: "#5b5b9a",
-    PUBLISH_FAILED: "#6b1d1d",
-    "stale": "#e7cf4f",
-}
 _RASTER_ABOVE = 20_000
 """Points above which a line is a picture inside the SVG, which otherwise grows without bound."""
 
@@ -158,12 +142,12 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
 def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
     """The ledger rows that occurred: delivered first, in_flight last, the others by name between them."""
     found = {row for ledger in ledgers for row, count in ledger.items() if count}
-    return sorted(found, key=lambda row: (row != DELIVERED, row == IN_FLIGHT, row))
+    return sorted(found, key=lambda row: (row != Row.DELIVERED, row == Row.IN_FLIGHT, row))
 
 
 def row_colour(row: str) -> str:
     """The colour of a ledger row; of one this version does not know, always the same one."""
-    return _ROW_COLOURS.get(row) or COLOURS[sum(row.encode()) % len(COLOURS)]
+    return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]
 
 
 def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from gr_ros2 import __version__
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.events import LOST_ON_GRAPH
+from gr_ros2.link.outcome import Row
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, read_result, topic_numbers
 from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv, write_text, write_whole
@@ -301,7 +301,8 @@ def _check(run: Run) -> None:
     for topic in run.result.topics:
         messages = counts.get((topic.topic, topic.src_id))
         sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
-        submitted = topic.sent - topic.ledger.get(LOST_ON_GRAPH, 0)  # of what did not reach the link nothing is known
+        # Of what did not reach the link nothing but its number is known.
+        submitted = topic.sent - topic.ledger.get(Row.LOST_ON_GRAPH, 0)
         if (sent, delivered) != (submitted, topic.delivered):
             raise ConfigError(
                 f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "

@@ -12,7 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from gr_ros2.record.ledger import DELIVERED
+from gr_ros2.link.outcome import Row
 from gr_ros2.record.result import Result, TopicResult
 
 _DASH = "–"
@@ -78,7 +78,7 @@ def paper_grid(results: Sequence[Result]) -> Grid:
 
 def ledger_grid(result: Result) -> Grid:
     """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
-    rows = [DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
+    rows = [Row.DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
     rows = list(dict.fromkeys(rows))
     lines = (
         (topic.topic, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for topic in result.topics

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
@@ -73,7 +72,7 @@ class Direction:
         self.source = RosSource(
             registry,
             middleware=self.input,
-            observer=partial(ears.sender_event, self.src_id),
+            observer=ears,
             seed=scenario.seed,
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
@@ -81,8 +80,7 @@ class Direction:
         self.sink = RosSink(
             registry,
             middleware=self.output,
-            observer=lambda event: ears.receiver_event(event, time.monotonic()),
-            packet_observer=lambda data: ears.packet_received(data, time.monotonic()),
+            observer=ears,
             **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)

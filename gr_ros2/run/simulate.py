@@ -1,16 +1,17 @@
-"""A scenario without threads and waiting: the link's engines on a clock that jumps from event to event.
+"""A scenario without threads and waiting: both ends of its link on a clock that jumps from event to event.
 
-Version 0 tells its sender nothing of the receiver, so a run is three stages behind one another: what the sender puts on
-the air and when (:class:`Transmission`), what the air makes of it (an :data:`Air`), and what the receiver makes of that
-(:class:`Reception`). What the computer takes (middleware, Python, signal processing) is one constant, ``overhead_s``, 0
-unless given. Laws: the same scenario gives the same numbers; packets go one after the other, each for its airtime, so
-no message completes before all its packets have been on the air; the ledger hears both ends in the order of time.
+An event loop (:class:`EventLoop`) over the ends and the directions between them (:class:`Way`): an end is asked for
+packets when it may have one, a packet is on the air for its airtime, and what lands is given to the other end, which it
+may move to send. What the computer takes (middleware, Python, signal processing) is one constant, ``overhead_s``, 0
+unless given. Laws: the same scenario gives the same numbers; the packets of a direction go one after the other, each
+for its airtime, so no message completes before all its packets have been on the air; everything is told in the order
+of time.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
@@ -18,12 +19,12 @@ from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import message_codec
-from gr_ros2.link import Receiver, Sender, SenderEvent, SenderStats, SentPacket
+from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.receiver import ReceiverStats
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -52,16 +53,15 @@ class Offered:
 
 @dataclass(frozen=True, slots=True)
 class Landed:
-    """A packet whose airtime was over at ``now``, s after the start."""
+    """A packet whose airtime is over, and whose fate is decided later."""
 
     data: bytes
-    now: float
 
 
-Step = SenderEvent | Landed
-"""What happens at the sending end and on the air, in the order of time."""
-Air = Callable[[Iterable[Step]], Iterable[Step]]
-"""Takes away the packets that do not come through; everything else stays as it is, in its order."""
+Happening = tuple[float, "Way", SenderEvent | ReceiverEvent | Landed]
+"""When, s after the start; in which direction; and what."""
+Air = Callable[[bytes, float], Iterable[bytes]]
+"""What becomes of a packet whose airtime is over now: what comes out of the receiver."""
 
 
 @dataclass(frozen=True)
@@ -146,155 +146,208 @@ def simulate(
     src_id = scenario.ros_source.src_id()
     topics = {src_id: source_names(scenario, registry).values()}
     recorder = Recorder(registry, {src_id: scenario.ros_source.namespace}, topics)
-    sending = Transmission(scenario, registry, phy.airtime(), codec)
-    receiving = Reception(scenario, registry, recorder, codec, overhead_s)
-    for step in drop_packets(sending.steps(messages or offered(scenario, registry)), PduLosses(scenario.channel)):
-        receiving.take(step)
-        if on_packet is not None and isinstance(step, SentPacket):
-            on_packet(step)
-    receiving.wait_until(sending.end)
+    losses = PduLosses(scenario.channel)
+    ends = make_ends([scenario], registry, codec)
+    way = Way(scenario, *ends, phy.airtime(), messages or offered(scenario, registry))
+    way.air = lambda data, now: [data] if losses.passes(now) else ()
+    for happening in EventLoop([way]).run():
+        tell(recorder, happening, overhead_s)
+        if on_packet is not None and isinstance(happening[2], SentPacket):
+            on_packet(happening[2])
     return Simulated(
-        duration_s=sending.duration_s,
+        duration_s=way.duration_s,
         airtime_s=phy.airtime(),
-        topics=recorder.finish(sending.duration_s, sending.duration_s, sending.empty),
+        topics=recorder.finish(way.duration_s, way.duration_s, way.empty),
         packets=recorder.ledger.packets(),
-        stats=sending.stats,
+        stats=way.sender.endpoint.sent,
         recorder=recorder,
     )
 
 
-def drop_packets(steps: Iterable[Step], losses: PduLosses) -> Iterator[Step]:
-    """The steps without the packets that are lost whole."""
-    for step in steps:
-        if not isinstance(step, Landed) or losses.passes(step.now):
-            yield step
+def tell(observer: LinkObserver, happening: Happening, overhead_s: float = 0.0) -> None:
+    """Let an observer hear of what happened."""
+    now, way, event = happening
+    if isinstance(event, SenderEvent):
+        observer.sender_event(way.src_id, event)
+    elif isinstance(event, ReceiverEvent):
+        observer.receiver_event(event, now + overhead_s if isinstance(event, Delivered) else now)
 
 
-class Transmission:
-    """The sending end and its turn on the air.
+@dataclass(frozen=True)
+class End:
+    """One robot's end, and what its sending half has done and nobody has heard of yet."""
+
+    endpoint: Endpoint
+    told: list[SenderEvent]
+
+
+def make_ends(ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None) -> tuple[End, End]:
+    """The two ends of a link: each sends in one direction and receives in the other, as far as there are two.
+
+    :param ways: one scenario per direction
+    :param codec: of all messages; None makes it where ``compression`` is on
+    """
+    there, back = ways[0], ways[1] if len(ways) > 1 else None
+    return _end(registry, there, back, codec), _end(registry, back, there, codec)
+
+
+def _end(registry: Registry, out: Scenario | None, back: Scenario | None, codec: MessageCodec | None) -> End:
+    source, sink = None if out is None else out.ros_source, None if back is None else back.ros_sink
+    to_air, from_air = (
+        codec or message_codec(config, registry) if config is not None else None for config in (source, sink)
+    )
+    told: list[SenderEvent] = []
+    rng = None if out is None else random.Random(out.seed)
+    endpoint = EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=told.append)
+    return End(endpoint, told)
+
+
+class Way:
+    """One direction of a link: what is offered to the end that sends, its turn on the air, and the end that hears it.
 
     :param airtime: of one packet, s; 0 for a PHY without samples
-    :param codec: None makes it where ``compression`` is on
+    :param messages: in the order of time
     :raises ConfigError: for pace ``flow``, which has no times
     """
 
     def __init__(
-        self, scenario: Scenario, registry: Registry, airtime: float, codec: MessageCodec | None = None
+        self, scenario: Scenario, sender: End, receiver: End, airtime: float, messages: Iterator[Offered]
     ) -> None:
         if scenario.pace != "airtime":
             raise ConfigError(f"pace = {scenario.pace!r}: only pace airtime can be simulated")
-        self._steps: list[Step] = []
-        self._sender = Sender(
-            registry,
-            scenario.ros_source,
-            codec=codec or message_codec(scenario.ros_source, registry),
-            rng=random.Random(scenario.seed),
-            observer=self._steps.append,
-        )
+        self.sender, self.receiver = sender, receiver
+        self.src_id = scenario.ros_source.src_id()
+        self.air: Air | None = None
+        """What becomes of packets; None leaves that to who hears of them (:class:`Landed`)."""
+        self.due = 0.0
+        """s, when something may happen next; infinite when it is over."""
+        self.end = 0.0
+        """s, when something happened last."""
+        self.duration_s = scenario.duration_s
+        """s during which messages were offered; where the scenario leaves that to its bag, known at the end."""
+        self._messages = messages
+        self._coming = next(messages, None)
         self._clock: AirtimeClock[bytes] | None = AirtimeClock(airtime) if airtime else None
         self._paced = scenario.paced and self._clock is not None
         self._drain = scenario.drain_s
         self._until = scenario.duration_s
-        self.duration_s = scenario.duration_s
-        """s during which messages were offered; where the scenario leaves that to its bag, known at the end."""
-        self.end = 0.0
-        """s, when the run was over."""
-
-    @property
-    def stats(self) -> SenderStats:
-        """The sender's counters."""
-        return self._sender.stats
+        if self._paced:
+            sender.endpoint.use_credit()
 
     @property
     def empty(self) -> bool:
-        """Whether nothing waits at the sender or for the air."""
-        return self._sender.idle and not (self._clock and self._clock.backlog)
+        """Whether nothing waits at the sending end or for the air."""
+        return self.sender.endpoint.idle and not (self._clock and self._clock.backlog)
 
-    def steps(self, messages: Iterator[Offered]) -> Iterator[Step]:
-        """Everything that happens, until nothing is left or the time to drain is over. Once."""
-        coming = next(messages, None)
-        now = 0.0
-        if self._paced:
-            self._sender.use_credit()
-        while now < inf:
-            self.end = now
-            self._let_through(now)
-            while coming is not None and coming.t <= now:
-                self._sender.submit(coming.topic_id, coming.payload, now)
-                if not self._until:
-                    self.duration_s = now
-                coming = next(messages, None)
-            self._send(now)
-            yield from self._steps
-            self._steps.clear()
-            if coming is None and now >= self.duration_s and self.empty:
-                break
-            now = max(now, self._next(now, inf if coming is None else coming.t))
-            if coming is None and now > self.duration_s + self._drain:
-                break
+    def step(self, now: float) -> Iterator[Happening]:
+        """Everything that happens by ``now``."""
+        self.end = now
+        yield from self._let_through(now)
+        self._submit(now)
+        yield from self._send(now)
+        yield from self._told(now)
+        self.due = self._next(now)
 
-    def _let_through(self, now: float) -> None:
+    def arrive(self, data: bytes, now: float) -> Iterator[Happening]:
+        """A packet comes out of the receiver."""
+        for event in self.receiver.endpoint.receive(data, now):
+            yield now, self, event
+
+    def wake(self, now: float) -> None:
+        """The sending end has been called: it may have something earlier than it said."""
+        at = self.sender.endpoint.next_timeout()
+        if at is not None and self.due < inf:
+            self.due = min(self.due, max(now, at))
+
+    def _let_through(self, now: float) -> Iterator[Happening]:
         if self._clock is not None:
-            self._steps += (Landed(data, now) for data in self._clock.due(now))
+            for data in self._clock.due(now):
+                yield from self._land(data, now)
             credits = self._clock.grants(now)
             if self._paced:
-                self._sender.credit(credits)
+                self.sender.endpoint.credit(credits)
 
-    def _send(self, now: float) -> None:
-        while (data := self._sender.next_packet(now)) is not None:
+    def _land(self, data: bytes, now: float) -> Iterator[Happening]:
+        if self.air is None:
+            yield now, self, Landed(data)
+        else:
+            for arrived in self.air(data, now):
+                yield from self.arrive(arrived, now)
+
+    def _submit(self, now: float) -> None:
+        while self._coming is not None and self._coming.t <= now:
+            self.sender.endpoint.submit(self._coming.topic_id, self._coming.payload, now)
+            if not self._until:
+                self.duration_s = now
+            self._coming = next(self._messages, None)
+
+    def _send(self, now: float) -> Iterator[Happening]:
+        while (data := self.sender.endpoint.next_packet(now)) is not None:
             if self._clock is not None:
                 self._clock.offer(data, now)
             else:
-                self._steps.append(Landed(data, now))
+                yield from self._told(now)
+                yield from self._land(data, now)
 
-    def _next(self, now: float, coming: float) -> float:
+    def _told(self, now: float) -> Iterator[Happening]:
+        for event in self.sender.told:
+            yield now, self, event
+        self.sender.told.clear()
+
+    def _next(self, now: float) -> float:
+        """When something may happen next; infinite when all is done, or the time to drain is over."""
+        coming = self._coming
+        if coming is None and now >= self.duration_s and self.empty:
+            return inf
         clock = self._clock.next_timeout(now) if self._clock is not None else None
-        times = (coming, clock, self._sender.next_timeout())
+        times = (None if coming is None else coming.t, clock, self.sender.endpoint.next_timeout())
         soonest = min((at for at in times if at is not None), default=inf)
-        # Nothing more to come before the end of the run: the receiver may still be waiting.
-        return self.duration_s if soonest == inf and now < self.duration_s else soonest
+        if soonest == inf and now < self.duration_s:
+            soonest = self.duration_s  # nothing more to come before the end of the run
+        soonest = max(now, soonest)
+        return inf if coming is None and soonest > self.duration_s + self._drain else soonest
 
 
-class Reception:
-    """The receiving end, and who hears of both.
+class EventLoop:
+    """The directions of one link on one clock.
 
-    :param ears: hears every event of both ends, in the order of time
-    :param codec: None makes it where ``compression`` is on
-    :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
+    :param ways: one, or the two between the same ends
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        registry: Registry,
-        ears: LinkObserver,
-        codec: MessageCodec | None = None,
-        overhead_s: float = 0.0,
-    ) -> None:
-        self._src_id = scenario.ros_source.src_id()
-        self._receiver = Receiver(
-            registry, scenario.ros_sink, codec=codec or message_codec(scenario.ros_sink, registry)
-        )
-        self._ears = ears
-        self._overhead = overhead_s
+    def __init__(self, ways: Sequence[Way]) -> None:
+        self._ways = ways
+        self.now = -inf
 
-    @property
-    def stats(self) -> ReceiverStats:
-        """The receiver's counters."""
-        return self._receiver.stats
+    def run(self) -> Iterator[Happening]:
+        """Everything that happens, in the order of time, until nothing is left or the time to drain is over. Once."""
+        while (due := min(way.due for way in self._ways)) < inf:
+            self.now = min(due, *(self._timers()))
+            yield from self._expire()
+            for way in self._ways:
+                if way.due <= self.now:
+                    yield from self._heard(way.step(self.now))
 
-    def take(self, step: Step) -> None:
-        """One step, no earlier than the one before."""
-        if isinstance(step, Landed):
-            self.wait_until(step.now)
-            self._ears.packet_received(step.data, step.now)
-            for event in self._receiver.receive(step.data, step.now):
-                self._ears.receiver_event(event, step.now + self._overhead)
-        else:
-            self._ears.sender_event(self._src_id, step)
+    def _timers(self) -> Iterator[float]:
+        """When an end that hears of its packets at once has something to do, other than to send."""
+        for way in self._ways:
+            at = way.receiver.endpoint.next_timeout() if way.air is not None else None
+            yield inf if at is None or at <= self.now else at
 
-    def wait_until(self, now: float) -> None:
-        """Give up what has waited too long by then."""
-        while (at := self._receiver.next_timeout()) is not None and at < now:
-            for event in self._receiver.handle_timeout(at):
-                self._ears.receiver_event(event, at + self._overhead)
+    def _expire(self) -> Iterator[Happening]:
+        for way in self._ways:
+            if way.air is not None:
+                yield from self._heard((self.now, way, event) for event in self._overdue(way.receiver.endpoint))
+
+    def _overdue(self, endpoint: Endpoint) -> list[ReceiverEvent]:
+        at = endpoint.next_timeout()
+        return endpoint.handle_timeout(self.now) if at is not None and at <= self.now else []
+
+    def _heard(self, happenings: Iterable[Happening]) -> Iterator[Happening]:
+        """Let an end that has heard something send."""
+        for happening in happenings:
+            yield happening
+            _, way, event = happening
+            if way.receiver.endpoint.answers and isinstance(event, ReceiverEvent):
+                for back in self._ways:
+                    if back.sender is way.receiver:
+                        back.wake(self.now)

@@ -8,17 +8,16 @@ samples, as in a run in real time, so neither noise nor fading moves on in it.
 
 from __future__ import annotations
 
-import heapq
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gr_ros2.guard import Guard
-from gr_ros2.link import Missed, Refused
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
@@ -30,8 +29,11 @@ from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
-from gr_ros2.run.simulate import Landed, Reception, Step, Transmission, drop_packets, offered
+from gr_ros2.run.simulate import End, EventLoop, Happening, Landed, Way, make_ends, offered, tell
 from gr_ros2.run.watch import LiveRun, Onlookers
+
+if TYPE_CHECKING:
+    from gr_ros2.phy.measure import Passage
 
 _REPORT_S = 0.05
 
@@ -81,22 +83,23 @@ def run_simulated(
         ears = Observers[LinkObserver]()
         recorded = ears.add(recorder, needed=True)
         ears.add(onlookers)
-        directions = [_Direction(way, registry, phy, ears) for way, phy in zip(ways, phys, strict=True)]
+        ends = make_ends(ways, registry)
+        directions = [
+            _Direction(way, registry, phy, pair) for way, phy, pair in zip(ways, phys, (ends, ends[::-1]), strict=False)
+        ]
         clock = _Clock()
         onlookers.run_started(_live_run(scenario, registry, recorder, clock))
         reported, progress = 0.0, Guard("progress")
-        for now, number, step in heapq.merge(*(one.timed(place) for place, one in enumerate(directions)), key=_when):
-            clock.now = now
-            directions[number].reception.take(step)
+        for happening in _whole(directions):
+            clock.now = happening[0]
+            tell(ears, happening)
             recorded.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
-                progress(on_progress, Progress(now, scenario.duration_s, *recorder.progress()))
-        for direction in directions:
-            direction.reception.wait_until(direction.transmission.end)
+                progress(on_progress, Progress(clock.now, scenario.duration_s, *recorder.progress()))
         recorded.check()
-    played = max(direction.transmission.duration_s for direction in directions)
-    topics = recorder.finish(played, played, all(direction.transmission.empty for direction in directions))
+    played = max(direction.way.duration_s for direction in directions)
+    topics = recorder.finish(played, played, all(direction.way.empty for direction in directions))
     there, *back = (direction.counters() for direction in directions)
     result = Result(
         scenario=scenario.name,
@@ -123,34 +126,70 @@ class _Clock:
         return self.now
 
 
-class _Direction:
-    """Sender, air and receiver of one direction."""
+@dataclass(eq=False)
+class _Landing:
+    """A packet whose samples have been on the air.
 
-    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ears: LinkObserver) -> None:
-        self.transmission = Transmission(scenario, registry, phy.airtime())
-        self.reception = Reception(scenario, registry, ears)
+    :param arrived: what came out of the receiver; None while that is not known
+    """
+
+    data: bytes
+    arrived: list[bytes] | None = None
+
+
+class _Direction:
+    """One direction, and what the air does to its packets.
+
+    :param ends: the one that sends, and the one that hears it
+    """
+
+    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
+        self.way = Way(scenario, *ends, phy.airtime(), offered(scenario, registry))
         self._scenario, self._registry = scenario, registry
         self._losses = PduLosses(scenario.channel)
         self._lost_by_phy: Counter[str] = Counter()
-        steps: Iterable[Step] = self.transmission.steps(offered(scenario, registry))
+        self._passage: Passage | None = None
+        self._landings: list[_Landing] = []
         if scenario.time == "samples" and phy.has_samples:
-            steps = self._sampled(steps, phy)
+            from gr_ros2.phy.measure import Passage  # with GNU Radio
+
+            self._passage = Passage(phy, scenario.channel)
+            if ends[1].endpoint.answers:
+                self.way.air = self._packet_by_packet
         else:
             measured = PduLosses(packet_losses(phy, scenario.channel))
             self._lost_by_phy = measured.dropped
-            steps = drop_packets(steps, measured)
-        self._steps = drop_packets(steps, self._losses)
+            self.way.air = lambda data, now: [data] if measured.passes(now) and self._losses.passes(now) else ()
 
-    def timed(self, number: int) -> Iterator[tuple[float, int, Step]]:
-        """The steps with their times and the number of this direction."""
-        now = 0.0
-        for step in self._steps:
-            now = now if isinstance(step, Refused | Missed) else step.now
-            yield now, number, step
+    def land(self, data: bytes) -> _Landing:
+        """A packet's samples have been on the air; its fate is known when its batch is full."""
+        landing = _Landing(data)
+        self._landings.append(landing)
+        if self._passage is not None and len(self._landings) == self._passage.batch:
+            self.decide()
+        return landing
+
+    def decide(self) -> None:
+        """Let what has landed pass through the flowgraph."""
+        if self._passage is None or not self._landings:
+            return
+        arrived: list[list[bytes]] = [[] for _ in self._landings]
+        for place, packet in self._passage.send([landing.data for landing in self._landings]):
+            arrived[place].append(packet)
+        for landing, packets in zip(self._landings, arrived, strict=True):
+            landing.arrived = packets
+            self._lost_by_phy["phy"] += landing.data not in packets
+        self._landings.clear()
+
+    def arrive(self, landing: _Landing, now: float) -> Iterator[Happening]:
+        """What the flowgraph made of a packet, less what is lost by setting."""
+        for data in landing.arrived or ():
+            if self._losses.passes(now):
+                yield from self.way.arrive(data, now)
 
     def counters(self) -> dict[str, Any]:
         """What each part counted; ``channel``: packets lost in the PHY, and on purpose by setting."""
-        sent, got = self.transmission.stats, self.reception.stats
+        sent, got = self.way.sender.endpoint.sent, self.way.receiver.endpoint.received
         return {
             "source": {
                 "packets": sent.packets,
@@ -177,40 +216,37 @@ class _Direction:
             "channel": {"phy": self._lost_by_phy.total(), **self._losses.dropped},
         }
 
-    def _sampled(self, steps: Iterable[Step], phy: Phy) -> Iterator[Step]:
-        """The steps with what the flowgraph makes of their packets, batch by batch."""
-        from gr_ros2.phy.measure import Passage
+    def _packet_by_packet(self, data: bytes, now: float) -> Iterator[bytes]:
+        """For ends that answer: what comes next depends on whether this one arrives."""
+        landing = self.land(data)
+        self.decide()
+        yield from (packet for packet in landing.arrived or () if self._losses.passes(now))
 
-        passage = Passage(phy, self._scenario.channel)
-        held: list[Step] = []
-        packets = 0
-        for step in steps:
-            held.append(step)
-            packets += isinstance(step, Landed)
-            if packets == passage.batch:
-                yield from self._through(passage.send, held)
-                held, packets = [], 0
-        yield from self._through(passage.send, held)
 
-    def _through(
-        self, send: Callable[[Sequence[bytes]], list[tuple[int, bytes]]], steps: Sequence[Step]
-    ) -> Iterator[Step]:
-        sent = [step.data for step in steps if isinstance(step, Landed)]
-        arrived: dict[int, list[bytes]] = {}
-        for place, packet in send(sent) if sent else ():
-            arrived.setdefault(place, []).append(packet)
-        self._lost_by_phy["phy"] += len(sent) - sum(sent[place] in packets for place, packets in arrived.items())
-        place = 0
-        for step in steps:
-            if isinstance(step, Landed):
-                yield from (Landed(packet, step.now) for packet in arrived.get(place, ()))
-                place += 1
+def _whole(directions: Sequence[_Direction]) -> Iterator[Happening]:
+    """Everything that happens. Packets go through the flowgraph many at a time where no end answers; until the fate of
+    one is known, what comes behind it waits."""
+    of = {id(direction.way): direction for direction in directions}
+    held: deque[tuple[Happening, _Landing | None]] = deque()
+
+    def decided() -> Iterator[Happening]:
+        while held and (held[0][1] is None or held[0][1].arrived is not None):
+            happening, landing = held.popleft()
+            if landing is None:
+                yield happening
             else:
-                yield step
+                yield from of[id(happening[1])].arrive(landing, happening[0])
 
-
-def _when(item: tuple[float, int, Step]) -> float:
-    return item[0]
+    for happening in EventLoop([direction.way for direction in directions]).run():
+        _, way, event = happening
+        held.append((happening, of[id(way)].land(event.data) if isinstance(event, Landed) else None))
+        yield from decided()
+    for direction in directions:
+        direction.decide()
+    yield from decided()
+    for direction in directions:
+        way = direction.way
+        yield from ((way.end, way, event) for event in way.receiver.endpoint.handle_timeout(way.end))
 
 
 def _published_as(way: Scenario, registry: Registry) -> dict[str, str]:

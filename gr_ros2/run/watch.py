@@ -17,7 +17,7 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import RunError
 from gr_ros2.gr import RosSource
 from gr_ros2.guard import Guard
-from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
 from gr_ros2.phy.path import LinkCounts
@@ -171,14 +171,10 @@ class Apart(Observers[Watcher]):
         self._over = False
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        size = len(event.data) if isinstance(event, SentPacket) else len(getattr(event, "payload", b""))
-        self._pass_on(size, self._watcher.sender_event, src_id, event)
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        self._pass_on(len(data), self._watcher.packet_received, data, now)
+        self._pass_on(_size(event), self._watcher.sender_event, src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        self._pass_on(len(getattr(event, "payload", b"")), self._watcher.receiver_event, event, now)
+        self._pass_on(_size(event), self._watcher.receiver_event, event, now)
 
     def run_started(self, run: LiveRun) -> None:
         self._backlog.offer(0, self._guard, self._watcher.run_started, run)
@@ -204,3 +200,10 @@ class Apart(Observers[Watcher]):
         if self._guard.error is None:
             self._guard.end(RunError(f"it has not come back for {_PATIENCE_S:g} s"))
             self._guard.miss(self._backlog.pending)
+
+
+def _size(event: SenderEvent | ReceiverEvent) -> int:
+    """Bytes of packet or message that an event holds; a packet's are there as bytes and as payloads."""
+    if isinstance(event, SentPacket | Received):
+        return 2 * len(event.data)
+    return len(event.data) if isinstance(event, Rejected) else len(getattr(event, "payload", b""))

@@ -23,7 +23,6 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import offered, simulate
-from gr_ros2.wire import decode
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -215,7 +214,7 @@ class Planner:
         def share(sent: SentPacket) -> None:
             nonlocal padded, cut
             cut = cut or any(entry.total > 1 for entry in sent.entries)
-            layout = wire.layout(decode(sent.data, scenario.packet_len), scenario.packet_len)
+            layout = wire.layout(sent.packet, scenario.packet_len)
             padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:

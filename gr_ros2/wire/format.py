@@ -29,6 +29,10 @@ class Entry(Protocol):
         """Bytes of the message."""
 
     @property
+    def name(self) -> int:
+        """What names the message on the wire, among those of its source and topic."""
+
+    @property
     def label(self) -> str:
         """Which message, and which part of it, in a few characters."""
 

@@ -60,6 +60,11 @@ class Entry:
     payload: bytes
 
     @property
+    def name(self) -> int:
+        """``entry_id``."""
+        return self.entry_id
+
+    @property
     def label(self) -> str:
         """``#entry_id[index/total]``."""
         return f"#{self.entry_id}[{self.index}/{self.total}]"

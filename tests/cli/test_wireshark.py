@@ -16,20 +16,23 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.errors import ConfigError, WireError
-from gr_ros2.link.events import SentPacket
+from gr_ros2.link.events import Received, SentPacket
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import load_scenario
-from gr_ros2.wire.v0 import V0
+from gr_ros2.wire.v0 import V0, Packet
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 FIELDS = ("src_id", "dst_id", "seq", "hop", "qos", "compressed", "encrypted", "entries", "crc")
+
+NOTHING = Packet(1, 255, 0, 1, ())
+"""A capture has the bytes as they are."""
 
 
 def capture(path: Path, packets: list[bytes]) -> Path:
     with PacketCapture(path, clock=lambda: 0.0) as writing:
         for number, data in enumerate(packets):
-            writing.sender_event(1, SentPacket(data, (), number * 0.5))
-            writing.packet_received(data, number * 0.5 + 0.25)
+            writing.sender_event(1, SentPacket(data, NOTHING, (), number * 0.5))
+            writing.receiver_event(Received(data, NOTHING), number * 0.5 + 0.25)
     return path
 
 

@@ -19,7 +19,6 @@ NAMES = {(SRC, 0): "/robot_4/at", (SRC, 1): "/robot_4/raw"}
 
 class Hears(Protocol):
     def sender_event(self, src_id: int, event: SenderEvent) -> None: ...
-    def packet_received(self, data: bytes, now: float) -> None: ...
     def receiver_event(self, event: ReceiverEvent, now: float) -> None: ...
 
 
@@ -62,9 +61,11 @@ class Feed:
             self.packets += 1
             if self._lost(self.packets):
                 continue
-            for ear in self.ears:
-                ear.packet_received(data, now + latency)
-            self._tell(self.receiver.receive(data, now + latency), now + latency)
+            self.hear(data, now + latency)
+
+    def hear(self, data: bytes, now: float) -> None:
+        """Bytes come to the receiver."""
+        self._tell(self.receiver.receive(data, now), now)
 
     def wait(self, now: float) -> None:
         """Time passes at the receiver."""

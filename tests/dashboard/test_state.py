@@ -167,7 +167,7 @@ def test_packets_field_by_field() -> None:
     feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, hop=5)
     feed.submit(1, bytes(300), 10.0)
     feed.fly(10.0)
-    state.packet_received(b"no packet", 11.0)
+    feed.hear(b"no packet", 11.0)
     *packets, refused = state.tick(12.0).last_packets
     assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
     first = packets[0]
@@ -233,6 +233,6 @@ def test_an_hour_at_35_hz_takes_no_more_memory_than_ten_minutes() -> None:
     assert snapshot.sent == 3600 * 35
     assert snapshot.delivered > 0.7 * snapshot.sent
     source = state._sources[SRC]
-    assert max(len(source.open), len(source.away)) <= UNDER_WAY
+    assert len(source.messages) <= UNDER_WAY
     assert len(state._topics[SRC, 0].latencies) == LATENCIES
     assert resident_mb() - early[1] < 8

@@ -37,7 +37,7 @@ def snapshot(name: str = "/robot_4/at") -> Snapshot:
         feed.submit(0, at(step, 0), step / 10)
         feed.submit(1, bytes(200), step / 10)
         feed.fly(step / 10)
-    state.packet_received(b"<b>", 2.0)
+    feed.hear(b"<b>", 2.0)
     return state.tick(2.0, {(SRC, 0): 3})
 
 

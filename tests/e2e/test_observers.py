@@ -19,8 +19,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
-from gr_ros2.errors import ConfigError, RunError
-from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.errors import ConfigError, CrcError, RunError
+from gr_ros2.link.events import ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result, read_result
@@ -107,9 +107,6 @@ class Onlooker:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002
         self.on_packet()
         self.heard += 1
-
-    def packet_received(self, data: bytes, now: float) -> None:  # noqa: ARG002
-        self.on_packet()
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
         self.on_packet()
@@ -249,13 +246,13 @@ def test_a_capture_on_a_disk_that_takes_half_a_record_ends_with_a_whole_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with disk(tmp_path / "disk", "size=16k") as small:
-        capture = PacketCapture(small / "x.pcapng")
+        capture, noise = PacketCapture(small / "x.pcapng"), Rejected(bytes(61), CrcError("noise"))
         with pytest.raises(RunError, match=FULL):
             for _ in range(1000):
-                capture.packet_received(bytes(61), 0.0)
+                capture.receiver_event(noise, 0.0)
         packets = capture.packets
         with pytest.raises(RunError, match=FULL):
-            capture.packet_received(bytes(61), 0.0)
+            capture.receiver_event(noise, 0.0)
         capture.close()
         command.run(["packet", "decode", str(small / "x.pcapng")])
         assert capsys.readouterr().out.count("rejected") == packets > 0

@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pmt
 from gnuradio import gr
+
+from gr_ros2.link import ReceiverEvent, SenderEvent
+
+
+class Hears:
+    """A LinkObserver that hands every event to one function."""
+
+    def __init__(self, hear: Callable[[Any], object]) -> None:
+        self._hear = hear
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002
+        self._hear(event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
+        self._hear(event)
 
 
 def pdu(data: bytes) -> Any:

@@ -26,6 +26,7 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.registry import Registry
 from tests.domains import free_domains
+from tests.gr.probe import Hears
 from tests.waiting import wait_for
 
 STORE = typestore()
@@ -207,7 +208,7 @@ def test_a_source_repeats_the_static_transforms_of_all_its_broadcasters() -> Non
     events: list[Any] = []
     rows = Registry.from_rows({"/tf_static": TF_TYPE})
     with MemoryMiddleware(domain_id=64) as graph, MemoryMiddleware(domain_id=64) as robot:
-        source = RosSource(rows, robot_id=1, middleware=graph, observer=events.append)
+        source = RosSource(rows, robot_id=1, middleware=graph, observer=Hears(events.append))
         for child in ("imu", "laser"):
             robot.advertise("/tf_static", TF_TYPE, Qos("reliable", "transient_local", 1)).publish(transforms(child))
         wait_for(lambda: len(events) >= 2)

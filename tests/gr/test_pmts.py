@@ -14,30 +14,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.gr.pmts import PduMaker, packet_of
+from gr_ros2.wire.v0 import Packet
+
+PACKET = Packet(1, 255, 0, 1, ())
 
 
 @given(st.binary(min_size=14, max_size=4095))
 def test_bytes_survive(data: bytes) -> None:
-    assert packet_of(PduMaker().pdu(data, 0.0)) == (data, "")
+    assert packet_of(PduMaker().pdu(PACKET, data, 0.0)) == (data, "")
 
 
 @given(st.binary(min_size=14, max_size=300))
 def test_a_pdu_is_what_gnu_radio_itself_would_make(data: bytes) -> None:
-    vector = pmt.cdr(PduMaker().pdu(data, 0.0))
+    vector = pmt.cdr(PduMaker().pdu(PACKET, data, 0.0))
     assert pmt.equal(vector, pmt.init_u8vector(len(data), list(data)))
 
 
-def test_metadata_is_read_from_the_header() -> None:
+def test_metadata_says_what_the_packet_says() -> None:
     maker = PduMaker()
     for seq in (7, 8, 7):
-        metadata = pmt.to_python(pmt.car(maker.pdu(bytes([0b0000_0100, 3, 255, seq]) + bytes(60), 12.5)))
+        packet = Packet(3, 255, seq, 1, (), qos=1)
+        metadata = pmt.to_python(pmt.car(maker.pdu(packet, bytes(64), 12.5)))
         assert metadata == {"src_id": 3, "dst_id": 255, "seq": seq, "qos": 1, "t_src_wall": 12.5}
 
 
 def test_remembered_metadata_is_bounded() -> None:
     maker = PduMaker()
     for number in range(10_000):
-        maker.pdu(number.to_bytes(4, "big") + bytes(10), 0.0)
+        maker.pdu(Packet(number >> 8, 255, number & 255, 1, ()), bytes(14), 0.0)
     assert len(maker._metadata) <= 4096
 
 

@@ -8,21 +8,24 @@ import sys
 
 import pytest
 
-from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.errors import LengthError
+from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.link import Received, Rejected, SentPacket
 from gr_ros2.registry import Registry
-from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.wire.v0 import Entry, Packet
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
 
 
 def test_header_and_entries() -> None:
     packet = Packet(1, 255, 7, 1, (Entry(0, 9, 2, 5, b"abc"), Entry(3, 1, 0, 1, b"x")), qos=1)
-    line = describe_bytes(V0.encode(packet, 64), 64, REGISTRY)
+    line = describe(Received(b"", packet), REGISTRY)
+    assert line == describe(SentPacket(b"", packet, (), 0.0), REGISTRY)
     assert line == "v0 qos=latency flags=- src=1 dst=255 seq=7 hop=1 entries=2: 0:odom#9[2/5]=3B 3:?#1[0/1]=1B"
 
 
 def test_what_is_no_packet() -> None:
-    assert describe_bytes(bytes(10), 64, REGISTRY).startswith("refused (length)")
+    assert describe(Rejected(b"", LengthError("10 bytes")), REGISTRY) == "refused (length): 10 bytes"
 
 
 def test_lines_appear_on_standard_output_where_nothing_else_takes_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,11 +22,11 @@ from gr_ros2.config import SourceConfig
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.latency import Latency, LatencyWindow
-from gr_ros2.link import Delivered, Lost, Sender
+from gr_ros2.link import Delivered, Lost, Received, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
-from tests.gr.probe import Probe
+from tests.gr.probe import Hears, Probe
 from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows(
@@ -143,12 +143,12 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
 
 def test_an_incomplete_message_expires_without_further_packets(rig: Rig) -> None:
     events: list[Any] = []
-    rig.make(reassembly_timeout=0.05, observer=events.append)
+    rig.make(reassembly_timeout=0.05, observer=Hears(events.append))
     rig.start()
     rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
-    wait_for(lambda: events)
-    assert isinstance(events[0], Lost)
-    assert events[0].reason == "expired"
+    wait_for(lambda: len(events) == 2)
+    assert [type(event) for event in events] == [Received, Lost]
+    assert events[1].reason == "expired"
     assert rig.sink.stats()["topics"]["/rx_robot_1/odom"]["lost"] == {"expired": 1}
 
 
@@ -165,26 +165,25 @@ def test_delivered_is_observed_after_publication(rig: Rig) -> None:
             return publisher
 
         middleware.advertise = watched
-        rig.make(middleware=middleware, observer=lambda event: seen.append((event, len(published))))
+        rig.make(middleware=middleware, observer=Hears(lambda event: seen.append((event, len(published)))))
         rig.start()
         rig.probe.post(packets((0, stamped(5)[:40]))[0])
-        wait_for(lambda: seen)
-        assert isinstance(seen[0][0], Delivered)
-        assert seen[0][1] == 1
+        wait_for(lambda: len(seen) == 2)
+        assert [(type(event), count) for event, count in seen] == [(Received, 0), (Delivered, 1)]
         rig.sink.close()
 
 
 def test_a_failed_publication_is_counted_and_observed(rig: Rig) -> None:
     events: list[Any] = []
     middleware = MemoryMiddleware(domain_id=DOMAIN)
-    sink = rig.make(middleware=middleware, observer=events.append)
+    sink = rig.make(middleware=middleware, observer=Hears(events.append))
     rig.start()
     middleware.close()
     with pytest.raises(MiddlewareError):
         middleware.advertise("/x", "nav_msgs/Odometry", Qos())
     rig.probe.post(packets((0, stamped(5)[:40]))[0])
-    wait_for(lambda: events)
-    assert events == [Lost(1, 0, "publish_failed", events[0].entry_id)]
+    wait_for(lambda: len(events) == 2)
+    assert events[1] == Lost(1, 0, "publish_failed", events[0].packet.entries[0].entry_id)
     stats = sink.stats()
     assert stats["publish_failed"] == 1
     topic = stats["topics"]["/rx_robot_1/odom"]
@@ -201,14 +200,15 @@ def test_what_was_not_published_is_not_delivered_whatever_the_reason(rig: Rig, e
 
     events: list[Any] = []
     with Refusing(domain_id=DOMAIN) as middleware:
-        sink = rig.make(middleware=middleware, observer=events.append)
+        sink = rig.make(middleware=middleware, observer=Hears(events.append))
         rig.start()
         for data in packets((2, stamped(5)[:40]), (0, stamped(6)[:40]), (2, stamped(7)[:40])):
             rig.probe.post(data)
-        wait_for(lambda: len(events) == 3)
+        wait_for(lambda: len(events) == 6)
         stats = sink.stats()
         rig.sink.close()
-    assert sorted((event.topic_id, type(event)) for event in events) == [(0, Delivered), (2, Lost), (2, Lost)]
+    told = [event for event in events if not isinstance(event, Received)]
+    assert sorted((event.topic_id, type(event)) for event in told) == [(0, Delivered), (2, Lost), (2, Lost)]
     refused, passed = stats["topics"]["/rx_robot_1/cmd_vel"], stats["topics"]["/rx_robot_1/odom"]
     assert (refused["delivered"], refused["lost"]) == (0, {"publish_failed": 2})
     assert (passed["delivered"], passed["lost"]) == (1, {})
@@ -255,14 +255,14 @@ def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
             packet_len=PACKET_LEN,
             frame_prefix="r{src_id}/",
             merge_tf="/tf",
-            observer=events.append,
+            observer=Hears(events.append),
         )
         rig.start("/rx_robot_1/tf", "tf2_msgs/TFMessage")
         rig.probe.post(packets((0, b"\0\1\0\0" + bytes(4)))[0])
-        wait_for(lambda: events)
+        wait_for(lambda: len(events) == 2)
         stats = rig.sink.stats()
         rig.sink.close()
-    assert isinstance(events[0], Delivered)
+    assert isinstance(events[1], Delivered)
     assert (stats["tf_failed"], stats["handler_failed"]) == (1, 0)
     assert stats["topics"]["/rx_robot_1/tf"]["delivered"] == 1
 
@@ -271,36 +271,25 @@ def test_a_failing_observer_does_not_end_reception(rig: Rig, caplog: pytest.LogC
     def fail(_event: Any) -> None:
         raise ValueError("observer")
 
-    sink = rig.make(observer=fail)
+    sink = rig.make(observer=Hears(fail))
     rig.start()
     for data in packets(*((0, stamped(number)[:40]) for number in (1, 2))):
         rig.probe.post(data)
     wait_for(lambda: len(rig.heard) == 2)
-    wait_for(lambda: sink.stats()["observer_missed"] == 2)
+    wait_for(lambda: sink.stats()["observer_missed"] == 4)  # two packets and their messages
     assert [record.message for record in caplog.records if record.levelname == "ERROR"] == [
         "observer of ros2_sink: ended (ValueError: observer); the link goes on without it"
     ]
 
 
-def test_a_failing_observer_of_packets_does_not_end_reception(rig: Rig) -> None:
-    def fail(_data: bytes) -> None:
-        raise ValueError("observer")
-
-    sink = rig.make(packet_observer=fail)
-    rig.start()
-    for data in packets(*((0, stamped(number)[:40]) for number in (1, 2))):
-        rig.probe.post(data)
-    wait_for(lambda: len(rig.heard) == 2)
-    assert sink.stats()["observer_missed"] == 2
-
-
 def test_a_failing_observer_does_not_end_the_watch_over_timeouts(rig: Rig) -> None:
-    def fail(_event: Any) -> None:
-        raise ValueError("observer")
+    def fail(event: Any) -> None:
+        if isinstance(event, Lost):
+            raise ValueError("observer")
 
-    sink = rig.make(reassembly_timeout=0.05, observer=fail)
+    sink = rig.make(reassembly_timeout=0.05, observer=Hears(fail))
     rig.start()
-    for count in (1, 2):
+    for count in (1, 3):  # the second packet and what it began
         rig.probe.post(packets((0, stamped(count) + bytes(600)))[0])
         wait_for(lambda count=count: sink.stats()["observer_missed"] == count)
     assert [thread for thread in threading.enumerate() if thread.name == "gr-ros2-sink"]
@@ -311,13 +300,13 @@ def test_what_an_observer_makes_of_a_loss_does_not_cost_the_next_message(rig: Ri
         if isinstance(event, Lost):
             raise ValueError("observer")
 
-    sink = rig.make(observer=fail)
+    sink = rig.make(observer=Hears(fail))
     rig.start()
     # The same entry id: the second message ends the first, which is not complete.
     for data in packets((0, bytes(600)))[:1] + packets((0, stamped(5)[:40])):
         rig.probe.post(data)
     wait_for(lambda: rig.heard == [stamped(5)[:40]])
-    wait_for(lambda: sink.stats()["observer_missed"] == 2)
+    wait_for(lambda: sink.stats()["observer_missed"] == 2)  # the loss, and the message delivered behind it
 
 
 def test_nothing_waits_while_latencies_are_sorted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

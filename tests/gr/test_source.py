@@ -24,7 +24,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0
 from tests.domains import free_domains
-from tests.gr.probe import Probe
+from tests.gr.probe import Hears, Probe
 from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
@@ -118,7 +118,7 @@ def test_each_topic_has_its_depth(rig: Rig) -> None:
 
 def test_what_outlives_its_lifespan_is_stale(rig: Rig) -> None:
     refused: list[Refused] = []
-    rig.make(observer=lambda event: refused.append(event) if isinstance(event, Refused) else None)
+    rig.make(observer=Hears(lambda event: refused.append(event) if isinstance(event, Refused) else None))
     publisher = rig.robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=5, lifespan_s=0.01))
     rig.source.use_credit()
     rig.start(credit=True)
@@ -141,7 +141,7 @@ def test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up
         held.set()
         release.wait(20)
 
-    source = rig.make(topics=["odom"], subscriber_depth=5, observer=observe)
+    source = rig.make(topics=["odom"], subscriber_depth=5, observer=Hears(observe))
     rig.publish(bytes(40))
     wait_for(held.is_set)
     rig.publish(bytes(40), count=29)
@@ -156,7 +156,7 @@ def test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up
 
 def test_what_the_graph_loses_last_is_told_when_the_source_stops(rig: Rig) -> None:
     events: list[SenderEvent] = []
-    source = rig.make(observer=events.append)
+    source = rig.make(observer=Hears(events.append))
     rig.start()
     subscription = source._subscriptions[0]
     source.middleware.count_lost(subscription, "/robot_1/odom", "lost", 3)
@@ -199,7 +199,7 @@ def test_credit_paces(rig: Rig) -> None:
 
 def test_events_reach_the_observer_in_order(rig: Rig) -> None:
     events: list[Any] = []
-    rig.make(packet_len=64, observer=events.append)
+    rig.make(packet_len=64, observer=Hears(events.append))
     rig.start()
     rig.publish(bytes(40))
     rig.publish(bytes(64_000))
@@ -272,7 +272,7 @@ def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
         if isinstance(event, SentPacket) and event.entries[0].serial == 0:
             raise ValueError("observer")
 
-    source = rig.make(packet_len=64, observer=fail)
+    source = rig.make(packet_len=64, observer=Hears(fail))
     rig.start()
     rig.publish(bytes(40))
     wait_for(lambda: source.stats()["observer_missed"] == 1)

@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig, build
-from gr_ros2.link import Delivered, Receiver, ReceiverEvent, Sender
+from gr_ros2.link import Delivered, Received, Receiver, ReceiverEvent, Sender
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0, Packet
 
@@ -40,6 +40,11 @@ def trace(packets: list[bytes]) -> list[list[tuple[int, int, int]]]:
 
 def read(data: bytes) -> Packet:
     return V0.decode(data, len(data))
+
+
+def take(engine: Receiver, data: bytes, now: float) -> list[ReceiverEvent]:
+    """What comes of a packet, beside that it came."""
+    return [event for event in engine.receive(data, now) if not isinstance(event, Received)]
 
 
 def delivered(events: list[ReceiverEvent]) -> list[bytes]:

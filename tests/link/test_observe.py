@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gr_ros2.errors import CrcError
-from gr_ros2.link.events import Accepted, ReceiverEvent, Rejected, SenderEvent
+from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 
 
@@ -18,11 +18,8 @@ class Hears:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002
         self._hear("sender")
 
-    def packet_received(self, data: bytes, now: float) -> None:  # noqa: ARG002
-        self._hear("packet")
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
-        self._hear("receiver")
+        self._hear("packet" if isinstance(event, Rejected) else "message")
 
     def _hear(self, what: str) -> None:
         if what == self._fails_at:
@@ -32,12 +29,12 @@ class Hears:
 
 def tell(observers: Observers[LinkObserver]) -> None:
     observers.sender_event(1, Accepted(0, 0, b"", 0.0))
-    observers.packet_received(b"", 0.0)
-    observers.receiver_event(Rejected(CrcError("x")), 0.0)
+    observers.receiver_event(Rejected(b"", CrcError("x")), 0.0)
+    observers.receiver_event(Delivered(1, 0, b"", 0), 0.0)
 
 
 def test_one_that_fails_costs_the_others_nothing() -> None:
-    whole = ["sender", "packet", "receiver"]
+    whole = ["sender", "packet", "message"]
     for place, kind in enumerate(whole):
         first, bad, last = Hears(), Hears("bad", kind), Hears()
         observers = Observers[LinkObserver]([first, bad, last])
@@ -55,7 +52,7 @@ def test_what_one_within_another_missed_is_told_too() -> None:
     tell(observers)
     guard = observers.add(late, needed=True)
     tell(observers)
-    assert late.heard == ["sender", "packet", "receiver"]
+    assert late.heard == ["sender", "packet", "message"]
     assert guard.name == name_of(late) == "hears"
     assert observers.told() == ["deep: ended (ValueError: packet); 5 events missed"]
     assert name_of(observers) == "Observers"

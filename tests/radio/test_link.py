@@ -11,7 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.link import Delivered
-from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import Accepted, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY
 from gr_ros2.radio.link import RobotLink
@@ -71,13 +71,12 @@ class Ears:
         assert src_id == 1
         self.sent.append(event)
 
-    def packet_received(self, data: bytes, now: float) -> None:
-        self.packets.append(data)
-        self.times.append(now)
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        self.received.append(event)
         self.times.append(now)
+        if isinstance(event, Received):
+            self.packets.append(event.data)
+        else:
+            self.received.append(event)
 
 
 def test_an_observer_is_told_everything() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gr_ros2.link.events import Accepted, Delivered, Missed, Refused, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Missed, Received, Refused, SentEntry, SentPacket
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result, write_result
@@ -64,16 +64,17 @@ def recorded() -> Recorder:
             if imu >= 0 and index == 0:
                 record.append(SentEntry(imu, 1, step, 0, 1))
             entries = tuple(
-                Entry(e.topic_id, e.entry_id, e.index, e.total, bytes([step, e.topic_id, e.index])) for e in record
+                Entry(e.topic_id, step, e.index, e.total, bytes([step, e.topic_id, e.index])) for e in record
             )
-            data = V0.encode(Packet(1, 255, number & 255, 1, entries), 64)
+            packet = Packet(1, 255, number & 255, 1, entries)
+            data = V0.encode(packet, 64)
             number += 1
             left = now + (index + 1) * 0.02 - 0.02
-            recorder.sender_event(1, SentPacket(data, tuple(record), left))
+            recorder.sender_event(1, SentPacket(data, packet, tuple(record), left))
             lost = step % 4 == 3 and index == 1 and step < 4 * LOST + 2
             if lost or step >= ODOM - UNSENT - IN_FLIGHT:
                 continue
-            recorder.packet_received(data, left + 0.05)
+            recorder.receiver_event(Received(data, packet), left + 0.05)
             if imu >= 0 and index == 0:
                 recorder.receiver_event(Delivered(1, 1, b"imu %d" % step, 0, step), left + 0.05)
             if index == 1:

@@ -38,7 +38,6 @@ def test_a_run_over_the_engines() -> None:
         while (data := sender.next_packet(now)) is not None:
             if 20 <= step < 30:  # an outage
                 continue
-            recorder.packet_received(data)
             for event in receiver.receive(data, now + 0.05):
                 recorder.receiver_event(event, now + 0.05)
     assert recorder.progress() == (100, 90)

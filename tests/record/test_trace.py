@@ -16,6 +16,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Accepted, Delivered, SentEntry, SentPacket
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.trace import PacketLog, read_trace, write_trace
+from gr_ros2.wire.v0 import Entry, Packet
 from tests.record.runs import DURATION_S, IMU, IN_FLIGHT, LOST, ODOM, TOO_LARGE, UNSENT, empty_trace, make_run
 
 NAMES = ["messages", "packets", "paths"]
@@ -151,11 +152,12 @@ def test_a_packet_costs_numbers_and_no_objects() -> None:
     def send(numbers: range) -> None:
         for number in numbers:
             ledger.sender_event(1, Accepted(number, 0, b"x%d" % number, float(number)))
-            event = SentPacket(number.to_bytes(8, "big"), (SentEntry(number, 0, number & 255, 0, 1),), float(number))
+            packet = Packet(1, 255, number & 255, 1, (Entry(0, number & 255, 0, 1, b""),))
+            entry = SentEntry(number, 0, number & 255, 0, 1)
+            event = SentPacket(number.to_bytes(8, "big"), packet, (entry,), float(number))
             log.sent(event)
             ledger.sender_event(1, event)
-            packet = ledger.packet_received(event.data)
-            assert packet == (1, number)
+            assert ledger.packet_received(event.data) == (1, number)
             log.received(number, float(number))
             ledger.receiver_event(Delivered(1, 0, b"x%d" % number, 0, number & 255), float(number))
 

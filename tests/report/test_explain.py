@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from gr_ros2.link.outcome import ROWS, Row
 from gr_ros2.report.explain import explanation
 from tests.record.results import RESULT
 from tests.record.runs import empty_trace, make_run
@@ -58,3 +59,10 @@ def test_as_fast_as_the_flowgraph_runs_the_clock_says_nothing_of_the_air(tmp_pat
 
 def test_nothing_sent() -> None:
     assert explanation(replace(RESULT, topics=()), empty_trace()) == ["No message was sent."]
+
+
+def test_every_row_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    everything = replace(run.result.topics[0], ledger=dict.fromkeys(ROWS, 1), sent=len(ROWS))
+    outcome, *_ = explanation(replace(run.result, topics=(everything,)), run.trace)
+    assert all(row.words in outcome for row in Row)

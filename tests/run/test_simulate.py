@@ -10,10 +10,12 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.gr.ends import message_codec
+from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import Offered, Simulated, simulate
+from gr_ros2.run.simulate import End, EventLoop, Offered, Simulated, Way, make_ends, simulate
 
 
 class Sized:
@@ -161,3 +163,39 @@ def test_the_time_of_the_computer_is_added_to_every_latency() -> None:
 def test_what_has_no_times_is_refused() -> None:
     with pytest.raises(ConfigError, match="pace = 'flow'"):
         run("paper-ofdm-paced", "pace=flow")
+
+
+class Answering(EndpointV0):
+    """Says the size of every message it gets, as an end that acknowledges would."""
+
+    answers = True
+
+    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
+        events = super().receive(data, now)
+        for event in events:
+            if isinstance(event, Delivered):
+                self.submit(event.topic_id, len(event.payload).to_bytes(4, "big"), now)
+        return events
+
+
+def test_an_end_may_answer_what_it_hears() -> None:
+    settings = scenario("two-way", "time=packets", duration=2.0)
+    there, back = settings.directions()
+    registry = there.load_registry()
+    (one, _) = make_ends((there, back), registry)
+    told: list[SenderEvent] = []
+    codecs = message_codec(back.ros_source, registry), message_codec(there.ros_sink, registry)
+    other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
+    ways = [
+        Way(there, one, other, 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])),
+        Way(back, other, one, 0.01, iter(())),
+    ]
+    for way in ways:
+        way.air = lambda data, now: [data]  # noqa: ARG005
+    heard = [(now, event) for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
+    times = [now for now, _ in heard]
+    assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]
+    answers = [event.payload for _, event in heard if event.src_id == back.ros_source.src_id()]
+    assert [int.from_bytes(answer, "big") for answer in answers] == [51, 300]
+    assert times == sorted(times)
+    assert times[1] - times[0] == pytest.approx(0.01), "the answer is on the air as soon as the message has landed"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent
+from gr_ros2.errors import LengthError
+from gr_ros2.link.events import Accepted, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.observe import Observers
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.recorder import Recorder
@@ -34,9 +35,6 @@ class Onlooker:
         assert src_id == 1
         self.heard.append(type(event).__name__)
 
-    def packet_received(self, data: bytes, now: float) -> None:  # noqa: ARG002
-        self.heard.append("received")
-
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
         self.heard.append(type(event).__name__)
 
@@ -50,7 +48,7 @@ def test_an_onlooker_hears_what_the_result_counts() -> None:
     assert onlooker.heard.count("Accepted") == topic.sent
     assert onlooker.heard.count("Delivered") == topic.delivered
     assert onlooker.heard.count("SentPacket") == result.packets["sent"]
-    assert onlooker.heard.count("received") == result.packets["received"]
+    assert onlooker.heard.count("Received") == result.packets["received"]
     assert onlooker.run is not None
     assert onlooker.run.topics == {(1, 0): "/robot_1/odom"}
     assert onlooker.run.ledger.rows()[1, 0] == topic.ledger
@@ -61,8 +59,8 @@ def test_everyone_hears_in_turn() -> None:
     one, other = Onlooker(), Onlooker()
     fanout = Observers([one, other])
     fanout.sender_event(1, Accepted(0, 0, b"", 0.0))
-    fanout.packet_received(b"", 0.0)
-    assert one.heard == other.heard == ["Accepted", "received"]
+    fanout.receiver_event(Rejected(b"", LengthError("0 bytes")), 0.0)
+    assert one.heard == other.heard == ["Accepted", "Rejected"]
 
 
 def test_the_rows_of_an_open_ledger_add_up() -> None:
@@ -76,7 +74,6 @@ def test_the_rows_of_an_open_ledger_add_up() -> None:
 
 def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
     audience, early, late = Audience(), Onlooker(), Onlooker()
-    audience.invite(early)
 
     class Invites(Onlooker):
         """Lets the late one in when the first message is delivered."""
@@ -89,12 +86,10 @@ def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
         def sender_event(self, src_id: int, event: SenderEvent) -> None:
             """Not counted."""
 
-        def packet_received(self, data: bytes, now: float) -> None:
-            """Not counted."""
-
     ends = ["ros_source.middleware=memory", "ros_sink.middleware=memory"]
-    watchers = [Invites(), audience]
-    result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), watchers=watchers).result
+    for watcher in (Invites(), early):
+        audience.invite(watcher)
+    result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), watchers=[audience]).result
     assert late.run is early.run
     assert late.result is early.result is result
     assert 0 < late.heard.count("Delivered") <= early.heard.count("Delivered") == result.topics[0].delivered

@@ -1,0 +1,88 @@
+"""Both halves of a robot's end behind one surface."""
+
+from __future__ import annotations
+
+import random
+from math import inf
+
+import pytest
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import ConfigError
+from gr_ros2.link import Delivered, Endpoint, EndpointV0, Lost, SenderEvent, SentPacket
+from tests.link.engines import registry
+
+
+def end(robot: int, *, sends: bool = True, hears: bool = True, told: list[SenderEvent] | None = None) -> EndpointV0:
+    source = SourceConfig(robot_id=robot, packet_len=64, packet_rate=100.0) if sends else None
+    sink = SinkConfig(packet_len=64, robot_id=robot, reassembly_timeout=0.5) if hears else None
+    observer = None if told is None else told.append
+    return EndpointV0(registry(), source, sink, rng=random.Random(robot), observer=observer)
+
+
+def run(ends: list[Endpoint], until: float) -> list[list[bytes]]:
+    """Each hears at once what the other sends; the messages that each delivered, in order."""
+    got: list[list[bytes]] = [[], []]
+    now = 0.0
+    while now < until:
+        for place, (one, other) in enumerate((ends, ends[::-1])):
+            events = one.handle_timeout(now)
+            while (data := one.next_packet(now)) is not None:
+                got[1 - place] += [e.payload for e in other.receive(data, now) if isinstance(e, Delivered)]
+            assert not any(isinstance(event, Delivered) for event in events)
+        later = [at for e in ends if (at := e.next_timeout()) is not None]
+        assert all(at > now for at in later), "what is due has been done"
+        now = min(later, default=inf)
+    return got
+
+
+def test_two_ends_send_to_each_other() -> None:
+    told: list[SenderEvent] = []
+    ends: list[Endpoint] = [end(1, told=told), end(2)]
+    messages = [[bytes([robot, number]) * 60 for number in range(5)] for robot in (1, 2)]
+    for number in range(5):
+        for place, one in enumerate(ends):
+            one.submit(number % 3, messages[place][number], 0.0)
+    assert not ends[0].idle
+    got = run(ends, 10.0)
+    assert [sorted(payloads) for payloads in got] == [sorted(messages[1]), sorted(messages[0])]
+    assert all(one.idle and one.next_timeout() is None for one in ends)
+    assert ends[0].sent.packets == ends[1].received.packets == sum(isinstance(event, SentPacket) for event in told)
+
+
+def test_an_end_that_only_sends_and_one_that_only_hears() -> None:
+    source, sink = end(1, hears=False), end(2, sends=False)
+    source.submit(0, bytes(100), 0.0)
+    packets = [source.next_packet(number / 100) for number in range(4)]
+    assert packets[2:] == [None] * 2, "two fragments"
+    assert source.receive(packets[0] or b"", 0.0) == source.handle_timeout(9.0) == []
+    events = [event for data in packets[:2] for event in sink.receive(data or b"", 0.0)]
+    assert [event.payload for event in events if isinstance(event, Delivered)] == [bytes(100)]
+    assert sink.next_packet(0.0) is None
+    assert sink.idle
+    sink.credit(3)
+    with pytest.raises(ConfigError, match="an end that sends nothing"):
+        sink.submit(0, b"x", 0.0)
+
+
+def test_the_next_timeout_is_that_of_the_half_that_comes_first() -> None:
+    one, other = end(1), end(2)
+    other.submit(0, bytes(160), 0.0)
+    first, _ = other.next_packet(0.0), other.next_packet(0.0)
+    assert other.next_timeout() == pytest.approx(0.01), "the next packet"
+    one.receive(first or b"", 0.0)
+    assert one.next_timeout() == pytest.approx(0.5), "the incomplete message"
+    one.submit(0, b"x", 0.1)
+    assert one.next_timeout() == pytest.approx(-inf)
+    assert one.next_packet(0.1) is not None
+    assert [type(event) for event in one.handle_timeout(0.5)] == [Lost]
+    assert one.next_timeout() is None
+
+
+def test_packets_wait_for_credit() -> None:
+    one = end(1)
+    one.use_credit()
+    one.submit(0, b"x", 0.0)
+    assert one.next_packet(0.0) is None
+    one.credit()
+    assert one.next_packet(0.0) is not None
