@@ -9,7 +9,10 @@ MIDDLEWARE = BackendTable(
     "middleware",
     {
         "dds": Backend(
-            "gr_ros2.middleware.dds", "DdsMiddleware", "embedded DDS, no ROS install", "pip install cyclonedds==11.0.1"
+            "gr_ros2.middleware.dds",
+            "DdsMiddleware",
+            "embedded DDS, no ROS install",
+            "Cyclone DDS 11.0, which the installation of gr-ros2 brings",
         ),
         "rclpy": Backend(
             "gr_ros2.middleware.rclpy", "RclpyMiddleware", "a sourced ROS 2 (Humble or later)", "a sourced ROS 2 setup"
