@@ -51,4 +51,4 @@ $(VENV)/stamp-dev: $(VENV)/stamp-run requirements-dev.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info gr_ros2/phy/kernels/*.so
+	rm -rf $(VENV) build dist *.egg-info gr_ros2/phy/kernels/*.so gr_ros2/middleware/*.so

@@ -1,10 +1,21 @@
 """Package metadata; it stands here and not in pyproject.toml because colcon reads it from here."""
 
 import platform
+import shutil
+import subprocess
+import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from zipfile import ZipFile
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
+
+CYCLONEDDS = "cyclonedds==11.0.1"
+NEWEST_CYCLONEDDS = (3, 13)
+"""The last Python that its wheels are for. Their C library, which is all that is used, needs none: for a newer Python
+the build takes it out of the last wheel, and it becomes a part of ours."""
+LIBDDSC = Extension("gr_ros2.middleware.libddsc", sources=[])
 
 KERNELS = "gr_ros2/phy/kernels"
 COMPILE = [
@@ -38,10 +49,28 @@ def kernels(variant: str, flags: list[str]) -> Extension:
     )
 
 
-class BuildKernels(build_ext):
-    """Objects of each variant in a folder of its own."""
+def fetch_libddsc(place: Path) -> None:
+    """Write the C library of the last Python's wheel to a file."""
+    last = ".".join(map(str, NEWEST_CYCLONEDDS))
+    with TemporaryDirectory() as folder:
+        download = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+        subprocess.run([*download, "--python-version", last, "--dest", folder, CYCLONEDDS], check=True)
+        (wheel,) = Path(folder).glob("cyclonedds-*.whl")
+        with ZipFile(wheel) as files:
+            (library,) = (name for name in files.namelist() if name.startswith("cyclonedds.libs/libddsc"))
+            with files.open(library) as source, place.open("wb") as target:
+                shutil.copyfileobj(source, target)
+
+
+class BuildLibraries(build_ext):
+    """Objects of each variant of the kernels in a folder of its own; the DDS library comes ready."""
 
     def build_extension(self, ext: Extension) -> None:
+        if ext is LIBDDSC:
+            place = Path(self.get_ext_fullpath(ext.name))
+            place.parent.mkdir(parents=True, exist_ok=True)
+            fetch_libddsc(place)
+            return
         shared, self.build_temp = self.build_temp, str(Path(self.build_temp) / ext.name.rpartition(".")[2])
         try:
             super().build_extension(ext)
@@ -72,8 +101,11 @@ setup(
             "compression/dictionaries/*",
         ]
     },
-    ext_modules=[kernels(variant, flags) for variant, flags in VARIANTS.items()],
-    cmdclass={"build_ext": BuildKernels},
+    ext_modules=[
+        *(kernels(variant, flags) for variant, flags in VARIANTS.items()),
+        *([LIBDDSC] if sys.version_info[:2] > NEWEST_CYCLONEDDS else []),
+    ],
+    cmdclass={"build_ext": BuildLibraries},
     # What a ROS 2 workspace looks for; GRC finds the blocks in share by the hook of colcon.pkg.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gr_ros2"]),
@@ -87,10 +119,12 @@ setup(
         "apsw>=3.46",
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
-        "cyclonedds==11.0.1",
+        f"{CYCLONEDDS}; python_version < '3.14'",
         "jinja2>=3.1,<4",
         "matplotlib>=3.9,<4",
-        "numpy>=1.21.5,<2",
+        # That of the distribution's GNU Radio: Debian's and Ubuntu's was built for numpy 2 from Python 3.13 on.
+        "numpy>=1.21.5,<2; python_version < '3.13'",
+        "numpy>=2,<3; python_version >= '3.13'",
         "pyarrow>=17",
         "plotext>=5.3,<6",
         "pydantic>=2.10,<3",

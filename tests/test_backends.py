@@ -128,20 +128,22 @@ def test_our_back_ends_load(table: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("package", "table", "name", "remedy"),
+    ("packages", "table", "name", "remedy"),
     [
-        ("cyclonedds", "middleware", "dds", "pip install cyclonedds"),
-        ("rclpy", "middleware", "rclpy", "a sourced ROS 2 setup"),
-        ("gnuradio", "phy", "ofdm", "apt install gnuradio"),
+        (("cyclonedds", "gr_ros2.middleware.libddsc"), "middleware", "dds", "the installation of gr-ros2"),
+        (("rclpy",), "middleware", "rclpy", "a sourced ROS 2 setup"),
+        (("gnuradio",), "phy", "ofdm", "apt install gnuradio"),
     ],
 )
-def test_choosing_what_is_not_installed_names_what_to_install(package: str, table: str, name: str, remedy: str) -> None:
+def test_choosing_what_is_not_installed_names_what_to_install(
+    packages: tuple[str, ...], table: str, name: str, remedy: str
+) -> None:
     code = f"""
 import sys
 
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] == {package!r}:
+        if name.startswith({packages!r}):
             raise ImportError("blocked")
 
 sys.meta_path.insert(0, Blocked())

@@ -47,11 +47,10 @@ CONFINED = {
     "pmt": ("gr/", "phy/", "radio/", "race/air.py"),
     "rclpy": ("middleware/rclpy.py", "ros/"),
     "rcl_interfaces": ("ros/",),
-    "cyclonedds": ("middleware/cdr_dds.py", "middleware/dds"),
     "distributed": ("study/sweep/cluster.py",),
     "zenoh": ("middleware/zenoh.py", "race/"),
 }
-BLOCKED = tuple(CONFINED)
+BLOCKED = (*CONFINED, "cyclonedds")
 WITHOUT_BACKENDS = (
     "gr_ros2",
     "gr_ros2.wire",

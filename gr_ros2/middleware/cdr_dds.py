@@ -1,9 +1,8 @@
 """The one module that knows the symbols of the DDS library: whole CDR messages in and out, no message definition.
 
 A topic is declared with a descriptor of one octet. The library keeps what follows that octet untouched, so any
-type passes as opaque bytes, under whatever type name the topic carries. The library is the one inside PyPI's
-cyclonedds 11.0; most functions used are its documented C API (dds.h), those of the serdata family are not, hence
-the check of the version.
+type passes as opaque bytes, under whatever type name the topic carries. Most functions used are the library's
+documented C API (dds.h); those of the serdata family are not, and the layouts here are those of version 11.0.
 
 Laws: entities are plain integers and every function may be called from any thread; calls release the GIL; whatever
 the library refuses is a DdsError that names call and code. An entity deleted elsewhere makes calls fail, never crash.
@@ -13,16 +12,11 @@ from __future__ import annotations
 
 import ctypes as c
 from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any, NamedTuple
 
-from cyclonedds.internal import DDS
-
 from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware import dds_library
 from gr_ros2.middleware.base import Qos, finite
-
-if not version("cyclonedds").startswith("11.0."):
-    raise ImportError(f"cyclonedds {version('cyclonedds')} is installed, which lacks a layout this was written for")
 
 Entity = int
 """Handle of anything the library made."""
@@ -147,9 +141,11 @@ class _Status(c.Structure):
     ]
 
 
+_LIBRARY = dds_library.load()
+
+
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    # Subscription makes a function object of our own, so these types do not disturb the package's own calls.
-    function = DDS._dll_handle[name]
+    function = _LIBRARY[name]
     function.restype, function.argtypes = result, list(arguments)
     return function
 

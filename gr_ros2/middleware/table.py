@@ -37,7 +37,7 @@ MIDDLEWARE = BackendTable(
             "gr_ros2.middleware.dds",
             "DdsMiddleware",
             "embedded DDS, no ROS install",
-            "pip install cyclonedds==11.0.1",
+            "Cyclone DDS 11.0, which the installation of gr-ros2 brings",
             title="DDS (embedded)",
             localhost_only=True,
         ),

@@ -267,7 +267,7 @@ class LinearModem(BurstModem):
         total = float(np.vdot(received, received).real)
         rest = max(total - float(np.vdot(explained, explained).real), _TINY)
         noise = rest / (count - unknowns)
-        return (total - count * noise) / (self._clean_energy * noise)
+        return float((total - count * noise) / (self._clean_energy * noise))
 
     def _lateness(self, samples: Samples, start: int, frequency: float) -> float:
         """Samples by which the preamble's symbols lie behind ``start``, -0.5..0.5."""

@@ -16,6 +16,9 @@ from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Se
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
 from gr_ros2.phy.soft import Points
 
+Complexes = NDArray[np.complexfloating[Any, Any]]
+"""Complex numbers of single or double precision."""
+
 _FALSE_ALARM = 1e-3
 """Share of samples of noise that are looked at closely."""
 _ALIKE = 0.2
@@ -315,7 +318,7 @@ class OfdmModem(BurstModem):
         return signal * self._power / (float(self._word_weight.sum()) * noise * self._size)
 
     def _decide(
-        self, rows: NDArray[np.complex64], channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
+        self, rows: Complexes, channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
     ) -> tuple[_Channel, NDArray[np.float32], Samples, float]:
         """Symbols to likelihoods of points, with a channel estimate that they have made better.
 
@@ -351,9 +354,8 @@ class OfdmModem(BurstModem):
         return _Channel(gains, total, noise), likely, seen, late
 
     def _weigh(
-        self, rows: NDArray[np.complex64], gains: NDArray[np.complex128], noise: float, points: Points,
-        used: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.float32], Samples]:  # fmt: skip
+        self, rows: Complexes, gains: NDArray[np.complex128], noise: float, points: Points, used: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float32], Samples]:
         gains = gains[self._data]
         power = np.abs(gains) ** 2 + _TINY
         seen = (rows[:, self._data] * (gains.conj() / power))[used].astype(np.complex64)

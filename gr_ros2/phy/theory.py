@@ -118,7 +118,7 @@ def _information(points: bytes, snr_db: float) -> tuple[float, float]:
     """Mean and variance of what one received point tells of the one sent, bits."""
     sent = np.frombuffer(points, np.complex64).astype(np.complex128)
     noise = np.mean(np.abs(sent) ** 2) / 10 ** (snr_db / 10)
-    nodes, weights = np.polynomial.hermite.hermgauss(24)  # type: ignore[no-untyped-call]
+    nodes, weights = np.polynomial.hermite.hermgauss(24)
     added = sqrt(noise) * (nodes[:, None] + 1j * nodes).reshape(-1)
     share = (weights[:, None] * weights).reshape(-1) / pi
     apart = np.abs(sent[:, None, None] - sent[None, :, None] + added) ** 2

@@ -15,7 +15,7 @@ import struct
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 from gnuradio import blocks, iio
@@ -101,7 +101,8 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     def close(self) -> None:
         if self._receiving is not None:
-            self._receiving.stop()
+            with suppress(RuntimeError):  # from GNU Radio 3.10.9 on, of one that does not run or was stopped already
+                self._receiving.stop()
             # Kept for ever: its destructor waits for a thread of its own that never ends when it was not started, or
             # ran for less than a second.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._receiving))

@@ -126,7 +126,7 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
         counts = np.array([ledger.get(row, 0) for ledger in shown.values()])
         width = counts / sent * 100 if shown else left
         axes.barh(places, width, left=left, height=0.7, color=row_colour(row), label=row.replace("_", " "))
-        for place, start, share, count in zip(places, left, width, counts, strict=True):
+        for place, start, share, count in zip(range(len(shown)), left, width, counts, strict=True):
             if share > 1.5 + 1.2 * len(str(count)):  # where the number fits into the bar
                 axes.text(start + share / 2, place, str(count), ha="center", va="center", fontsize=8)
         left += width

@@ -6,8 +6,12 @@ Law: every place keeps ``clearance`` from walls and obstacles, and so does every
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gr_ros2.sim.world import Floats, World
+
+Places = NDArray[np.int_]
+"""Indices of places."""
 
 _NEIGHBOUR_M = 6.0
 _SPACING_M = 1.1
@@ -38,7 +42,7 @@ class Roadmap:
         self.reachable = np.flatnonzero(np.isfinite(distance[hub]))
         """Indices of the places that can reach each other."""
 
-    def _routes(self, nodes: Floats) -> tuple[Floats, np.ndarray]:  # type: ignore[type-arg]
+    def _routes(self, nodes: Floats) -> tuple[Floats, Places]:
         """Shortest distances and next steps between all places (Floyd and Warshall)."""
         count = len(nodes)
         lengths = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
@@ -65,7 +69,7 @@ class Roadmap:
                 return int(node)
         return int(order[0])
 
-    def far_from(self, node: int, least_m: float) -> np.ndarray:  # type: ignore[type-arg]
+    def far_from(self, node: int, least_m: float) -> Places:
         """Places at least that far to drive, or the farthest one if none is."""
         distance = self._distance[node, self.reachable]
         far = self.reachable[distance >= least_m]

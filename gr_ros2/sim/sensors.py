@@ -55,7 +55,7 @@ class Sensors:
         self._gyro_bias = rng.normal(0.0, settings.imu_gyro_noise / 5, 3)
         self._accel_bias = rng.normal(0.0, settings.imu_accel_noise / 5, 3)
         turn = 2 * math.pi / settings.beams
-        self._bearings: Floats = -math.pi + turn * np.arange(settings.beams)
+        self._bearings: Floats = -math.pi + turn * np.arange(settings.beams, dtype=np.float64)
         # What drivers fill in: how far wrong position, height, roll, pitch and heading may be.
         pose = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
         twist = (settings.odom_linear_noise**2, 1e-6, 1e6, 1e6, 1e6, settings.odom_angular_noise**2)

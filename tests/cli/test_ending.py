@@ -23,7 +23,7 @@ GRAPH = ("registry", "from-graph", "--wait", "60")
         (PLAN, "pydantic_core"),  # with the command's own modules
         (PLAN, "pmt"),
         (PLAN, "gnuradio.digital.digital_python"),  # with a PHY
-        (GRAPH, "cyclonedds.core"),  # with a middleware
+        (GRAPH, "gr_ros2.middleware.cdr_dds"),  # with a middleware
     ],
 )
 def test_a_signal_while_modules_are_loaded(words: tuple[str, ...], loaded: str, number: signal.Signals) -> None:

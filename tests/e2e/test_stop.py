@@ -23,7 +23,12 @@ class Run:
     def __init__(self, *arguments: str) -> None:
         self._terminal, end = pty.openpty()
         self.process = subprocess.Popen(
-            [*COMMAND, "run", *arguments], stdout=end, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+            [*COMMAND, "run", *arguments],
+            stdout=end,
+            stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            text=True,
+            env={**os.environ, "TERM": "xterm"},  # a `dumb` one shows no progress
         )
         os.close(end)
         self.shown = ""

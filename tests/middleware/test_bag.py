@@ -151,12 +151,16 @@ def test_close_interrupts_waiting(tmp_path: Path) -> None:
 def test_truncated_is_one_line_naming_the_path(tmp_path: Path, storage: Storage, keep: float) -> None:
     path = write(tmp_path / "bag", storage, count=2000)
     (file,) = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3")]
-    data = file.read_bytes()
+    intact, data = list(read_bag(path)), file.read_bytes()
     file.write_bytes(data[: int(keep * len(data))])
     for damaged in (path, file):
-        with pytest.raises(BagError) as caught:
-            list(read_bag(damaged))
-        assert str(damaged) in str(caught.value) and "\n" not in str(caught.value)
+        try:
+            got = list(read_bag(damaged))
+        except BagError as error:
+            assert str(damaged) in str(error) and "\n" not in str(error)
+        else:
+            # SQLite from 3.46 on reads a file that lacks the unused end of its last page.
+            assert (storage, keep) == ("sqlite3", 0.999) and got == intact
 
 
 def test_damage_found_while_playing_ends_it(tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from tests.waiting import wait_for
 
 SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
+THIRD = Path("/usr/include/fastdds/config.hpp")
+"""Fast DDS 3 has it; before, half of its names were `fastrtps`."""
 OLDEST = (2, 6, 2)
 """Fast DDS before that throws the announcement of every Cyclone DDS 11 participant away: it holds binary properties."""
 RELIABLE = Qos("reliable", "volatile", 100)
@@ -26,9 +28,10 @@ RELIABLE = Qos("reliable", "volatile", 100)
 
 def installed() -> tuple[int, ...]:
     """Version of Fast DDS's headers."""
-    command = ["g++", "-E", "-dM", "-include", "fastrtps/config.h", "-x", "c++", "/dev/null"]
+    header = "fastdds/config.hpp" if THIRD.exists() else "fastrtps/config.h"
+    command = ["g++", "-E", "-dM", "-include", header, "-x", "c++", "/dev/null"]
     macros = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    found = dict(re.findall(r"#define FASTRTPS_VERSION_(M\w+) (\d+)", macros))
+    found = dict(re.findall(r"#define FAST(?:DDS|RTPS)_VERSION_(M\w+) (\d+)", macros))
     return tuple(int(found[part]) for part in ("MAJOR", "MINOR", "MICRO"))
 
 
@@ -36,10 +39,11 @@ def installed() -> tuple[int, ...]:
 def program(pytestconfig: pytest.Config) -> Path:
     """The peer."""
     if not HEADER.exists() or not shutil.which("g++"):
-        pytest.skip("needs g++ and Fast DDS's headers: apt install g++ libfastrtps-dev")
+        pytest.skip("needs g++ and Fast DDS's headers: apt install g++ and libfastdds-dev or libfastrtps-dev")
     if installed() < OLDEST:
         pytest.skip(f"Fast DDS is {installed()}: from {OLDEST} on it hears Cyclone DDS 11")
-    return compiled(pytestconfig, SOURCE, "peer", ("-std=c++14", "-lfastrtps", "-lfastcdr", "-lpthread"))
+    library = "-lfastdds" if THIRD.exists() else "-lfastrtps"
+    return compiled(pytestconfig, SOURCE, "peer", ("-std=c++17", library, "-lfastcdr", "-lpthread"))
 
 
 @pytest.fixture

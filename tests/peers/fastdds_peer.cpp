@@ -23,12 +23,21 @@
 #include <fastdds/dds/subscriber/SampleInfo.hpp>
 #include <fastdds/dds/subscriber/Subscriber.hpp>
 #include <fastdds/dds/topic/TopicDataType.hpp>
+#if __has_include(<fastdds/config.hpp>)
+#define FAST_DDS_3 1
+#include <fastdds/rtps/transport/UDPv4TransportDescriptor.hpp>
+namespace fast = eprosima::fastdds;
+using Duration_t = eprosima::fastdds::dds::Duration_t;
+#else
+#define FAST_DDS_3 0
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
+namespace fast = eprosima::fastrtps;
+using eprosima::fastrtps::Duration_t;
+#endif
 
 using namespace eprosima::fastdds::dds;
-using eprosima::fastrtps::Duration_t;
-using eprosima::fastrtps::rtps::InstanceHandle_t;
-using eprosima::fastrtps::rtps::SerializedPayload_t;
+using fast::rtps::InstanceHandle_t;
+using fast::rtps::SerializedPayload_t;
 using Bytes = std::vector<unsigned char>;
 
 namespace {
@@ -38,30 +47,41 @@ class OpaqueType : public TopicDataType {
 public:
     explicit OpaqueType(const std::string& name)
     {
+        // The size to begin with: payloads are reallocated, as rmw_fastrtps has it.
+#if FAST_DDS_3
+        set_name(name);
+        max_serialized_type_size = 64;
+        is_compute_key_provided = false;
+#else
         setName(name.c_str());
-        m_typeSize = 64;  // to begin with: payloads are reallocated, as rmw_fastrtps has it
+        m_typeSize = 64;
         m_isGetKeyDefined = false;
         auto_fill_type_object(false);
         auto_fill_type_information(false);
+#endif
     }
 
-    bool serialize(void* data, SerializedPayload_t* payload) override
+#if FAST_DDS_3
+    bool serialize(const void* const data, SerializedPayload_t& payload, DataRepresentationId_t) override
     {
-        const auto& bytes = *static_cast<Bytes*>(data);
-        if (bytes.size() > payload->max_size) {
-            return false;
-        }
-        payload->encapsulation = CDR_LE;
-        payload->length = static_cast<uint32_t>(bytes.size());
-        std::memcpy(payload->data, bytes.data(), bytes.size());
-        return true;
+        return to_payload(data, &payload);
     }
 
-    bool deserialize(SerializedPayload_t* payload, void* data) override
+    bool deserialize(SerializedPayload_t& payload, void* data) override { return from_payload(&payload, data); }
+
+    uint32_t calculate_serialized_size(const void* const data, DataRepresentationId_t) override
     {
-        static_cast<Bytes*>(data)->assign(payload->data, payload->data + payload->length);
-        return true;
+        return static_cast<uint32_t>(static_cast<const Bytes*>(data)->size());
     }
+
+    void* create_data() override { return new Bytes(); }
+    void delete_data(void* data) override { delete static_cast<Bytes*>(data); }
+    bool compute_key(SerializedPayload_t&, InstanceHandle_t&, bool) override { return false; }
+    bool compute_key(const void* const, InstanceHandle_t&, bool) override { return false; }
+#else
+    bool serialize(void* data, SerializedPayload_t* payload) override { return to_payload(data, payload); }
+
+    bool deserialize(SerializedPayload_t* payload, void* data) override { return from_payload(payload, data); }
 
     std::function<uint32_t()> getSerializedSizeProvider(void* data) override
     {
@@ -71,7 +91,35 @@ public:
     void* createData() override { return new Bytes(); }
     void deleteData(void* data) override { delete static_cast<Bytes*>(data); }
     bool getKey(void*, InstanceHandle_t*, bool) override { return false; }
+#endif
+
+private:
+    static bool to_payload(const void* data, SerializedPayload_t* payload)
+    {
+        const auto& bytes = *static_cast<const Bytes*>(data);
+        if (bytes.size() > payload->max_size) {
+            return false;
+        }
+        payload->encapsulation = CDR_LE;
+        payload->length = static_cast<uint32_t>(bytes.size());
+        std::memcpy(payload->data, bytes.data(), bytes.size());
+        return true;
+    }
+
+    static bool from_payload(const SerializedPayload_t* payload, void* data)
+    {
+        static_cast<Bytes*>(data)->assign(payload->data, payload->data + payload->length);
+        return true;
+    }
 };
+
+#if FAST_DDS_3
+constexpr auto OK = RETCODE_OK;
+bool written(DataWriter* writer, Bytes* bytes) { return writer->write(bytes) == OK; }
+#else
+const auto OK = ReturnCode_t::RETCODE_OK;
+bool written(DataWriter* writer, Bytes* bytes) { return writer->write(bytes); }
+#endif
 
 std::mutex output;
 
@@ -120,7 +168,7 @@ class ReaderEvents : public DataReaderListener {
     {
         Bytes bytes;
         SampleInfo info;
-        while (reader->take_next_sample(&bytes, &info) == ReturnCode_t::RETCODE_OK) {
+        while (reader->take_next_sample(&bytes, &info) == OK) {
             if (info.valid_data) {
                 say("data " + to_hex(bytes));
             }
@@ -135,7 +183,7 @@ void apply(EndpointQos& qos, const std::string& reliability, const std::string& 
     qos.durability().kind = durability == "transient_local" ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;
     qos.history().kind = depth == 0 ? KEEP_ALL_HISTORY_QOS : KEEP_LAST_HISTORY_QOS;
     qos.history().depth = depth == 0 ? 1 : depth;
-    qos.endpoint().history_memory_policy = eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
+    qos.endpoint().history_memory_policy = fast::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
     qos.data_sharing().off();
 }
 
@@ -206,7 +254,7 @@ int main(int argc, char** argv)
     for (std::string line; std::getline(std::cin, line);) {
         if (writer != nullptr) {
             Bytes bytes = from_hex(line);
-            if (!writer->write(&bytes)) {
+            if (!written(writer, &bytes)) {
                 return fail("write refused");
             }
         }

@@ -1,0 +1,40 @@
+"""Where the C library of Cyclone DDS is: inside PyPI's cyclonedds 11.0, or inside our own wheel.
+
+Law: the Python part of that package is not imported. There is none for Python 3.14, while the C library serves every
+Python; for those that PyPI has no cyclonedds for, setup.py puts the library beside this module.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from runpy import run_path
+
+VERSION = "11.0."
+"""What the version begins with that our calls were written for."""
+
+
+def load() -> ctypes.CDLL:
+    """The library, loaded.
+
+    :raises ImportError: there is none, or one of another version
+    """
+    try:
+        return ctypes.CDLL(_path())
+    except OSError as error:
+        raise ImportError(f"the library of Cyclone DDS does not load: {error}") from error
+
+
+def _path() -> str:
+    ours = find_spec(f"{__package__}.libddsc")
+    if ours is not None and ours.origin is not None:
+        return ours.origin
+    if not (found := version("cyclonedds")).startswith(VERSION):
+        raise ImportError(f"cyclonedds {found} is installed, which lacks a layout this was written for")
+    package = find_spec("cyclonedds")
+    if package is None or package.origin is None:
+        raise ImportError("cyclonedds is installed without its Python package; install it again")
+    # There the package says where its library is, that of a wheel or one that was built on this machine.
+    return str(run_path(str(Path(package.origin).with_name("__library__.py")))["library_path"])

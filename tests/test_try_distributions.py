@@ -1,0 +1,66 @@
+"""tools/try-distributions: what it refuses before it makes anything, and the table it writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+TOOL = ROOT / "tools" / "try-distributions"
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    """The tool as a module."""
+    spec = importlib.util.spec_from_loader("try_distributions", SourceFileLoader("try_distributions", str(TOOL)))
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look there
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["debian-1"], "no 'debian-1'; known are debian-12"),
+        (["--steps", "setup,fly"], "no 'fly'; known are setup"),
+        (["--folder", str(ROOT / "build")], "lies in the repository"),
+        (["--mirror", "gentoo=here"], "families are debian, ubuntu"),
+    ],
+)
+def test_what_it_refuses(words: list[str], said: str) -> None:
+    done = subprocess.run([sys.executable, str(TOOL), *words], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert said in done.stderr
+
+
+def test_the_clone_is_copied_without_what_git_ignores(tool: ModuleType, tmp_path: Path) -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("needs a clone: this is no git repository")
+    kept, old = tmp_path / tool.CLONE / ".venv" / "kept", tmp_path / tool.CLONE / "old" / "file"
+    for path in (kept, old):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    tool.copy_in(tmp_path)
+    assert (tmp_path / tool.CLONE / "setup.py").read_bytes() == (ROOT / "setup.py").read_bytes()
+    assert kept.exists()
+    assert not old.exists()
+    assert not list((tmp_path / tool.CLONE).rglob("__pycache__"))
+
+
+def test_a_table_says_what_passed_failed_and_was_not_run(tool: ModuleType, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    log.write_text("...\n==== 2 failed, 7 passed, 1 skipped in 3.21s ====\nmake: *** [test] Error 1\n")
+    failed = tool.Done(2, 3.4, tool.summary("test", log))
+    rows = [("debian-13", "3.13.5, 3.10.12.0, 2.3.5", {"setup": tool.Done(0, 61.0, ""), "test": failed})]
+    assert tool.table(("setup", "demo", "test"), rows).splitlines()[2:] == [
+        "| debian-13 | 3.13.5, 3.10.12.0, 2.3.5 | passed, 61 s | not run | "
+        "failed (2), 3 s: 2 failed, 7 passed, 1 skipped in 3.21s |"
+    ]
