@@ -10,13 +10,18 @@ import pytest
 
 import fuzz.receiver
 import fuzz.wire
+import fuzz.wire_v1
 from fuzz.loop import Harness, inputs, run
 
 ROOT = Path(__file__).parents[1]
-HARNESSES = {"wire": (fuzz.wire.wire, fuzz.wire.corpus), "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus)}
+HARNESSES = {
+    "wire": (fuzz.wire.wire, fuzz.wire.corpus),
+    "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
+    "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+}
 
 
-@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("receiver", 1_500)])
+@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("wire_v1", 20_000), ("receiver", 1_500)])
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     harness, corpus = HARNESSES[name]
     run(harness, corpus(), seed=1, count=count)
