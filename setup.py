@@ -44,6 +44,7 @@ setup(
     install_requires=[
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
+        "cryptography>=41",
         "cyclonedds==11.0.1",
         "jinja2>=3.1,<4",
         "matplotlib>=3.9,<4",

@@ -37,8 +37,8 @@ LAYERS = (
 MAY_PRINT = {"cli", "ros"}
 
 PURE = {"wire", "link"}
-PURE_CODECS = {"backports"}
-"""Small pure codecs these may import beside the standard library."""
+PURE_CODECS = {"backports", "cryptography"}
+"""Small codecs and ciphers without IO that these may import beside the standard library."""
 
 CONFINED = {
     "gnuradio": ("gr/", "phy/", "radio/", "race/air.py"),
