@@ -17,7 +17,7 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
-    {"config", "backends"},
+    {"config", "backends", "keys", "boots"},
     {"registry", "settings_file"},
     {"wire"},
     {"link"},

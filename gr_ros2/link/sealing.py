@@ -23,12 +23,11 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gr_ros2.errors import ConfigError, CrcError, TagError
+from gr_ros2.keys import KEY_LEN
 from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
 
 SealMode = Literal["none", "authenticate", "encrypt"]
 
-KEY_LEN = 32
-"""Bytes of a fleet's key."""
 SOURCE_ROW = 255
 """Stands in the nonce of a source packet, where others have their row."""
 
