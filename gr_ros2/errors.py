@@ -6,7 +6,7 @@
     ├── WireError (ValueError)          bytes that are no packet of ours, or a packet that has no bytes
     │   ├── LengthError · CrcError · VersionError · NoEntriesError
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
-    │   ├── EntryKindError · VarintError · WindowError
+    │   ├── EntryKindError · VarintError · WindowError · SourcesError
     │   ├── SealError
     │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
     │   └── EncodeError
@@ -163,6 +163,12 @@ class ReplayedError(SealError):
     """A packet that was here before, or is older than anything that may still be accepted."""
 
     kind = "replayed"
+
+
+class SourcesError(WireError):
+    """A packet of one robot more than ``max_sources`` allows."""
+
+    kind = "max_sources"
 
 
 class EncodeError(WireError):

@@ -11,14 +11,16 @@ from typing import NamedTuple
 
 from gr_ros2.errors import EncodeError, EntryBoundsError
 
-_HELLO, _ASK, _REPORT = 0xF8, 0xF9, 0xFA
+_HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
 
+_heard = Struct(">BI")
 _hello = Struct(">IIBI")
 _mark = Struct(">BI")
 _report = Struct(">BHHQB")
 HELLO_LEN = 2 + _hello.size
 MARK_LEN = _mark.size
 REPORT_LEN = 2 + _report.size
+HEARD_LEN = 2 + _heard.size
 
 
 class Hello(NamedTuple):
@@ -74,7 +76,22 @@ class Report(NamedTuple):
     loss: int
 
 
-def write_control(entry: Hello | Ask | Report) -> bytes:
+class Heard(NamedTuple):
+    """The sender has heard a start of another robot. To that robot it proves that the packet is no replay of an
+    earlier one.
+
+    :param src_id: of the other robot
+    :param boot: number of its start, 0..2^32-1
+    """
+
+    src_id: int
+    boot: int
+
+
+Control = Hello | Ask | Report | Heard
+
+
+def write_control(entry: Control) -> bytes:
     """The bytes of an entry.
 
     :raises EncodeError: a field out of range
@@ -88,6 +105,8 @@ def write_control(entry: Hello | Ask | Report) -> bytes:
         elif isinstance(entry, Hello):
             marks = b"".join(_mark.pack(*mark) for mark in entry.marks)
             name, data = _HELLO, _hello.pack(*entry[:4]) + marks
+        elif isinstance(entry, Heard):
+            name, data = _HEARD, _heard.pack(*entry)
         else:
             name, data = _ASK, bytes((entry.src_id,)) + entry.topic_ids
         return bytes((name, len(data))) + data
@@ -95,7 +114,7 @@ def write_control(entry: Hello | Ask | Report) -> bytes:
         raise EncodeError(f"a field of {entry} is out of range ({error})") from error
 
 
-def read_control(body: bytes, position: int, end: int) -> tuple[int, Hello | Ask | Report | None]:
+def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | None]:
     """Where the entry after the one at ``position`` begins, and that one; None for a kind that is not known.
 
     :raises EntryBoundsError: it runs past ``end``, or is no multiple of what it holds
@@ -117,6 +136,10 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Hello | Ask
         marks = tuple(_mark.iter_unpack(body[start + _hello.size : stop]))
         boot, turns, capabilities, digest = _hello.unpack_from(body, start)
         return stop, Hello(boot, turns, capabilities, digest, marks)
+    if name == _HEARD:
+        if size != _heard.size:
+            raise EntryBoundsError(f"a note of {size} bytes that a robot was heard")
+        return stop, Heard(*_heard.unpack_from(body, start))
     if name == _ASK:
         if size < 2:
             raise EntryBoundsError(f"a request of {size} bytes")

@@ -10,6 +10,7 @@ same values; a body says nothing of the number of its packet, so that it can be 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from gr_ros2.errors import (
     VersionError,
     WindowError,
 )
-from gr_ros2.wire.control import Ask, Hello, Report, read_control, write_control
+from gr_ros2.wire.control import Control, read_control, write_control
 
 VERSION = 1
 BROADCAST = 255
@@ -106,7 +107,7 @@ class Part(NamedTuple):
     coded: bool = False
 
 
-Entry = Part | Hello | Ask | Report
+Entry = Part | Control
 
 
 class Standing(NamedTuple):
@@ -245,7 +246,7 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
     return most, head + most
 
 
-def write_body(entries: tuple[Entry, ...] | list[Entry], room: int) -> bytes:
+def write_body(entries: Sequence[Entry], room: int) -> bytes:
     """The bytes of some entries, no padding.
 
     :param room: the longest body; the last entry ends there without saying its length where it can

@@ -152,10 +152,13 @@ def test_what_is_over_is_left_out_where_its_mask_fits() -> None:
     assert (repair.number, repair.mask) == (6, 0b111111)
 
 
-def test_more_than_a_group_is_repaired_in_windows_in_turn() -> None:
-    sender = window(count=300)
+def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
+    sender = window()
+    long = Life()
+    for number in range(1, 301):
+        sender.sent(number, body(number), b"", (long,), 0.0)
     seen = set()
-    for _ in range(6):
+    for _ in range(9):
         repair = sender.next(9.0)
         assert isinstance(repair, Repair)
         numbers = window_numbers(repair.number, repair.mask)
@@ -163,6 +166,17 @@ def test_more_than_a_group_is_repaired_in_windows_in_turn() -> None:
         assert repair.oldest == (numbers[-1] == 1)
         seen |= set(numbers)
     assert seen == set(range(1, 301))
+
+
+def test_short_messages_are_repaired_beside_a_long_one() -> None:
+    sender = window()
+    long, short = Life(), Life()
+    for number in range(1, 301):
+        sender.sent(number, body(number), b"", (long,), 0.0)
+    sender.sent(301, b"short", b"", (short,), 0.0)
+    repairs = [sender.next(0.0) for _ in range(30)]
+    alone = [repair for repair in repairs if isinstance(repair, Repair) and (repair.number, repair.mask) == (301, 1)]
+    assert len(alone) == 10
 
 
 def test_a_row_is_used_once_per_number() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.errors import WireError
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import Ask, Hello, Report
+from gr_ros2.wire.control import Ask, Heard, Hello, Report
 from gr_ros2.wire.table import Row, read_table, write_table
 from gr_ros2.wire.v1 import Header, Packet, Part, Standing, decode, encode
 
@@ -35,6 +35,7 @@ marks = st.lists(st.tuples(U8, U32), max_size=7).map(tuple)
 controls = (
     st.builds(Hello, U32, U32, U8, U32, marks)
     | st.builds(Ask, U8, st.binary(min_size=1, max_size=9))
+    | st.builds(Heard, U8, U32)
     | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127))
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)
@@ -188,6 +189,7 @@ def test_entries_of_kinds_not_known_are_skipped() -> None:
         ("fa0100", "entry_bounds"),  # a report of one byte
         ("f80100", "entry_bounds"),
         ("f90100", "entry_bounds"),
+        ("fb0100", "entry_bounds"),
         ("010001aa0001", "pad"),
     ],
 )
