@@ -13,7 +13,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
+from typing import Any, Literal
 
+from bench.report import Row
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.sealing import Keys
 from gr_ros2.link.v1.endpoint import Endpoint
@@ -236,18 +238,67 @@ def show(name: str, outcome: Outcome, ideal: Outcome | None = None, ordered: Out
     return line + f"  {dict(outcome.air)}"
 
 
+ODOMETRY = (
+    # loss, mean burst; PDR one-way and with reports, age over the ideal's in order, p99 in ms
+    (0.0, 1.0, 1.0, 1.0, 1.03, 30.0),
+    (0.05, 1.0, 0.999, 1.0, 1.03, 60.0),
+    (0.1, 1.0, 0.999, 1.0, 1.03, 80.0),
+    (0.2, 1.0, 0.998, 0.999, 1.05, 120.0),
+    (0.27, 1.0, 0.995, 0.998, 1.08, None),
+    (0.2, 3.0, 0.97, 0.98, None, None),
+)
+
+
+def repair(seed: int = 1) -> list[Row]:
+    """Odometry, long messages, several receivers and large ones, each against its target."""
+    rows: list[Row] = []
+
+    def add(name: str, value: float, unit: str, sense: Literal["≥", "≤"], target: float) -> None:
+        rows.append(Row(f"repair: {name}", value, unit, sense, target))
+
+    for loss, burst, one_way, reports, age, p99 in ODOMETRY:
+        case: dict[str, Any] = {"loss": loss, "burst": burst, "seed": seed}
+        name = f"odometry, {loss:.0%} lost" + (" in bursts of 3" if burst > 1 else "")
+        ideal = genie(**case, in_order=True)
+        for way, back, least in (("one-way", None, one_way), ("with reports", loss, reports)):
+            outcome = run(back=back, **case)
+            add(f"{name}, {way}: PDR", outcome.pdr[0], "", "≥", least)
+            if age is not None:
+                add(f"{name}, {way}: mean age over the ideal's", outcome.age / ideal.age, "", "≤", age)
+            if p99 is not None:
+                add(f"{name}, {way}: p99", outcome.p99 * 1e3, "ms", "≤", p99)
+    thrifty = run(loss=0.2, back=0.2, repair="thrifty", seed=seed)
+    add("thrifty, 20% lost: PDR", thrifty.pdr[0], "", "≥", 0.998)
+    add("thrifty, 20% lost: p99", thrifty.p99 * 1e3, "ms", "≤", 250)
+    add("thrifty, 20% lost: packets a message", thrifty.packets, "", "≤", 1.65)
+    add("thrifty, nothing lost: repairs", run(loss=0, back=0, repair="thrifty").air["repair"], "packets", "≤", 0)
+    for receivers in (1, 5):
+        long = run(hz=3, size=724, loss=0.2, receivers=receivers, seconds=60, seed=seed)
+        add(f"15 packets a message, 20% lost, one-way, {receivers} receivers: PDR", min(long.pdr), "", "≥", 0.999)
+        add(f"15 packets a message, 20% lost, one-way, {receivers} receivers: p99", long.p99 * 1e3, "ms", "≤", 400)
+    for back in (None, 0.2):
+        way = "one-way" if back is None else "with reports"
+        five = run(loss=0.2, back=back, receivers=5, seed=seed)
+        add(f"odometry, 20% lost, {way}, 5 receivers: least PDR", min(five.pdr), "", "≥", 0.999)
+        for size in (500_000, 1_000_000):
+            for packet_len in (220, 1500):
+                large = run(once=True, size=size, packet_len=packet_len, loss=0.2, back=back, tail=200, seed=seed)
+                needed = -(-size // (packet_len - 18))
+                name = f"{size // 1000} kB in packets of {packet_len} B, 20% lost, {way}"
+                add(f"{name}: packets over those needed", large.sent_until / needed, "", "≤", 1.35)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=38.0)
     options = parser.parse_args()
-    common = {"seed": options.seed, "seconds": options.seconds}
-    for loss, burst in ((0.0, 1.0), (0.05, 1.0), (0.1, 1.0), (0.2, 1.0), (0.27, 1.0), (0.2, 3.0)):
-        case = {**common, "loss": loss, "burst": burst}
-        ideal = genie(**case)  # type: ignore[arg-type]
-        ordered = genie(**case, in_order=True)  # type: ignore[arg-type]
-        for title, back, repair in (("one-way", None, "idle"), ("reports", loss, "idle"), ("thrifty", loss, "thrifty")):
-            outcome = run(back=back, repair=repair, **case)  # type: ignore[arg-type]
+    for loss, burst, *_ in ODOMETRY:
+        case: dict[str, Any] = {"seed": options.seed, "seconds": options.seconds, "loss": loss, "burst": burst}
+        ideal, ordered = genie(**case), genie(**case, in_order=True)
+        for title, back, mode in (("one-way", None, "idle"), ("reports", loss, "idle"), ("thrifty", loss, "thrifty")):
+            outcome = run(back=back, repair=mode, **case)
             print(show(f"{loss:.0%} bursts {burst:g} {title}", outcome, ideal, ordered), flush=True)
 
 

@@ -1,1 +1,1 @@
-"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.wire`, `wire_v1`, `receiver`."""
+"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.NAME`, one for each module here."""

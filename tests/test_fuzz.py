@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import fuzz.endpoint
 import fuzz.receiver
 import fuzz.wire
 import fuzz.wire_v1
@@ -17,11 +18,14 @@ ROOT = Path(__file__).parents[1]
 HARNESSES = {
     "wire": (fuzz.wire.wire, fuzz.wire.corpus),
     "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
+    "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
 }
 
 
-@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("wire_v1", 20_000), ("receiver", 1_500)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("wire", 20_000), ("wire_v1", 20_000), ("endpoint", 400), ("receiver", 1_500)]
+)
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     harness, corpus = HARNESSES[name]
     run(harness, corpus(), seed=1, count=count)

@@ -395,16 +395,16 @@ class RepairWindow:
         if not window:
             return None
         newest, first = window[0].number, window[-1].number
-        longest = max(len(record.body) for record in window)
         size = newest - first + 1
-        if len(window) < size and longest + (size + 7) // 8 > self._room:
-            window = [self._records[number] for number in range(newest, first - 1, -1)]
-        mask = 0
-        for record in window:
-            mask |= 1 << newest - record.number
+        if len(window) < size:
+            longest = max(len(record.body) for record in window)
+            if longest + (size + 7) // 8 > self._room:
+                window = [self._records[number] for number in range(newest, first - 1, -1)]
+        full = len(window) == size
+        mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
         row = self.take_row(newest)
         assert row is not None
-        combined = combine(((record.number, record.body) for record in window), row)
+        combined = combine([(record.number, record.body) for record in window], row)
         self._fly(now, first, newest)
         self.counts["combined"] += 1
         oldest = first == self._oldest

@@ -103,6 +103,8 @@ class Inbox:
         self._ready: dict[int, list[_Ready]] = {}
         """Messages waiting for their turn, by topic."""
         self._unknown: deque[_Ready] = deque()
+        self._waiting = 0
+        """Bytes of these."""
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message delivered, by topic."""
         self.marks = marks
@@ -312,8 +314,10 @@ class Inbox:
         row = self.rows.get(ready.topic_id)
         if row is None:
             self._unknown.append(ready)
-            if len(self._unknown) > _WAITING:
+            self._waiting += len(ready.payload)
+            while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
                 lost = self._unknown.popleft()
+                self._waiting -= len(lost.payload)
                 self._events.append(Lost(self.src_id, lost.topic_id, "unknown_topic", self._key(lost.order)))
         elif row.reliable and ready.order[0] > self._low:
             self._ready.setdefault(ready.topic_id, []).append(ready)
@@ -339,7 +343,7 @@ class Inbox:
             self._low = low
             for topic_id, line in self._ready.items():
                 if line:
-                    self._release(topic_id, line)
+                    self._release(self.rows[topic_id], line)
 
     def _give_up(self, low: int, dead: int) -> int:
         """Up to where missing packets have been waited for long enough; sees how many come back."""
@@ -355,8 +359,7 @@ class Inbox:
             low = max(low, gaps[-1][1] + 1)
         return low
 
-    def _release(self, topic_id: int, line: list[_Ready]) -> None:
-        row = self.rows[topic_id]
+    def _release(self, row: Row, line: list[_Ready]) -> None:
         line.sort(key=lambda ready: ready.order)
         while line and line[0].order[0] <= self._low:
             self._deliver(line.pop(0), row)
@@ -399,12 +402,15 @@ class Inbox:
         self.digest = digest
         self._know(rows)
         self._events.append(Announced(self.src_id, rows))
-        waiting, self._unknown = self._unknown, deque()
+        waiting, self._unknown, self._waiting = self._unknown, deque(), 0
         for ready in sorted(waiting, key=lambda item: item.order):
             self._arrived(ready)
 
     def _know(self, rows: tuple[Row, ...]) -> None:
         self.rows = {row.topic_id: row for row in rows}
+        for topic_id in [topic_id for topic_id in self._ready if topic_id not in self.rows]:
+            for ready in self._ready.pop(topic_id):
+                self._events.append(Lost(self.src_id, topic_id, "unknown_topic", self._key(ready.order)))
         if self._decoder_for is not None:
             self._codec = self._decoder_for(rows)
 
