@@ -254,7 +254,7 @@ def repair(seed: int = 1) -> list[Row]:
     rows: list[Row] = []
 
     def add(name: str, value: float, unit: str, sense: Literal["≥", "≤"], target: float) -> None:
-        rows.append(Row(f"repair: {name}", value, unit, sense, target))
+        rows.append(Row(f"repair: {name}", value, unit, sense, target, "{:,.0f}" if unit else "{:.4f}"))
 
     for loss, burst, one_way, reports, age, p99 in ODOMETRY:
         case: dict[str, Any] = {"loss": loss, "burst": burst, "seed": seed}
