@@ -42,6 +42,8 @@ FIRST_AGE_S = 1.0
 """s that a topic counts as old when its first message comes."""
 SETTLING_S = 1.0
 """s after which a latched message is named in hellos: who lacks it then has not merely not got it yet."""
+STARTING_S = 2.0
+"""s from the start for which the table is repaired though nobody reports."""
 _QOS = {"default": 0, "latency": 1, "bulk": 2}
 _RANK = (1, 0, 2)
 _ENTRY = 3
@@ -125,6 +127,7 @@ class Outbox:
         self.refused: Counter[tuple[int, str]] = Counter()
         self.sent: Counter[int] = Counter()
         self.repeats = 0
+        self._starting_until = inf
         self.reported = False
         """Whether receivers report, so that they say when a message is over."""
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
@@ -158,6 +161,7 @@ class Outbox:
 
     def ask(self, topic_id: int, now: float) -> None:
         """Somebody lacks what is kept of a topic: send it again, unless it waits already."""
+        self._starting_until = min(self._starting_until, now + STARTING_S)
         queue = self._queues.get(topic_id)
         if queue is None or any(message.serial < 0 for message in queue):
             return
@@ -366,7 +370,8 @@ class Outbox:
             if kept.payload is message.payload and kept.named == inf:
                 kept.named = now + SETTLING_S
         if topic_id == TABLE_TOPIC and not self.reported:
-            message.life.over = True  # it comes again, and is small
+            # Later it comes again, and is small; at the start nothing can be delivered without it.
+            message.life.expires = self._starting_until
         elif topic_id in self._kept and not self.reported:
             message.life.expires = min(message.life.expires, now + 2 * (now - message.submitted) + 2.0)
 

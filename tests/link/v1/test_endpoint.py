@@ -239,7 +239,7 @@ def test_a_lifespan_ends_repair_and_message() -> None:
     topics = registry(odom=TopicOptions(queue="deadline", deadline_ms=200))
     one, two = Robot(1, topics, hears=False), Robot(2, hears=False)
     air = Air(one, two)
-    air.run(0.5)
+    air.run(2.5)
     air.lost = lambda *_: True
     one.end.submit(0, text(1), air.now)
     air.run(0.25)
