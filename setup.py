@@ -119,6 +119,7 @@ setup(
         "apsw>=3.46",
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
+        "cryptography>=41",
         f"{CYCLONEDDS}; python_version < '3.14'",
         "jinja2>=3.1,<4",
         "matplotlib>=3.9,<4",

@@ -15,6 +15,8 @@ from bench.report import Row, table
 
 BENCHMARKS = {
     "codec": "bench.codec",
+    "repair": "bench.repair",
+    "endpoint": "bench.endpoint",
     "port": "bench.port",
     "direct": "bench.runs",
     "fast": "bench.runs",

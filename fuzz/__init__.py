@@ -1,1 +1,1 @@
-"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.wire` and so on."""
+"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.NAME`, one for each module here."""

@@ -6,6 +6,9 @@
     ├── WireError (ValueError)          bytes that are no packet of ours, or a packet that has no bytes
     │   ├── LengthError · CrcError · VersionError · NoEntriesError
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
+    │   ├── EntryKindError · VarintError · WindowError · SourcesError
+    │   ├── SealError
+    │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
     │   └── UnknownDictionaryError · DamagedError
@@ -49,19 +52,19 @@ class RegistryError(ConfigError):
 
 
 class WireError(GrRos2Error, ValueError):
-    """Bytes that are no version-0 packet. ``kind`` is the name its counter carries."""
+    """Bytes that are no packet of ours. ``kind`` is the name its counter carries."""
 
     kind = "wire"
 
 
 class LengthError(WireError):
-    """Not exactly ``packet_len`` bytes."""
+    """Not as many bytes as ``packet_len`` allows."""
 
     kind = "length"
 
 
 class CrcError(WireError):
-    """The CRC-16 does not match."""
+    """The CRC does not match."""
 
     kind = "crc"
 
@@ -100,6 +103,72 @@ class IndexRangeError(WireError):
     """An entry whose index is not below its total."""
 
     kind = "index"
+
+
+class EntryKindError(WireError):
+    """An entry of a kind that there is not, or whose fields contradict its kind."""
+
+    kind = "entry_kind"
+
+
+class VarintError(WireError):
+    """A number of variable length that is too long, too large, or longer than it needs to be."""
+
+    kind = "varint"
+
+
+class WindowError(WireError):
+    """A repair whose window, mask and row do not go together."""
+
+    kind = "window"
+
+
+class SealError(WireError):
+    """A packet that may be intact and yet cannot be trusted here."""
+
+    kind = "seal"
+
+
+class NoHelloError(SealError):
+    """A packet of a robot, or of a start of it, of which no hello has been heard yet."""
+
+    kind = "no_hello"
+
+
+class NoKeyError(SealError):
+    """A sealed packet where no key is configured."""
+
+    kind = "no_key"
+
+
+class NotSealedError(SealError):
+    """A packet without a tag where a key is configured."""
+
+    kind = "not_sealed"
+
+
+class WrongKeyError(SealError):
+    """A hello sealed with none of the keys that are accepted, or damaged."""
+
+    kind = "wrong_key"
+
+
+class TagError(SealError):
+    """A tag that does not match: damaged, forged, or of another start of the sender."""
+
+    kind = "tag"
+
+
+class ReplayedError(SealError):
+    """A packet that was here before, or is older than anything that may still be accepted."""
+
+    kind = "replayed"
+
+
+class SourcesError(WireError):
+    """A packet of one robot more than ``max_sources`` allows."""
+
+    kind = "max_sources"
 
 
 class EncodeError(WireError):

@@ -12,8 +12,10 @@ import pytest
 
 import fuzz.compression
 import fuzz.doorbell
+import fuzz.endpoint
 import fuzz.receiver
 import fuzz.wire
+import fuzz.wire_v1
 from fuzz.loop import Harness, inputs, run, within
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -23,12 +25,23 @@ import fuzz.kernels
 ROOT = Path(__file__).parents[1]
 HARNESSES = {
     "wire": (fuzz.wire.wire, fuzz.wire.corpus),
+    "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
+    "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "doorbell": (fuzz.doorbell.doorbell, fuzz.doorbell.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
 }
-COUNTS = {"wire": 20_000, "receiver": 1_500, "compression": 2_000, "doorbell": 1_000, "dashboard": 300, "kernels": 400}
+COUNTS = {
+    "wire": 20_000,
+    "wire_v1": 20_000,
+    "endpoint": 400,
+    "receiver": 1_500,
+    "compression": 2_000,
+    "doorbell": 1_000,
+    "dashboard": 300,
+    "kernels": 400,
+}
 if find_spec("bokeh") is not None:
     import fuzz.dashboard
 

@@ -1,0 +1,89 @@
+"""What an endpoint of version 1 costs: sealing, opening, repairing and decoding, on one core."""
+
+from __future__ import annotations
+
+import random
+import time
+
+from bench.report import Row, median_of
+from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.events import Delivered
+from gr_ros2.link.v1.sealing import Keys
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.registry import Registry
+
+PACKET_LEN, MESSAGES, REPEATS, LOSS = 64, 10_000, 5, 0.2
+TARGET = 40_000
+PACKETS_S = 20_000.0
+
+
+def endpoint() -> list[Row]:
+    """Encrypted messages of one packet each, half of the slots idle, 20 % lost, with reports: each end's own time."""
+    sending: list[float] = []
+    receiving: list[float] = []
+
+    def rate() -> float:
+        sender, receiver = transfer()
+        sending.append(sender)
+        receiving.append(receiver)
+        return min(sender, receiver)
+
+    slower = median_of(REPEATS, rate)
+    return [
+        Row("endpoint: packets of the sending end", sorted(sending)[REPEATS // 2], "packets/s", "≥", TARGET),
+        Row("endpoint: packets of the receiving end", sorted(receiving)[REPEATS // 2], "packets/s", "≥", TARGET),
+        Row("endpoint: packets of the slower end", slower, "packets/s", "≥", TARGET),
+    ]
+
+
+def transfer() -> tuple[float, float]:
+    """Packets/s of processor time of the sending and of the receiving end."""
+    keys = Keys((bytes(32),), "encrypt")
+    topics = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    sender = Endpoint(topics, Settings(1, packet_len=PACKET_LEN, repair="idle"), boot=5, keys=keys)
+    receiver = Endpoint(None, Settings(2, packet_len=PACKET_LEN), boot=6, keys=keys)
+    sender.use_credit()
+    receiver.use_credit()
+    rng = random.Random(1)
+    payloads = [rng.randbytes(45) for _ in range(256)]
+    clock = time.process_time
+    spent = [0.0, 0.0]
+    packets = [0, 0]
+    delivered = submitted = 0
+    now = 0.0
+    while submitted < MESSAGES:
+        # Slots are done in turns of 50 so that reading the clock costs nothing beside them.
+        outgoing: list[tuple[bytes, float]] = []
+        begin = clock()
+        for slot in range(50):
+            now += 1 / PACKETS_S
+            if slot % 2:
+                sender.submit(0, payloads[submitted & 255], now)
+                submitted += 1
+            sender.credit()
+            data = sender.next_packet(now)
+            if data is not None:
+                outgoing.append((data, now))
+        packets[0] += len(outgoing)
+        spent[0] += clock() - begin
+        heard = [(data, at) for data, at in outgoing if rng.random() >= LOSS]
+        begin = clock()
+        for data, at in heard:
+            delivered += sum(isinstance(event, Delivered) for event in receiver.receive(data, at))
+        answers = []
+        for _ in range(12):
+            receiver.credit()
+            answer = receiver.next_packet(now)
+            if answer is not None:
+                answers.append(answer)
+        receiver.handle_timeout(now)
+        packets[1] += len(heard) + len(answers)
+        spent[1] += clock() - begin
+        begin = clock()
+        for answer in answers:
+            sender.receive(answer, now)
+        sender.handle_timeout(now)
+        packets[0] += len(answers)
+        spent[0] += clock() - begin
+    assert delivered > 0.99 * MESSAGES
+    return packets[0] / spent[0], packets[1] / spent[1]

@@ -1,0 +1,79 @@
+"""What a robot must not forget from one start to the next: its boot number, and how far it has heard others.
+
+A boot number is greater than all before it, and at least the wall clock's seconds: so it grows when the file is lost,
+and when the clock is set back.
+
+Laws: the file is replaced as a whole and is on the disk before a call returns, so that a power cut leaves the old or
+the new one; a boot number is given out only after it has been written.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from gr_ros2.errors import ConfigError
+
+_LARGEST = (1 << 32) - 1
+
+
+class BootFile:
+    """The state file of one robot.
+
+    :param path: of the file, which need not exist; its folder must
+    :param wall_clock: seconds since 1970
+    :raises ConfigError: the file cannot be read, written or understood
+    """
+
+    def __init__(self, path: str | Path, wall_clock: float) -> None:
+        self._path = Path(path)
+        before, self._heard = self._read()
+        self.boot = min(max(before + 1, int(wall_clock)), _LARGEST)
+        """Of this start."""
+        if self.boot <= before:
+            raise ConfigError(f"{self._path}: boot numbers are used up; make a new key and delete this file")
+        self._write()
+
+    @property
+    def heard(self) -> Mapping[int, tuple[int, int]]:
+        """Per robot id its newest boot number, and the packet number below which nothing more is taken."""
+        return self._heard
+
+    def save(self, src_id: int, boot: int, floor: int) -> None:
+        """Remember how far a robot has been heard.
+
+        :raises ConfigError: the file cannot be written
+        """
+        self._heard[src_id] = (boot, floor)
+        self._write()
+
+    def _read(self) -> tuple[int, dict[int, tuple[int, int]]]:
+        try:
+            values = json.loads(self._path.read_text("ascii"))
+            heard = {int(name): (int(boot), int(floor)) for name, (boot, floor) in values["heard"].items()}
+            return int(values["boot"]), heard
+        except FileNotFoundError:
+            return 0, {}
+        except OSError as error:
+            raise ConfigError(f"{self._path}: cannot be read ({error.strerror})") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(f"{self._path}: no state file of a link ({error}); restore it, or change keys") from error
+
+    def _write(self) -> None:
+        text = json.dumps({"boot": self.boot, "heard": {str(name): value for name, value in self._heard.items()}})
+        beside = self._path.with_name(f"{self._path.name}.new")
+        try:
+            with open(beside, "w", encoding="ascii") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(self._path)
+            folder = os.open(self._path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            raise ConfigError(f"{self._path}: cannot be written ({error.strerror})") from error

@@ -1,0 +1,63 @@
+"""The file of a fleet's keys: one key per line, 64 hex digits; the first seals, all are accepted.
+
+Laws: a key file that others than its owner may read or write is refused; a file that exists is never written over.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from pathlib import Path
+
+from gr_ros2.errors import ConfigError
+
+KEY_LEN = 32
+"""Bytes of a key."""
+
+
+def new_key_file(path: str | Path) -> None:
+    """Make a file with one new key, readable and writable by its owner only.
+
+    :raises ConfigError: it exists, or cannot be written
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        raise ConfigError(f"{path}: exists; a key is never written over, so choose another name") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror})") from error
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(
+            "# Key of a gr-ros2 fleet: the first line seals, all are accepted. Keep it secret.\n"
+            f"{secrets.token_hex(KEY_LEN)}\n"
+        )
+
+
+def read_key_file(path: str | Path) -> tuple[bytes, ...]:
+    """The keys of a file, at least one.
+
+    :raises ConfigError: cannot be read, is readable by others, or holds something else than keys
+    """
+    try:
+        with open(path, encoding="ascii") as file:
+            others = stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077
+            lines = [line.split("#")[0].strip() for line in file]
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: no key file; make one with gr-ros2 key new FILE") from None
+    if others:
+        raise ConfigError(f"{path}: others than its owner may read or write it; run chmod 600 {path}")
+    keys: list[bytes] = []
+    for number, line in enumerate(lines, 1):
+        if line:
+            try:
+                keys.append(bytes.fromhex(line))
+            except ValueError:
+                keys.append(b"")
+            if len(keys[-1]) != KEY_LEN:
+                raise ConfigError(f"{path}:{number}: not {2 * KEY_LEN} hex digits; make one with gr-ros2 key new FILE")
+    if not keys:
+        raise ConfigError(f"{path}: no key in it; make one with gr-ros2 key new FILE")
+    return tuple(keys)

@@ -1,0 +1,473 @@
+"""One robot's end of a link that speaks version 1: messages in, packets out; packets in, messages out.
+
+*What leaves.* When a packet is asked for: a hello that cannot wait, then new messages, then what there is to say about
+others' packets, then repair (``link.repair``). Reports ride along where a packet of messages has room for one.
+
+Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason; ``receive``
+never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is sent once, a
+row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+
+from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
+from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.v1.events import AirKind, Event, Gone, Met, Rejected, SentPacket, SentPart
+from gr_ros2.link.v1.inbox import Inbox
+from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
+from gr_ros2.link.v1.outbox import Filling, Outbox
+from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.link.v1.talk import Talk
+from gr_ros2.registry import Registry
+from gr_ros2.wire.control import (
+    CAN_HEAR,
+    REPORT_LEN,
+    Ask,
+    Control,
+    Heard,
+    Hello,
+    Report,
+)
+from gr_ros2.wire.table import Row
+from gr_ros2.wire.v1 import (
+    BROADCAST,
+    MAX_TOPICS,
+    QOS_STANDING,
+    TABLE_TOPIC,
+    Entry,
+    Header,
+    Standing,
+    body_room,
+    read_body,
+    read_header,
+    write_body,
+    write_header,
+    write_standing,
+)
+
+FORCED = 20
+"""New packets after which a report that found no room goes by itself: 5 % of the slots."""
+_INTERVALS = 15
+_POLL_S = 0.02
+"""s after which a thrifty sender with doubts thinks again."""
+
+
+class Endpoint:
+    """Both directions of one robot.
+
+    :param topics: what it sends; None where it only receives
+    :param boot: number of this start: greater than all before it
+    :param keys: what packets are sealed with
+    :param codec: codes the messages sent
+    :param decoder_for: makes what decodes a robot's messages of its table of topics
+    :param rows: topics of robots that announce none
+    :param heard: what ``save`` stored before this start
+    :param save: stores how far a robot was heard; needed where ``keys`` are to keep replays out after a restart
+    :param observer: called with every Event, in order
+    """
+
+    def __init__(
+        self,
+        topics: Registry | None,
+        settings: Settings,
+        *,
+        boot: int,
+        keys: Keys | None = None,
+        codec: MessageCodec | None = None,
+        decoder_for: Callable[[tuple[Row, ...]], MessageCodec] | None = None,
+        rows: tuple[Row, ...] = (),
+        heard: Mapping[int, tuple[int, int]] | None = None,
+        save: Save | None = None,
+        observer: Callable[[Event], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.boot = boot
+        self.keys = keys if keys is not None else Keys()
+        if topics is not None and len(topics) > MAX_TOPICS:
+            raise ConfigError(f"{len(topics)} topics; at most {MAX_TOPICS}")
+        self.rejected: Counter[str] = Counter()
+        """Packets that could not be used, by kind of WireError."""
+        self.dropped: Counter[str] = Counter()
+        """Packets that do not concern us: ``own``, ``not_for_us``; ``early`` ones were kept until a hello came."""
+        self.air: Counter[AirKind] = Counter()
+        """Packets sent, by what they were spent on."""
+        self._observer = observer
+        self._decoder_for = decoder_for
+        self._rows = rows
+        self._marks: dict[int, dict[int, int]] = {}
+        """CRC-32 of the latched messages of every robot, across its restarts."""
+        sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
+        self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
+        self._trailer = self.keys.own(settings.src_id, boot)
+        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
+        self.window = RepairWindow(settings.repair or "idle", self._room, settings.expected_loss)
+        self.neighbours = Neighbours(
+            (settings.src_id, boot), settings, self.keys, heard=heard or {}, save=save, inbox=self._inbox
+        )
+        self._events: list[Event] = []
+        self._now = -inf
+        self._slot = -inf
+        self._credits: int | None = None
+        self._busy_since = inf
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._talk = Talk(settings, boot, encrypts=self.keys.encrypts)
+        self._started = False
+        self._hello_number = -1
+        self._repeat_at = inf
+        self._unheard = 0
+        """New packets since a report was due and found no room."""
+        self._sender: Neighbour | None = None
+
+    # ---- sending
+
+    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
+        """Take a serialized message."""
+        self._now = max(self._now, now)
+        self.outbox.submit(topic_id, payload, now)
+
+    def next_packet(self, now: float) -> bytes | None:
+        """The next packet that may go at ``now``, or None."""
+        self._now = max(self._now, now)
+        if self._credits == 0 or now < self._slot:
+            return None
+        data = self._compose(now)
+        if data is None:
+            return None
+        if self._credits is not None:
+            if self._busy_since < inf:
+                self._intervals.append(now - self._busy_since)
+            self._credits -= 1
+            self._busy_since = now if not self._credits and not self.outbox.idle else inf
+        rate = self.settings.packet_rate
+        if rate > 0:
+            # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
+            self._slot = max(self._slot, now - 1 / rate) + 1 / rate
+        return data
+
+    def use_credit(self) -> None:
+        """From now on a packet leaves only for a credit."""
+        if self._credits is None:
+            self._credits = 0
+
+    def credit(self, packets: int = 1) -> None:
+        """The PHY can take so many further packets."""
+        self._credits = (self._credits or 0) + packets
+
+    @property
+    def out_of_credit(self) -> bool:
+        """Whether nothing leaves before the next credit."""
+        return self._credits == 0
+
+    def follow(
+        self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+    ) -> None:
+        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open."""
+        if self.outbox.follow(topic_id, reliable=reliable, depth=depth, lifespan_s=lifespan_s, period_s=period_s):
+            self._talk.hurry(self._now)
+
+    @property
+    def interval(self) -> float:
+        """s from one packet to the next while busy; 0 where not known."""
+        if self.settings.packet_rate > 0:
+            return 1 / self.settings.packet_rate
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
+
+    @property
+    def paced(self) -> bool:
+        """Whether something says when there is a slot, and so when one is idle."""
+        return self._credits is not None or self.settings.packet_rate > 0
+
+    # ---- receiving
+
+    def receive(self, data: bytes, now: float) -> list[Event]:
+        """Take the bytes of one packet; the events it causes, in order."""
+        self._now = max(self._now, now)
+        self._receive(data, now)
+        events, self._events = self._events, []
+        return events
+
+    def handle_timeout(self, now: float) -> list[Event]:
+        """Do what has become due at the receiving side: go on without what is missing, let go of who is silent."""
+        self._now = max(self._now, now)
+        for neighbour in self.neighbours:
+            self._report_all(neighbour.inbox.handle_timeout(now))
+        self.neighbours.settle(now)
+        for gone in self.neighbours.silent(now - self.settings.give_up_s):
+            self.window.forget(gone.src_id)
+            self._report_all([Gone(gone.src_id, gone.boot)])
+        self.outbox.reported = bool(self.window.receivers())
+        events, self._events = self._events, []
+        return events
+
+    def next_timeout(self) -> float | None:
+        """When ``next_packet`` or ``handle_timeout`` may have something to do without a further call."""
+        now = self._now
+        times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
+        times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
+        if self._credits != 0:
+            leaving = [self._talk.due]
+            waiting = self.outbox.next_timeout(now)
+            if waiting is not None:
+                leaving.append(waiting)
+            if self.settings.hears:
+                leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+            if self._repeat_at < inf:
+                leaving.append(self._repeat_at)
+            if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
+                leaving.append(now if self._mode() == "idle" else now + _POLL_S)
+            times.append(max(min(leaving), self._slot))
+        return min(times) if times else None
+
+    # ---- what leaves
+
+    def _compose(self, now: float) -> bytes | None:
+        if not self._started:
+            self._start(now)
+        if self._talk.urgent(now, idle=self.outbox.idle):
+            return self._hello(now)
+        if now >= self._repeat_at:
+            self._repeat_at = now + self.settings.repeat_s
+            if not self.window.receivers():
+                self.outbox.announce(now)
+        self.outbox.expire(now, self.interval)
+        due: Sequence[Neighbour] = ()
+        if self.settings.hears:
+            due = [n for n in self.neighbours if n.inbox.unreported and n.inbox.report_due(now) <= now]
+        if due and self._unheard >= FORCED:
+            return self._say(due, now)
+        filling = self.outbox.fill(self.window.newest + 1, self._room, now)
+        if filling is not None:
+            return self._new(filling, due, now)
+        if due:
+            return self._say(due, now)
+        asks = self._talk.asks(self.neighbours, now)
+        if asks:
+            return self._control(asks, "hello", now)
+        if self.paced:
+            self.window.mode = self._mode()
+            return self._repair(now)
+        return None
+
+    def _start(self, now: float) -> None:
+        self._started = True
+        self._talk.start(now)
+        if self.outbox.digest:
+            self.outbox.ask(TABLE_TOPIC, now)
+            if self.settings.repeat_s:
+                self._repeat_at = now + self.settings.repeat_s
+
+    def _new(self, filling: Filling, due: Sequence[Neighbour], now: float) -> bytes:
+        """A source packet, with a report where there is room for one."""
+        entries: list[Entry] = list(filling.parts)
+        free = self._room - filling.used
+        for neighbour in due:
+            if free >= REPORT_LEN:
+                entries.append(neighbour.inbox.report(now))
+                free -= REPORT_LEN
+                self._unheard = 0
+            else:
+                self._unheard += 1
+        return self._source(entries, filling.lives, filling.qos, tuple(filling.sent), now)
+
+    def _source(
+        self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentPart, ...], now: float
+    ) -> bytes:
+        number = self.window.newest + 1
+        settings = self.settings
+        body = write_body(entries, self._room)
+        clear = write_header(
+            Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
+        )
+        data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
+        self.window.sent(number, body, data, lives, now)
+        return self._leave(data, "new", parts, now)
+
+    def _standing(self, standing: Standing, body: bytes, number: int, kind: AirKind, now: float) -> bytes:
+        settings = self.settings
+        header = Header(QOS_STANDING, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
+        clear = write_header(header) + write_standing(standing)
+        body = self._padded(body, clear)
+        data = self._trailer.close(clear, body, number, standing.row, plain=standing.clear)
+        return self._leave(data, kind, (), now)
+
+    def _control(self, entries: Sequence[Entry], kind: AirKind, now: float, *, clear: bool = False) -> bytes:
+        """A packet of entries that are no messages; it stands at the newest number."""
+        row = self.window.take_row(self.window.newest)
+        if row is None:
+            return self._source([], self.window.exhausted(now), 0, (), now)
+        return self._standing(
+            Standing(row, clear=clear), write_body(entries, self._room), self.window.newest, kind, now
+        )
+
+    def _repair(self, now: float) -> bytes | None:
+        chosen = self.window.next(now)
+        if isinstance(chosen, Repair):
+            number, mask, row, oldest, combined = chosen
+            return self._standing(Standing(row, mask, oldest), combined, number, "repair", now)
+        if chosen is not None:
+            return self._leave(chosen, "repair", (), now)
+        lives = self.window.exhausted(now)
+        return self._source([], lives, 0, (), now) if lives else None
+
+    def _hello(self, now: float) -> bytes:
+        quiet = self.window.newest == self._hello_number and not self.window.receivers()
+        if quiet and self.keys.sealed:
+            self._hello_number = -1
+            return self._source(
+                [], (), 0, (), now
+            )  # a receiver that has restarted takes nothing below a number it knew
+        self._hello_number = self.window.newest
+        outbox = self.outbox
+        if self._talk.starting and not self.window.receivers():
+            outbox.ask(TABLE_TOPIC, now)  # nobody says whether it has come
+        turns, marks = self.window.newest >> 16, outbox.marks(now)
+        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now)
+        return self._control(entries, "hello", now, clear=True)
+
+    def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
+        """Reports, and requests where there is room."""
+        entries: list[Entry] = []
+        free = self._room
+        for neighbour in due:
+            if free >= REPORT_LEN:
+                entries.append(neighbour.inbox.report(now))
+                free -= REPORT_LEN
+        for ask in self._talk.asks(self.neighbours, now):
+            if free >= 3 + len(ask.topic_ids):
+                entries.append(ask)
+                free -= 3 + len(ask.topic_ids)
+        self._unheard = 0
+        return self._control(entries, "report", now)
+
+    def _leave(self, data: bytes, kind: AirKind, parts: tuple[SentPart, ...], now: float) -> bytes:
+        self.air[kind] += 1
+        self._tell(SentPacket(data, kind, parts, now))
+        return data
+
+    def _padded(self, body: bytes, clear: bytes) -> bytes:
+        if not self.settings.fixed:
+            return body
+        return body.ljust(self.settings.packet_len - len(clear) - self.keys.trailer_len, b"\0")
+
+    @property
+    def _hop(self) -> int:
+        return self.settings.hop if self.settings.dst_id != BROADCAST else 0
+
+    def _mode(self) -> RepairMode:
+        return self.settings.repair or ("thrifty" if self.window.receivers() else "idle")
+
+    # ---- what arrives
+
+    def _receive(self, data: bytes, now: float) -> None:
+        try:
+            opened = self._open(data, now)
+            if opened is None:
+                return
+            self._use(opened, now)
+        except WireError as error:
+            self.rejected[error.kind] += 1
+            self._report_all([Rejected(error)])
+            return
+        if opened.met:
+            for early in self.neighbours.early(opened.neighbour.src_id):
+                self._receive(early, now)
+
+    def _open(self, data: bytes, now: float) -> Opened | None:
+        header = read_header(data, self.settings.packet_len)
+        if header.src_id == self.settings.src_id:
+            self.dropped["own"] += 1
+            return None
+        if header.dst_id not in (BROADCAST, self.settings.src_id):
+            self.dropped["not_for_us"] += 1
+            return None
+        if header.sealed and not self.keys.sealed:
+            raise NoKeyError(f"a sealed packet of robot {header.src_id}, and no key is configured here")
+        if self.keys.sealed and not header.sealed:
+            raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
+        opened = self.neighbours.open(data, header, now)
+        if opened is None:
+            self.dropped["early"] += 1
+        return opened
+
+    def _use(self, opened: Opened, now: float) -> None:
+        neighbour, number, standing = opened.neighbour, opened.number, opened.standing
+        if opened.met:
+            self._meet(opened, now)
+        inbox = neighbour.inbox
+        self._sender = neighbour
+        if standing is None:
+            self._report_all(inbox.source(number, opened.body, opened.header.qos, now))
+        elif standing.mask:
+            self._report_all(
+                inbox.repair(number, standing.mask, standing.row, opened.body, oldest=standing.oldest, now=now)
+            )
+        else:
+            room = body_room(
+                self.settings.packet_len, sealed=self.keys.sealed, addressed=opened.header.dst_id != BROADCAST
+            )
+            entries = opened.entries if opened.entries is not None else read_body(opened.body, room)
+            for entry in entries:
+                if isinstance(entry, (Hello, Ask, Report, Heard)):
+                    self._entry(entry)
+            self._report_all(inbox.heard(number, now))
+
+    def _meet(self, opened: Opened, now: float) -> None:
+        """A robot that was not known, or is heard again."""
+        neighbour = opened.neighbour
+        if opened.replaced is not None:
+            self._report_all(opened.replaced.inbox.close("restarted"))
+        self.window.forget(neighbour.src_id)
+        hears = neighbour.hello.capabilities & CAN_HEAR != 0
+        if hears:
+            self.window.meet(neighbour.src_id, now)
+            self.outbox.reported = True
+        if self.settings.hears:
+            self._talk.met(neighbour.src_id, neighbour.boot, now)
+        self._report_all([Met(neighbour.src_id, neighbour.boot, hears)])
+
+    def _entry(self, entry: Control) -> None:
+        """An entry that is no message, of the robot whose packet it came in."""
+        assert self._sender is not None
+        own, now = self.settings.src_id, self._now
+        if isinstance(entry, Report):
+            if entry.src_id != own or entry.boot != self.boot & 0xFFFF:
+                return
+            newest = self.window.newest
+            number = newest - ((newest - entry.number) & 0xFFFF)
+            if number < 0:
+                raise EntryKindError(f"a report of packet {entry.number}, which was never sent")
+            loss = entry.loss / 128
+            sender = self._sender.src_id
+            self.window.report(sender, number, entry.arrived, settled=entry.settled, loss=loss, now=now)
+            self.outbox.reported = True
+        elif isinstance(entry, Ask) and entry.src_id == own:
+            for topic_id in entry.topic_ids:
+                self.outbox.ask(topic_id, now)
+
+    def _inbox(self, src_id: int, boot: int, first: int, room: int) -> Inbox:
+        return Inbox(
+            src_id,
+            boot,
+            first,
+            room,
+            self.settings,
+            rows=self._rows,
+            decoder_for=self._decoder_for,
+            marks=self._marks.setdefault(src_id, {}),
+            control=self._entry,
+        )
+
+    def _report_all(self, events: Sequence[Event]) -> None:
+        for event in events:
+            self._events.append(event)
+            self._tell(event)
+
+    def _tell(self, event: Event) -> None:
+        if self._observer is not None:
+            self._observer(event)

@@ -1,0 +1,67 @@
+"""Arithmetic in GF(256), and the coefficients of repairs.
+
+The field is that of the polynomial 0x11D (x^8 + x^4 + x^3 + x^2 + 1) with generator 2. Adding is XOR. A row of bytes is
+multiplied by one ``bytes.translate`` with a table of 256 bytes, and added as one long integer: that is faster in Python
+than numpy for rows of a packet's size.
+
+Law: any square part of the Cauchy matrix ``coefficient(row, number)`` is invertible as long as its rows differ mod 128
+and its numbers differ mod 128. So as many different repairs as packets are missing always bring them back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+POLYNOMIAL = 0x11D
+_HALF = 128
+
+
+def _powers() -> tuple[list[int], list[int]]:
+    powers, logarithms = [0] * 510, [0] * 256
+    value = 1
+    for exponent in range(255):
+        powers[exponent] = powers[exponent + 255] = value
+        logarithms[value] = exponent
+        value <<= 1
+        if value > 255:
+            value ^= POLYNOMIAL
+    return powers, logarithms
+
+
+_POWER, _LOG = _powers()
+
+TIMES: tuple[bytes, ...] = (
+    bytes(256),
+    *(bytes((0, *(_POWER[_LOG[a] + _LOG[b]] for b in range(1, 256)))) for a in range(1, 256)),
+)
+"""``row.translate(TIMES[a])`` is the row times a."""
+
+INVERSE = bytes((0, *(_POWER[255 - _LOG[a]] for a in range(1, 256))))
+"""1 / a for a in 1..255."""
+
+CAUCHY: tuple[bytes, ...] = tuple(TIMES[a] for a in INVERSE)
+"""The table of the coefficient of (row, number) is ``CAUCHY[(128 + row % 128) ^ number % 128]``."""
+
+
+def coefficient(row: int, number: int) -> int:
+    """By what the body of a source packet is multiplied in a repair, 1..255.
+
+    :param row: of the repair
+    :param number: of the source packet
+    """
+    return INVERSE[(_HALF | row % _HALF) ^ number % _HALF]
+
+
+def combine(bodies: Iterable[tuple[int, bytes]], row: int) -> bytes:
+    """The linear combination of some bodies, as long as the longest; shorter ones count as followed by zeros.
+
+    :param bodies: (number, body) of each
+    :param row: of the repair
+    """
+    shifted = _HALF | row % _HALF
+    total = longest = 0
+    for number, body in bodies:
+        total ^= int.from_bytes(body.translate(CAUCHY[shifted ^ number % _HALF]), "little")
+        if len(body) > longest:  # noqa: PLR1730 - max() would take a third of this loop's time
+            longest = len(body)
+    return total.to_bytes(longest, "little")

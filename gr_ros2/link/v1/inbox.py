@@ -1,0 +1,426 @@
+"""One robot heard: its packets to messages, in order.
+
+*Order.* A message of a topic whose publishers are reliable waits until every packet before the one in which it began is
+here, or given up: it is not known what those carried. A packet is given up for this purpose when its sender says that
+it is over, or ``hold_s`` after it was missed; and at once while hardly any missing packet comes back. Messages of other
+topics are delivered as they come, and never after a later one.
+
+Laws: nothing is delivered twice, nor after a later message of its topic; every message of which something came ends in
+one Delivered or Lost; memory is bounded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from zlib import crc32
+
+from gr_ros2.errors import CodecError, WireError
+from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.events import Announced, Delivered, Key, Lost
+from gr_ros2.link.v1.reassembly import Partial, Reassembly
+from gr_ros2.link.v1.repair import MAP, SPAN
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.wire.control import Control, Report
+from gr_ros2.wire.table import Row, read_table
+from gr_ros2.wire.v1 import TABLE_TOPIC, Part, read_body
+
+Events = list[Delivered | Lost | Announced]
+
+_PACKET_COST = 150
+"""Bytes of bookkeeping counted per packet held."""
+_SMOOTHING = 1 / 32
+_HOPE = 1 / 16
+_WAITING = 256
+"""Messages of topics not known yet that are kept until the table comes."""
+
+
+@dataclass(slots=True)
+class _Ready:
+    """A message that is here whole and waits for its turn."""
+
+    topic_id: int
+    order: tuple[int, int]
+    payload: bytes
+    qos: int
+    coded: bool
+    repaired: bool
+
+
+class Inbox:
+    """What arrives of one start of one robot.
+
+    :param first: number of the first packet that may be wanted
+    :param room: bytes of its longest body
+    :param rows: its topics, where they are known beforehand
+    :param decoder_for: makes what decodes its messages of its table
+    :param control: takes entries that are no messages
+    """
+
+    def __init__(
+        self,
+        src_id: int,
+        boot: int,
+        first: int,
+        room: int,
+        settings: Settings,
+        *,
+        rows: tuple[Row, ...],
+        decoder_for: Callable[[tuple[Row, ...]], MessageCodec] | None,
+        marks: dict[int, int],
+        control: Callable[[Control], None],
+    ) -> None:
+        self.src_id, self.boot = src_id, boot
+        self.counts: Counter[str] = Counter()
+        """Packets by what became of them: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
+        self.rows: dict[int, Row] = {}
+        self.digest = 0
+        """CRC-32 of the table that is known."""
+        self.loss = 0.0
+        """Share of packets lost lately."""
+        self._settings = settings
+        self._room = room
+        self._control = control
+        self._decoder_for = decoder_for
+        self._codec: MessageCodec | None = None
+        span = max(min(SPAN, settings.max_source_bytes // (room + _PACKET_COST)), MAP)
+        self.decoder = RepairDecoder(room, self._plausible, span)
+        self.decoder.begin(first)
+        self.decoder.newest = first - 1
+        self._low = self._wanted = first
+        """No packet before these is waited for, and wanted."""
+        self._dead = first
+        """No packet before is worth anything to its sender."""
+        self._void: set[int] = set()
+        """Packets that their sender has left out of a repair."""
+        self._gaps: deque[tuple[float, int]] = deque()
+        """Packets that were missing, and since when."""
+        self._hope = 1.0
+        """Share of missing packets that come back in time."""
+        self._reassembly = Reassembly(settings.max_source_bytes)
+        self._ready: dict[int, list[_Ready]] = {}
+        """Messages waiting for their turn, by topic."""
+        self._unknown: deque[_Ready] = deque()
+        self._waiting = 0
+        """Bytes of these."""
+        self._last: dict[int, tuple[int, int]] = {}
+        """The newest message delivered, by topic."""
+        self.marks = marks
+        """CRC-32 of the newest message of each latched topic, as it was on the air."""
+        self.repeats = 0
+        self._events: Events = []
+        self._now = 0.0
+        self._unreported = 0
+        self._missed = False
+        """Whether a packet has been missed since the last report."""
+        self._reported_at = 0.0
+        self._old_turn = False
+        if rows:
+            self._know(rows)
+
+    @property
+    def newest(self) -> int:
+        """The newest packet number heard of."""
+        return self.decoder.newest
+
+    def source(self, number: int, body: bytes, qos: int, now: float) -> Events:
+        """A source packet came.
+
+        :param body: as it stood in the packet, padding included
+        :raises WireError: it cannot be read
+        """
+        self._unreported += 1
+        if number in self.decoder:
+            self.counts["duplicate"] += 1
+            return []
+        if number < self.decoder.floor:
+            self.counts["late"] += 1
+            return []
+        self._now = now
+        entries = read_body(body, self._room)
+        self.counts["packets"] += 1
+        late = number < self.decoder.newest
+        self._advance(number, now, here=True)
+        if not late:
+            self.loss -= self.loss * _SMOOTHING
+        for found in self.decoder.source(number, body[: self._room]):
+            if found[0] == number:
+                self._take(number, entries, qos, repaired=late)
+            else:
+                self._recovered(found)
+        self._settle()
+        return self._given()
+
+    def repair(self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float) -> Events:
+        """A repair came."""
+        self._unreported += 1
+        self._advance(number, now, here=False)
+        window = mask.bit_length()
+        if oldest and number - window + 1 > self._dead:
+            self._dead = number - window + 1
+        for found in self.decoder.repair(number, mask, row, combined):
+            self._recovered(found)
+        if mask + 1 != 1 << window:
+            for back in range(window):
+                if not mask >> back & 1 and number - back not in self.decoder and number - back >= self._wanted:
+                    self._void.add(number - back)
+        self._settle()
+        return self._given()
+
+    def heard(self, number: int, now: float) -> Events:
+        """A packet that is neither stands at this number."""
+        self._advance(number, now, here=False)
+        self._settle()
+        return self._given()
+
+    def handle_timeout(self, now: float) -> Events:
+        """Go on without what has been waited for long enough."""
+        self._now = now
+        self._settle()
+        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout):
+            self._lose(partial, "expired")
+        return self._given()
+
+    def next_timeout(self) -> float | None:
+        """When ``handle_timeout`` has something to do."""
+        times = []
+        if self._gaps and any(self._ready.values()):
+            times.append(self._gaps[0][0] + self._settings.hold_s)
+        waiting = self._reassembly.next_timeout()
+        if waiting is not None:
+            times.append(waiting + self._settings.reassembly_timeout)
+        return min(times) if times else None
+
+    def close(self, reason: str) -> Events:
+        """Give up everything that is not delivered."""
+        for partial in self._reassembly.clear():
+            self._lose(partial, reason)
+        for waiting in [ready for line in self._ready.values() for ready in line]:
+            self._events.append(Lost(self.src_id, waiting.topic_id, reason, self._key(waiting.order)))
+        for waiting in self._unknown:
+            self._events.append(Lost(self.src_id, waiting.topic_id, "unknown_topic", self._key(waiting.order)))
+        self._ready.clear()
+        self._unknown.clear()
+        return self._given()
+
+    def lacks(self, mark: tuple[int, int], now: float) -> bool:
+        """Whether a latched message is not here and not under way either."""
+        topic_id, value = mark
+        return self.marks.get(topic_id) != value and not self._reassembly.growing(topic_id, now - 1.0)
+
+    def report_due(self, now: float) -> float:
+        """When the next report is due, as long as there are packets since the last one."""
+        half = self._settings.half_duplex
+        if (self._missed and not half) or self._unreported >= self._settings.report_every * (4 if half else 1):
+            return now
+        return self._reported_at + _REPORT_S
+
+    def report(self, now: float) -> Report:
+        """What has arrived, newest part and oldest missing part in turn."""
+        self._unreported = 0
+        self._missed = False
+        self._reported_at = now
+        decoder = self.decoder
+        newest = decoder.newest
+        base = newest
+        self._old_turn = not self._old_turn
+        if self._old_turn and self._wanted < newest - MAP + 1:
+            base = self._wanted + MAP - 1
+        arrived = 0
+        for back in range(MAP):
+            number = base - back
+            if number in decoder or number < self._wanted:
+                arrived |= 1 << back
+        settled = self._wanted > base - MAP
+        loss = min(round(self.loss * 128), 127)
+        return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss)
+
+    @property
+    def unreported(self) -> int:
+        """Packets since the last report."""
+        return self._unreported
+
+    @property
+    def held(self) -> int:
+        """Bytes of incomplete messages."""
+        return self._reassembly.held
+
+    def _given(self) -> Events:
+        events, self._events = self._events, []
+        return events
+
+    def _plausible(self, body: bytes) -> bool:
+        try:
+            read_body(body, self._room)
+        except WireError:
+            return False
+        return True
+
+    def _advance(self, number: int, now: float, *, here: bool) -> None:
+        """The sender has come to this number: what is between it and the newest is missing for now."""
+        self._now = now
+        newest = self.decoder.newest
+        if number <= newest:
+            return
+        gone = number - newest - here
+        if gone:
+            self.counts["missing"] += gone
+            self._missed = True
+            self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
+            first = max(newest + 1, number - SPAN)
+            self._gaps.extend((now, missing) for missing in range(first, newest + 1 + gone))
+        self.decoder.advance(number)
+
+    def _recovered(self, found: tuple[int, bytes]) -> None:
+        number, body = found
+        self.counts["repaired"] += 1
+        self._take(number, read_body(body, self._room), -1, repaired=True)
+
+    def _take(self, number: int, entries: list[Part | Control], qos: int, *, repaired: bool) -> None:
+        """The entries of a packet that is here now."""
+        for place, entry in enumerate(entries):
+            if not isinstance(entry, Part):
+                self._control(entry)
+            elif entry.last and not entry.offset:
+                ready = _Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired)
+                self._arrived(ready)
+            else:
+                self._fragment(entry, number, place, qos, repaired=repaired)
+
+    def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool) -> None:
+        begin = number - part.back
+        if begin < self._last.get(part.topic_id, (0, 0))[0] or begin < 0:
+            self.counts["overtaken"] += 1
+            return
+        whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
+        for partial in self._reassembly.overflowing():
+            self._lose(partial, "memory")
+        if whole is None:
+            return
+        payload = whole.payload()
+        if payload is None:
+            self._lose(whole, "contradiction")
+            return
+        order = (whole.begin, whole.place)
+        self._arrived(_Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
+
+    def _arrived(self, ready: _Ready) -> None:
+        """A message is here whole."""
+        if ready.topic_id == TABLE_TOPIC:
+            self._table(ready.payload)
+            return
+        row = self.rows.get(ready.topic_id)
+        if row is None:
+            self._unknown.append(ready)
+            self._waiting += len(ready.payload)
+            while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
+                lost = self._unknown.popleft()
+                self._waiting -= len(lost.payload)
+                self._events.append(Lost(self.src_id, lost.topic_id, "unknown_topic", self._key(lost.order)))
+        elif row.reliable and ready.order[0] > self._low:
+            self._ready.setdefault(ready.topic_id, []).append(ready)
+        else:
+            self._deliver(ready, row)
+
+    def _settle(self) -> None:
+        """See how far everything is here or given up, and deliver what waited for that."""
+        decoder, dead, void = self.decoder, max(self._dead, self.decoder.floor), self._void
+        newest, low = decoder.newest, self._low
+        if self._gaps:
+            low = self._give_up(low, dead)
+        while low <= newest and (low in decoder or low < dead or low in void):
+            low += 1
+        wanted = max(self._wanted, dead)
+        while wanted <= newest and (wanted in decoder or wanted in void):
+            wanted += 1
+        if wanted > self._wanted:
+            if void:
+                self._void = {number for number in void if number >= wanted}
+            self._wanted = wanted
+        if low > self._low:
+            self._low = low
+            for topic_id, line in self._ready.items():
+                if line:
+                    self._release(self.rows[topic_id], line)
+
+    def _give_up(self, low: int, dead: int) -> int:
+        """Up to where missing packets have been waited for long enough; sees how many come back."""
+        gaps, decoder, hold_s = self._gaps, self.decoder, self._settings.hold_s
+        while gaps and gaps[0][0] + hold_s <= self._now:
+            number = gaps.popleft()[1]
+            if number in decoder:
+                self._hope += (1 - self._hope) * _HOPE
+            elif number >= dead and number not in self._void:
+                self._hope -= self._hope * _HOPE
+                low = max(low, number + 1)
+        if gaps and self._hope < 0.5:
+            low = max(low, gaps[-1][1] + 1)
+        return low
+
+    def _release(self, row: Row, line: list[_Ready]) -> None:
+        line.sort(key=lambda ready: ready.order)
+        while line and line[0].order[0] <= self._low:
+            self._deliver(line.pop(0), row)
+
+    def _deliver(self, ready: _Ready, row: Row) -> None:
+        topic_id, key = ready.topic_id, self._key(ready.order)
+        if ready.order <= self._last.get(topic_id, (-1, -1)):
+            self._events.append(Lost(self.src_id, topic_id, "given_up" if row.reliable else "overtaken", key))
+            return
+        self._last[topic_id] = ready.order
+        for partial in self._reassembly.overtaken(topic_id, ready.order[0]):
+            self._lose(partial, "given_up" if row.reliable else "overtaken")
+        payload = ready.payload
+        if row.latched:
+            mark = crc32(payload)
+            if self.marks.get(topic_id) == mark:
+                self.repeats += 1
+                return
+            self.marks[topic_id] = mark
+        if ready.coded:
+            try:
+                if self._codec is None:
+                    raise CodecError("coded, and no codec is configured here")
+                payload = self._codec.decode(topic_id, payload)
+            except CodecError as error:
+                self._events.append(Lost(self.src_id, topic_id, error.row, key))
+                return
+        qos = ready.qos if ready.qos >= 0 else row.qos
+        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
+
+    def _table(self, payload: bytes) -> None:
+        try:
+            rows = read_table(payload)
+        except WireError:
+            self.counts["bad_table"] += 1
+            return
+        digest = crc32(payload)
+        if digest == self.digest:
+            return
+        self.digest = digest
+        self._know(rows)
+        self._events.append(Announced(self.src_id, rows))
+        waiting, self._unknown, self._waiting = self._unknown, deque(), 0
+        for ready in sorted(waiting, key=lambda item: item.order):
+            self._arrived(ready)
+
+    def _know(self, rows: tuple[Row, ...]) -> None:
+        self.rows = {row.topic_id: row for row in rows}
+        for topic_id in [topic_id for topic_id in self._ready if topic_id not in self.rows]:
+            for ready in self._ready.pop(topic_id):
+                self._events.append(Lost(self.src_id, topic_id, "unknown_topic", self._key(ready.order)))
+        if self._decoder_for is not None:
+            self._codec = self._decoder_for(rows)
+
+    def _lose(self, partial: Partial, reason: str) -> None:
+        key = self._key((partial.begin, partial.place))
+        self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
+
+    def _key(self, order: tuple[int, int]) -> Key:
+        return Key(self.boot, *order)
+
+
+_REPORT_S = 0.1
+"""s after which even one packet is reported."""

@@ -1,0 +1,394 @@
+"""What waits to be sent, and what goes into the next packet.
+
+*Order.* Messages of class latency go first, then default, then bulk; within a class the most valuable per byte of air,
+``weight * g^2 / c`` (see ``link.freshness``). Every ``TURN``-th packet begins with the topic whose last turn is longest
+ago, so that nothing starves.
+
+*Cuts.* A message that fits goes whole. A fragment that is not the last one fills its packet, so the cut follows from
+what is free, and nothing about it is fixed beforehand.
+
+*Life.* For how long a message is worth repairing follows from its topic: ``latest`` until a newer one has left whole;
+with a lifespan, until that is over; otherwise until ``depth`` newer ones have left, or newer ones that fill a repair.
+Where receivers report they say when they have it, and no more than the publishers' depth limits it.
+
+Laws: a topic's messages begin one after the other, each after the one before has left whole; every message ends in
+being sent or in a Refused with its row.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from math import inf
+from zlib import crc32
+
+from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
+from gr_ros2.link.v1.events import Accepted, Key, Refused, SentPart
+from gr_ros2.link.v1.repair import GROUP, Life
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.registry import Registry, Topic
+from gr_ros2.wire.table import Row, write_table
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
+
+TURN = 4
+LARGE = 4
+"""Packets from which on a message begins in what others leave of a packet."""
+FIRST_AGE_S = 1.0
+"""s that a topic counts as old when its first message comes."""
+SETTLING_S = 1.0
+"""s after which a latched message is named in hellos: who lacks it then has not merely not got it yet."""
+STARTING_S = 2.0
+"""s from the start for which the table is repaired though nobody reports."""
+_QOS = {"default": 0, "latency": 1, "bulk": 2}
+_RANK = (1, 0, 2)
+_ENTRY = 3
+
+Observer = Callable[[Accepted | Refused], None]
+
+
+@dataclass(slots=True, eq=False)
+class Message(Outgoing):
+    """A message on its way out. ``begin``: packet in which it began; ``place``: among the entries there."""
+
+    life: Life = field(default_factory=Life)
+    begin: int = 0
+    place: int = 0
+    coded: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class _Kept:
+    """A message kept for robots that join late."""
+
+    payload: bytes
+    coded: bool
+    mark: int
+    named: float = inf
+    """s from when on hellos name it."""
+
+
+@dataclass(slots=True)
+class Filling:
+    """The content of a source packet."""
+
+    parts: list[Part]
+    sent: list[SentPart]
+    lives: tuple[Life, ...]
+    qos: int
+    used: int
+
+
+class Outbox:
+    """The queues of one sender.
+
+    :param topics: what it may send; the table that it announces is made of them
+    :param boot: of this start, for keys
+    :param room: bytes of the longest body
+    """
+
+    def __init__(
+        self,
+        topics: Registry | None,
+        settings: Settings,
+        *,
+        boot: int,
+        room: int,
+        codec: MessageCodec | None,
+        observer: Observer,
+    ) -> None:
+        self._settings = settings
+        self._topics = topics
+        self._boot = boot
+        self._room = room
+        self._codec = codec
+        self._observe = observer
+        self._queues: dict[int, TopicQueue] = {}
+        self._depths: dict[int, int] = {}
+        for topic in topics or ():
+            self._queues[topic.topic_id] = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
+        self._lives: dict[int, deque[tuple[Life, int]]] = {
+            topic_id: deque() for topic_id in (*self._queues, TABLE_TOPIC)
+        }
+        self._packets_of: Counter[int] = Counter()
+        """Packets of these lives, by topic."""
+        self._kept: dict[int, deque[_Kept]] = {}
+        self._open: dict[int, Sequence[Outgoing]] = {}
+        """What may go on or start now, by topic."""
+        self._newest: dict[int, float] = {}
+        self._line: list[int] = []
+        self._packets = 0
+        self._serial = 0
+        self.submitted: Counter[int] = Counter()
+        self.refused: Counter[tuple[int, str]] = Counter()
+        self.sent: Counter[int] = Counter()
+        self.repeats = 0
+        self._starting_until = inf
+        self.reported = False
+        """Whether receivers report, so that they say when a message is over."""
+        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        self._ordered: dict[int, bool] = {}
+        self.digest = 0
+        """CRC-32 of the table, 0 where there is nothing to announce."""
+        if topics:
+            self._queues[TABLE_TOPIC] = TopicQueue("latest")
+            self._tabulate()
+
+    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
+        """Take a message; it may be refused, and may push out others of its topic."""
+        assert self._topics is not None
+        topic = self._topics[topic_id]
+        serial = self._serial
+        self._serial += 1
+        self.submitted[topic_id] += 1
+        codec = self._codec
+        self._observe(
+            Accepted(serial, topic_id, payload, now, None if codec is None else codec.canonical(topic_id, payload))
+        )
+        if codec is not None:
+            payload = codec.encode(topic_id, payload)
+        if len(payload) > MAX_MESSAGE:
+            self._refuse(serial, topic_id, "too_large", f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            return
+        if topic.latched:
+            kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
+            kept.append(_Kept(payload, codec is not None, crc32(payload)))
+        self._admit(topic, serial, payload, codec is not None, now)
+
+    def ask(self, topic_id: int, now: float) -> None:
+        """Somebody lacks what is kept of a topic: send it again, unless it waits already."""
+        self._starting_until = min(self._starting_until, now + STARTING_S)
+        queue = self._queues.get(topic_id)
+        if queue is None or any(message.serial < 0 for message in queue):
+            return
+        for kept in self._kept.get(topic_id, ()):
+            if topic_id == TABLE_TOPIC:
+                queue.append(Message(-1, TABLE_TOPIC, kept.payload, 0, now))
+            else:
+                assert self._topics is not None
+                self._admit(self._topics[topic_id], -1, kept.payload, kept.coded, now)
+            self.repeats += 1
+
+    def announce(self, now: float) -> None:
+        """Send everything that is kept: to robots that cannot ask."""
+        for topic_id in self._kept:
+            if not self._queues[topic_id]:
+                self.ask(topic_id, now)
+
+    def marks(self, now: float) -> list[tuple[int, int]]:
+        """What hellos name: (topic id, CRC-32) of the messages kept."""
+        return [
+            (topic_id, kept.mark)
+            for topic_id, messages in self._kept.items()
+            if topic_id != TABLE_TOPIC
+            for kept in messages
+            if now >= kept.named
+        ]
+
+    def follow(self, topic_id: int, *, reliable: bool, depth: int, lifespan_s: float, period_s: float) -> bool:
+        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+
+        :return: whether the table of topics is another one now
+        """
+        assert self._topics is not None
+        queue = self._queues[topic_id]
+        self._depths[topic_id] = depth
+        self._ordered[topic_id] = reliable
+        queue.change(*queue_for(self._topics[topic_id].options, depth, lifespan_s, period_s))
+        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
+    def expire(self, now: float, interval: float) -> None:
+        """Drop what would be too late."""
+        for queue in self._with_deadline:
+            if queue:
+                self._drop(list(queue.expire(now, interval, LEAD_S, self._room - _ENTRY)))
+
+    def fill(self, number: int, room: int, now: float) -> Filling | None:
+        """Take what goes into the next source packet.
+
+        :param number: of that packet
+        :param room: bytes that its body may have
+        :return: None where nothing may go
+        """
+        if self.idle:
+            return None
+        heap = self._heap(now)
+        picks: list[tuple[Message, int]] = []
+        used = 0
+        while heap and used < room:
+            _, _, topic_id, position = heappop(heap)
+            queue = self._open[topic_id]
+            message = queue[position]
+            assert isinstance(message, Message)
+            taken, size = fit(room - used, message.remaining, number - message.begin, message.offset)
+            if taken < 0 or not (taken == message.remaining or self._may_cut(message, taken, used, room)):
+                continue
+            picks.append((message, taken))
+            used += size
+            if taken == message.remaining and position + 1 < len(queue):
+                following = queue[position + 1]
+                value = -_value(following, message.submitted)
+                heappush(heap, (_RANK[following.qos], value, topic_id, position + 1))
+        if not picks:
+            return None
+        wait = self._settings.flush_timeout
+        if wait and room - used >= self._settings.min_fragment + _ENTRY:
+            since = min(min(message.submitted, self._queues[message.topic_id].since) for message, _ in picks)
+            if now < since + wait:
+                return None
+        return self._take(picks, number, used, now)
+
+    def next_timeout(self, now: float) -> float | None:
+        """When ``fill`` may have something; None while nothing waits."""
+        times = [
+            max(queue.opens(now) if queue.opens(now) < inf else now, self._flush(queue, now))
+            for queue in self._queues.values()
+            if queue
+        ]
+        return min(times) if times else None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits."""
+        return not any(self._queues.values())
+
+    def queued(self) -> dict[int, int]:
+        """Messages waiting or under way, per topic id."""
+        return {topic_id: len(queue) for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC}
+
+    def room(self, topic_id: int) -> bool:
+        """Whether a message of that topic could be submitted without pushing another out."""
+        return self._queues[topic_id].room(self._bound(topic_id))
+
+    def _tabulate(self) -> None:
+        """Make the table of topics."""
+        rows = []
+        for topic in self._topics or ():
+            options = topic.options
+            reliable = options.reliability
+            ordered = self._ordered.get(topic.topic_id, True) if reliable is None else reliable == "reliable"
+            ordered = ordered and self._queues[topic.topic_id].policy != "latest"
+            depth = options.depth if options.depth is not None else self._depths.get(topic.topic_id, 0)
+            codec = "" if self._codec is None else options.codec
+            qos = _QOS[options.qos]
+            name, kind = topic.name, topic.type_name
+            rows.append(Row(topic.topic_id, name, kind, qos, ordered, topic.latched, min(depth, 255), codec))
+        table = write_table(rows)
+        self.digest = crc32(table)
+        self._kept[TABLE_TOPIC] = deque([_Kept(table, False, self.digest)])
+
+    def _flush(self, queue: TopicQueue, now: float) -> float:
+        return queue.since + self._settings.flush_timeout if self._settings.flush_timeout else now
+
+    def _bound(self, topic_id: int) -> int:
+        depth = None if self._topics is None else self._topics[topic_id].options.queue_depth
+        return self._settings.queue_depth if depth is None else depth
+
+    def _admit(self, topic: Topic, serial: int, payload: bytes, coded: bool, now: float) -> None:
+        qos = _QOS[topic.options.qos] if serial >= 0 else 2
+        message = Message(serial, topic.topic_id, payload, qos, now, topic.options.weight, coded=coded)
+        self._drop(self._queues[topic.topic_id].admit(message, self._bound(topic.topic_id)))
+
+    def _heap(self, now: float) -> list[tuple[int, float, int, int]]:
+        """Topics that may go on, the most urgent and most valuable first."""
+        self._open = {topic_id: queue.open(now) for topic_id, queue in self._queues.items() if queue}
+        heap = []
+        for topic_id, queue in self._open.items():
+            if queue:
+                head = queue[0]
+                before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
+                heap.append((_RANK[head.qos], -_value(head, before), topic_id, 0))
+        if len(heap) > 1 and self._packets % TURN == TURN - 1:
+            self._line += [item[2] for item in heap if item[2] not in self._line]
+            holder = next(topic_id for topic_id in self._line if any(item[2] == topic_id for item in heap))
+            self._line.remove(holder)
+            self._line.append(holder)
+            heap = [(-1, item[1], holder, 0) if item[2] == holder and item[0] else item for item in heap]
+        heapify(heap)
+        return heap
+
+    def _may_cut(self, message: Message, taken: int, used: int, room: int) -> bool:
+        """Whether a fragment of so many bytes is worth its header."""
+        if not used:
+            return True
+        if taken < self._settings.min_fragment:
+            return False
+        return message.started or message.qos == 1 or message.remaining > LARGE * room
+
+    def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
+        parts: list[Part] = []
+        sent: list[SentPart] = []
+        for place, (message, taken) in enumerate(picks):
+            queue = self._queues[message.topic_id]
+            if not message.started:
+                message.begin, message.place = number, place
+                message.life.expires = message.expires
+                queue.started(now)
+            offset = message.offset
+            payload = message.payload[offset : offset + taken]
+            message.index += 1
+            message.offset += taken
+            last = not message.remaining
+            back = number - message.begin if offset else 0
+            parts.append(Part(message.topic_id, payload, back, offset, last, message.coded))
+            key = Key(self._boot, message.begin, message.place)
+            sent.append(SentPart(message.serial, message.topic_id, key, offset, taken, last, message.serial < 0))
+            if last:
+                queue.popleft()
+                self._left(message, queue, now)
+        self._packets += 1
+        lives = tuple({id(message.life): message.life for message, _ in picks}.values())
+        ranks = [message.qos for message, _ in picks]
+        qos = min(ranks, key=lambda qos: _RANK[qos])
+        return Filling(parts, sent, lives, qos, used)
+
+    def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
+        """A message has left whole: what it overtakes is over."""
+        topic_id = message.topic_id
+        self._newest[topic_id] = max(message.submitted, self._newest.get(topic_id, 0.0))
+        self.sent[topic_id] += message.serial >= 0
+        lives = self._lives[topic_id]
+        most = self._settings.depth
+        if queue.policy == "latest":
+            most = 1
+        elif self.reported:
+            most = self._depths.get(topic_id, 0) or 10 * most
+        lives.append((message.life, message.index))
+        self._packets_of[topic_id] += message.index
+        while len(lives) > 1 and (len(lives) > most or (self._packets_of[topic_id] > GROUP and not self.reported)):
+            life, count = lives.popleft()
+            life.over = True
+            self._packets_of[topic_id] -= count
+        for kept in self._kept.get(topic_id, ()):
+            if kept.payload is message.payload and kept.named == inf:
+                kept.named = now + SETTLING_S
+        if topic_id == TABLE_TOPIC and not self.reported:
+            # Later it comes again, and is small; at the start nothing can be delivered without it.
+            message.life.expires = self._starting_until
+        elif topic_id in self._kept and not self.reported:
+            message.life.expires = min(message.life.expires, now + 2 * (now - message.submitted) + 2.0)
+
+    def _drop(self, dropped: list[Dropped]) -> None:
+        for item in dropped:
+            item.message.index = max(item.message.index, 1)
+            if isinstance(item.message, Message):
+                item.message.life.over = True
+            if item.message.serial >= 0:
+                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+
+    def _refuse(self, serial: int, topic_id: int, reason: str, detail: str) -> None:
+        self.refused[topic_id, reason] += 1
+        self._observe(Refused(serial, topic_id, reason, detail))
+
+
+def _value(message: Outgoing, before: float) -> float:
+    """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
+    younger = message.submitted - before
+    return message.weight * younger * younger / (message.remaining + _ENTRY)

@@ -1,0 +1,139 @@
+"""Fragments of one sender back to messages.
+
+A fragment names its message by the packet in which that began, and says where in it it belongs. Packet numbers are full
+ones here, of one start of the sender, so two messages cannot be taken for one.
+
+Laws: memory grows with what has arrived, never with what was announced; what it holds is bounded, the message longest
+without a fragment goes first.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+from gr_ros2.wire.v1 import Part
+
+_FRAGMENT_COST = 100
+"""Bytes of bookkeeping counted per fragment held."""
+
+
+@dataclass(slots=True, eq=False)
+class Partial:
+    """A message of which not all is here.
+
+    :param place: among the entries of the packet in which it began; -1 until that one is here
+    """
+
+    topic_id: int
+    begin: int
+    coded: bool
+    last: float
+    pieces: dict[int, bytes] = field(default_factory=dict)
+    size: int = 0
+    total: int = -1
+    place: int = -1
+    repaired: bool = False
+
+    def payload(self) -> bytes | None:
+        """The message; None where its fragments do not join."""
+        parts = []
+        offset = 0
+        for start in sorted(self.pieces):
+            if start != offset:
+                return None
+            parts.append(self.pieces[start])
+            offset += len(parts[-1])
+        return b"".join(parts)
+
+
+class Reassembly:
+    """The incomplete messages of one sender.
+
+    :param most: bytes held at most
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._partials: OrderedDict[tuple[int, int], Partial] = OrderedDict()
+        """By topic id and packet in which they began, longest without a fragment first."""
+        self._held = 0
+
+    @property
+    def held(self) -> int:
+        """Bytes in use."""
+        return self._held
+
+    def add(self, part: Part, number: int, place: int, *, repaired: bool, now: float) -> Partial | None:
+        """Take a fragment.
+
+        :param number: of its packet
+        :param place: among the entries there
+        :param repaired: it did not come the first time
+        :return: its message, if it is complete now; it is held no longer then
+        """
+        begin = number - part.back
+        name = (part.topic_id, begin)
+        partial = self._partials.get(name)
+        if partial is None:
+            partial = self._partials[name] = Partial(part.topic_id, begin, part.coded, now)
+        else:
+            self._partials.move_to_end(name)
+        partial.last = now
+        partial.repaired |= repaired
+        if part.offset in partial.pieces:
+            return None
+        partial.pieces[part.offset] = part.payload
+        partial.size += len(part.payload)
+        self._held += len(part.payload) + _FRAGMENT_COST
+        if not part.offset:
+            partial.place = place
+        if part.last:
+            partial.total = part.offset + len(part.payload)
+        if partial.size != partial.total or partial.place < 0:
+            return None
+        self._release(partial)
+        return partial
+
+    def overflowing(self) -> list[Partial]:
+        """Give up the oldest where memory is over its bound."""
+        ended = []
+        while self._held > self._most:
+            ended.append(self._release(next(iter(self._partials.values()))))
+        return ended
+
+    def expired(self, before: float) -> list[Partial]:
+        """Give up what has had no fragment since a time."""
+        ended = []
+        for partial in list(self._partials.values()):
+            if partial.last > before:
+                break
+            ended.append(self._release(partial))
+        return ended
+
+    def overtaken(self, topic_id: int, begin: int) -> list[Partial]:
+        """Give up what began before another message of its topic that has been delivered."""
+        names = [name for name in self._partials if name[0] == topic_id and name[1] < begin]
+        return [self._release(self._partials[name]) for name in names]
+
+    def clear(self) -> list[Partial]:
+        """Give up everything."""
+        ended = list(self._partials.values())
+        self._partials.clear()
+        self._held = 0
+        return ended
+
+    def growing(self, topic_id: int, since: float) -> bool:
+        """Whether a message of a topic has had a fragment since a time."""
+        return any(name[0] == topic_id and partial.last > since for name, partial in self._partials.items())
+
+    def next_timeout(self) -> float | None:
+        """Since when the one longest without a fragment has waited."""
+        for partial in self._partials.values():
+            return partial.last
+        return None
+
+    def _release(self, partial: Partial) -> Partial:
+        del self._partials[partial.topic_id, partial.begin]
+        self._held -= partial.size + len(partial.pieces) * _FRAGMENT_COST
+        return partial

@@ -1,0 +1,450 @@
+"""What an idle slot carries: the sender's side of repair.
+
+*The rule.* New packets always go first. In a slot that no new packet wants:
+
+1. if there is one receiver and its reports name a lost packet that is still alive: that packet again as it was, the
+   newest first;
+2. otherwise a linear combination over GF(256) of the newest live packets, up to ``GROUP``; where more are alive, of
+   those in windows of 127 numbers, which move over all of them and overlap.
+
+A packet is *alive* until every receiver that reports has confirmed it, or all messages in it are over: late, or
+overtaken. With one live packet the rule is repetition, which is age-optimal. Windows that overlap even out the losses
+of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, after 1.36 times in
+separate groups of 64.
+
+*Overload.* Where the idle slots cannot make up for the losses, a long window decodes nothing at all. It shrinks then:
+to ``FEW`` packets, and to those of the newest message.
+
+Laws: a standing packet's row is used once per number; coefficients of a window are never those of another repair of the
+same packets; nothing alive is older than ``span`` numbers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from math import inf
+from typing import Literal, NamedTuple
+
+from gr_ros2.link.v1.gf256 import combine
+from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
+
+RepairMode = Literal["idle", "thrifty", "off"]
+
+GROUP = 64
+"""Packets that a repair combines, as long as no more are alive."""
+FEW = 8
+"""The same where repair cannot keep up."""
+SPAN = 30_000
+"""Numbers that a sender repairs and a receiver remembers, if its memory allows; of a circle of 65,536."""
+MAP = 64
+"""Packets that a report tells of."""
+
+TURN = 3
+"""Every so manieth repair is for short messages, while a long one is alive."""
+_GOLDEN = (5**0.5 - 1) / 2
+_DECAY = 0.98
+_DELAYS = 16
+_ENOUGH = 0.05
+"""Packets' worth of doubt that is not worth a repair (thrifty)."""
+_TIMES = 512
+_PATIENCE_S = 0.2
+"""s beyond which a packet of which no report tells is taken for lost as likely as not."""
+
+
+@dataclass(slots=True, eq=False)
+class Life:
+    """How long a message is worth repairing.
+
+    :param expires: s, when it is of no more use
+    :param over: it was overtaken, or needs no repair
+    """
+
+    expires: float = inf
+    over: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Sent:
+    """A source packet that left. ``confirmed`` has a bit per receiver; ``at``: when it left last, s."""
+
+    number: int
+    body: bytes
+    data: bytes
+    lives: tuple[Life, ...]
+    at: float
+    confirmed: int = 0
+
+    def alive(self, now: float) -> bool:
+        for life in self.lives:  # noqa: SIM110 - any() with a generator takes three times as long
+            if not life.over and now < life.expires:
+                return True
+        return False
+
+
+class Repair(NamedTuple):
+    """A combination to be sent.
+
+    :param number: the newest number of its window
+    :param mask: bit i says that ``number - i`` is part of it
+    :param row: of its coefficients
+    :param oldest: nothing older than the window is alive
+    """
+
+    number: int
+    mask: int
+    row: int
+    oldest: bool
+    combined: bytes
+
+
+@dataclass(slots=True, eq=False)
+class Receiver:
+    """What reports of one receiver have told."""
+
+    bit: int
+    heard: float
+    loss: float = 0.0
+    newest: int = -1
+    interval: float = 0.0
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    lost: set[int] = field(default_factory=set)
+
+    @property
+    def delay(self) -> float:
+        """s from a packet's departure to the report that tells of it, at best."""
+        return min(self.delays) if self.delays else 0.0
+
+
+class RepairWindow:
+    """The source packets of one sender that are still worth something.
+
+    :param mode: ``idle`` uses every slot it is offered; ``thrifty`` only as many as losses are known or expected;
+        ``off`` none
+    :param room: bytes of the longest body
+    :param expected_loss: share of packets lost, as long as no report tells
+    """
+
+    def __init__(self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN) -> None:
+        self.mode = mode
+        self.counts: Counter[str] = Counter()
+        """Standing packets by kind: ``resent``, ``combined``."""
+        self._room = room
+        self._expected = expected_loss
+        self._span = span
+        self._records: dict[int, Sent] = {}
+        """Everything from the oldest live packet on, by number."""
+        self._oldest = 0
+        """No record is older."""
+        self.newest = 0
+        """Number of the last source packet; 0 before the first."""
+        self._receivers: dict[int, Receiver] = {}
+        self._everybody = 0
+        self._resend: list[int] = []
+        """Negated numbers that the only receiver lacks."""
+        self._rows: dict[int, int] = {}
+        """Bits of the rows used up, by number."""
+        self._row = 0
+        self._turn = 0
+        self._place = 0.0
+        self._flight: deque[tuple[float, int, int]] = deque()
+        """Until when a repair may be under way unheard of, and its window."""
+        self._times: dict[int, float] = {}
+        self._slots = [0.0, 0.0]
+        """New packets and idle slots, lately."""
+
+    def sent(self, number: int, body: bytes, data: bytes, lives: tuple[Life, ...], now: float) -> None:
+        """A source packet left.
+
+        :param body: its entries, without padding
+        :param data: the packet as it was sent
+        :param lives: of the messages in it; () for one that is not worth repairing
+        """
+        self.newest = number
+        self._times[number] = now
+        self._times.pop(number - _TIMES, None)
+        slots = self._slots
+        slots[0] = slots[0] * _DECAY + 1
+        slots[1] *= _DECAY
+        if self._records or lives:
+            if not self._records:
+                self._oldest = number
+            self._records[number] = Sent(number, body, data, lives, now)
+            if number - self._oldest >= self._span:
+                self._trim(number - self._span + 1)
+
+    def meet(self, receiver: int, now: float) -> Receiver:
+        """A receiver that reports is there; nothing is over before it has confirmed it."""
+        peer = self._receivers.get(receiver)
+        if peer is None:
+            free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
+            peer = self._receivers[receiver] = Receiver(1 << free, now)
+            self._everybody |= peer.bit
+        return peer
+
+    def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
+        """A receiver says what it has.
+
+        :param number: newest number that it tells of
+        :param arrived: bit i says that it has ``number - i``
+        :param settled: it wants nothing older than those 64
+        :param loss: share of packets that it lost lately
+        """
+        if number > self.newest:
+            return
+        peer = self.meet(receiver, now)
+        gap = now - peer.heard
+        peer.interval += (gap - peer.interval) / 8
+        peer.heard, peer.loss = now, loss
+        sent_at = self._times.get(number)
+        if sent_at is not None and number >= peer.newest:
+            peer.delays.append(now - sent_at)
+        peer.newest = max(peer.newest, number)
+        records, bit, delay = self._records, peer.bit, peer.delay
+        for back in range(MAP):
+            record = records.get(number - back)
+            if record is None or record.confirmed & bit:
+                continue
+            if arrived >> back & 1:
+                record.confirmed |= bit
+                peer.lost.discard(record.number)
+            elif now - record.at >= delay and record.number not in peer.lost and record.lives:
+                peer.lost.add(record.number)
+                heappush(self._resend, -record.number)
+        if settled:
+            for older in range(self._oldest, number - MAP + 1):
+                record = records.get(older)
+                if record is not None:
+                    record.confirmed |= bit
+                    peer.lost.discard(older)
+        self._retire(now)
+
+    def forget(self, receiver: int) -> None:
+        """A receiver is gone."""
+        peer = self._receivers.pop(receiver, None)
+        if peer is not None:
+            self._everybody &= ~peer.bit
+            for record in self._records.values():
+                record.confirmed &= ~peer.bit
+
+    def receivers(self) -> dict[int, tuple[float, float]]:
+        """Who reports: when they were heard last, and the share of packets that they lost."""
+        return {name: (peer.heard, peer.loss) for name, peer in self._receivers.items()}
+
+    def take_row(self, number: int) -> int | None:
+        """A row that no standing packet at this number has had; None where all are used up."""
+        used = self._rows.get(number, 0)
+        if used == (1 << ROWS) - 1:
+            return None
+        row = self._row
+        while used >> row & 1:
+            row = (row + 1) % ROWS
+        self._rows[number] = used | 1 << row
+        self._row = (row + 1) % ROWS
+        if len(self._rows) > 2 * self._span:
+            for old in [old for old in self._rows if old < number - self._span]:
+                del self._rows[old]
+        return row
+
+    def unconfirmed(self, now: float) -> bool:
+        """Whether anything is alive."""
+        self._retire(now)
+        return bool(self._records)
+
+    def next(self, now: float) -> bytes | Repair | None:
+        """What an idle slot carries: a packet again as it was, a combination, or nothing."""
+        slots = self._slots
+        slots[0] *= _DECAY
+        slots[1] = slots[1] * _DECAY + 1
+        if self.mode == "off":
+            return None
+        self._retire(now)
+        if not self._records:
+            return None
+        if len(self._receivers) == 1 and (again := self._lost(now)) is not None:
+            self.counts["resent"] += 1
+            return again.data
+        window = self._window(now)
+        if not window or (self.mode == "thrifty" and not self._worth(window, now)):
+            return None
+        return self._combination(window, now)
+
+    def exhausted(self, now: float) -> tuple[Life, ...]:
+        """What the newest live packet carries, if no standing packet can stand at the newest number any more and
+        something is alive; a packet with these lives and no content makes room. Otherwise ()."""
+        if self._rows.get(self.newest, 0) == (1 << ROWS) - 1:
+            for number in range(self.newest, self._oldest - 1, -1):
+                record = self._records.get(number)
+                if record is not None and record.alive(now):
+                    return record.lives
+        return ()
+
+    def _lost(self, now: float) -> Sent | None:
+        """The newest live packet that the only receiver lacks and has not been sent again since."""
+        (peer,) = self._receivers.values()
+        while self._resend:
+            number = -heappop(self._resend)
+            record = self._records.get(number)
+            if number in peer.lost:
+                peer.lost.discard(number)
+                if record is not None and not record.confirmed & peer.bit and record.alive(now):
+                    record.at = now
+                    return record
+        return None
+
+    def _window(self, now: float) -> list[Sent]:
+        """The packets to combine, newest first."""
+        found: list[Sent] = []
+        everybody = self._everybody
+        for number in range(self.newest, max(self._oldest, self.newest - self._span) - 1, -1):
+            record = self._records.get(number)
+            if record is None or (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
+                continue
+            if found and found[0].number - number >= MAX_WINDOW:
+                break
+            found.append(record)
+            if len(found) == GROUP:
+                break
+        if not found:
+            return found
+        if not self._long(now):
+            return self._shrunk(found)
+        # A long message must not keep short ones from being repaired soon, nor these it from being repaired at all.
+        self._turn += 1
+        counts = Counter(life for record in found for life in record.lives)
+        longest = max(counts, key=lambda life: counts[life])
+        short = [record for record in found if record.lives != (longest,)]
+        if short and self._turn % TURN == 0:
+            return short
+        return self._in_turn(now)
+
+    def _shrunk(self, window: list[Sent]) -> list[Sent]:
+        """The window, or less of it where idle slots cannot make up for the losses."""
+        loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+        new, idle = self._slots
+        need = loss / (1 - loss) * new if loss < 1 else inf
+        if need <= idle:
+            return window
+        if need <= 2 * idle:
+            return window[:FEW]
+        last = set(window[0].lives)
+        return [record for record in window[:FEW] if last & set(record.lives)]
+
+    def _long(self, now: float) -> bool:
+        """Whether more is alive than one repair can name."""
+        if self.newest - self._oldest < GROUP:
+            return False
+        for count, record in enumerate(self._live(self._oldest, self.newest, now)):
+            if count == GROUP or self.newest - record.number >= MAX_WINDOW:
+                return True
+        return False
+
+    def _live(self, first: int, last: int, now: float) -> Iterator[Sent]:
+        everybody = self._everybody
+        for number in range(first, last + 1):
+            record = self._records.get(number)
+            if record is None or (everybody and record.confirmed & everybody == everybody):
+                continue
+            if record.alive(now):
+                yield record
+
+    def _in_turn(self, now: float) -> list[Sent]:
+        """The next of the windows over all that is alive, newest first.
+
+        Their places follow the golden section, which spreads any number of them evenly; those that would reach beyond
+        the ends are moved to the ends, so that the packets there are in as many windows as the others.
+        """
+        self._place = (self._place + _GOLDEN) % 1
+        span = self.newest - self._oldest + 1
+        first = self._oldest + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
+        found = list(self._live(first, min(first + MAX_WINDOW - 1, self.newest), now))
+        if not found:  # all over there: go on from there to what is not
+            for record in self._live(first, self.newest, now):
+                found = list(self._live(record.number, min(record.number + MAX_WINDOW - 1, self.newest), now))
+                break
+        return found[::-1]
+
+    def _worth(self, window: list[Sent], now: float) -> bool:
+        """Whether more is missing, or expected to be, than repairs are under way (thrifty)."""
+        flight = self._flight
+        while flight and flight[0][0] <= now:
+            flight.popleft()
+        first, last = window[-1].number, window[0].number
+        under_way = sum(1 for _, low, high in flight if low <= last and high >= first)
+        if not self._receivers:
+            return len(window) * self._expected > under_way * (1 - self._expected) + _ENOUGH
+        for peer in self._receivers.values():
+            patience = 2 * (peer.delay + peer.interval)
+            need = 0.0
+            for record in window:
+                if not record.confirmed & peer.bit:
+                    if record.number in peer.lost:
+                        need += 1
+                    else:
+                        late = now - record.at > patience + _PATIENCE_S
+                        need += max(peer.loss, 0.5) if late else peer.loss
+            if need > under_way * (1 - peer.loss) + _ENOUGH:
+                return True
+        return False
+
+    def _combination(self, window: list[Sent], now: float) -> Repair | None:
+        """The combination of a window, its mask left out where it does not fit beside the bodies."""
+        window = self._anchored(window)
+        if not window:
+            return None
+        newest, first = window[0].number, window[-1].number
+        size = newest - first + 1
+        if len(window) < size:
+            longest = max(len(record.body) for record in window)
+            if longest + (size + 7) // 8 > self._room:
+                window = [self._records[number] for number in range(newest, first - 1, -1)]
+        full = len(window) == size
+        mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
+        row = self.take_row(newest)
+        assert row is not None
+        combined = combine([(record.number, record.body) for record in window], row)
+        self._fly(now, first, newest)
+        self.counts["combined"] += 1
+        oldest = first == self._oldest
+        return Repair(newest, mask, row, oldest, combined)
+
+    def _anchored(self, window: list[Sent]) -> list[Sent]:
+        """The window, its newest packet one at which a repair can stand yet: a later one is added, or some left out."""
+        full = (1 << ROWS) - 1
+        newest = window[0].number
+        if self._rows.get(newest, 0) != full:
+            return window
+        for number in range(newest + 1, min(self.newest, window[-1].number + MAX_WINDOW - 1) + 1):
+            record = self._records.get(number)
+            if record is not None and self._rows.get(number, 0) != full:
+                return [record, *window]
+        while window and self._rows.get(window[0].number, 0) == full:
+            window = window[1:]
+        return window
+
+    def _fly(self, now: float, first: int, last: int) -> None:
+        if self.mode == "thrifty":
+            wait = max((peer.delay + peer.interval for peer in self._receivers.values()), default=inf)
+            self._flight.append((now + wait, first, last))
+
+    def _retire(self, now: float) -> None:
+        """Let go of the oldest packets that are not alive."""
+        records, everybody = self._records, self._everybody
+        oldest = self._oldest
+        while oldest <= self.newest:
+            record = records.get(oldest)
+            if record is not None:
+                done = everybody and record.confirmed & everybody == everybody
+                if not done and record.alive(now):
+                    break
+                del records[oldest]
+            oldest += 1
+        self._oldest = oldest
+
+    def _trim(self, first: int) -> None:
+        """Give up what is older than ``first``."""
+        for number in range(self._oldest, first):
+            self._records.pop(number, None)
+        self._oldest = first

@@ -1,0 +1,178 @@
+"""The trailers of version 1: a CRC-32, or the 8-byte tag of AES-CCM (RFC 3610, RFC 6655) that nobody without the key
+can make.
+
+A fleet shares keys. Each start of each robot seals with a key of its own, derived from the fleet's by HKDF (RFC 5869)
+with the robot's id and the number of the start, its *boot number*. The nonce is the packet's number, not cut to 16
+bits, and its row. So no pair of key and nonce comes twice as long as boot numbers grow, a number is sent once, and a
+row is used once per number; a packet that is sent again is the same packet, byte for byte.
+
+Laws: ``open`` gives out a body only if the trailer belongs to the packet's bytes (but for the hop count of a sealed
+packet, which relays change), its sender's boot number and its full packet number; otherwise it raises a named
+WireError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from struct import Struct
+from typing import Literal, Protocol
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESCCM
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from gr_ros2.errors import ConfigError, CrcError, TagError
+from gr_ros2.keys import KEY_LEN
+from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
+
+SealMode = Literal["none", "authenticate", "encrypt"]
+
+SOURCE_ROW = 255
+"""Stands in the nonce of a source packet, where others have their row."""
+
+_SUBKEY_LEN = 16
+_SALT = b"gr-ros2 version 1"
+_HOP = HEADER_LEN + 1
+_nonce = Struct(">IQB")
+_info = Struct(">BI")
+
+
+class Trailer(Protocol):
+    """Closes and opens the packets of one start of one robot.
+
+    ``clear`` is what stands before the body: header, and in a standing packet window, row and mask. ``number`` is the
+    packet number in full; ``row`` is the row of a standing packet, ``SOURCE_ROW`` of another. ``plain``: the body is
+    not encrypted whatever the mode (a hello's).
+    """
+
+    size: int
+
+    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        """The whole packet."""
+
+    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        """The body.
+
+        :param rest: what follows ``clear`` in the packet
+        :raises WireError: CrcError or TagError, where the trailer does not match
+        """
+
+
+class Checksum:
+    """CRC-32 over boot number, turns and packet: finds damage, and packets of another start; forged by anybody.
+
+    :param boot: boot number of the sender
+    """
+
+    size = CRC_LEN
+
+    def __init__(self, boot: int) -> None:
+        self._boot = boot
+        self._turns = 0
+        self._session = session_crc(boot, 0)
+
+    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+        data = clear + body
+        return data + crc(data, self._of(number >> 16))
+
+    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+        body = rest[:-CRC_LEN]
+        if crc(clear + body, self._of(number >> 16)) != rest[-CRC_LEN:]:
+            raise CrcError("CRC-32 does not match: damaged, or of another start of the sender")
+        return body
+
+    def _of(self, turns: int) -> int:
+        if turns != self._turns:
+            self._turns, self._session = turns, session_crc(self._boot, turns)
+        return self._session
+
+
+class Seal:
+    """AES-128-CCM with a tag of 8 bytes.
+
+    :param key: 32 bytes, the fleet's
+    :param src_id: of the sender
+    :param boot: boot number of the sender
+    :param encrypt: whether bodies are encrypted; otherwise everybody can read them, and nobody change them
+    """
+
+    size = TAG_LEN
+
+    def __init__(self, key: bytes, src_id: int, boot: int, *, encrypt: bool) -> None:
+        self.encrypt = encrypt
+        self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
+
+    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        nonce = _nonce.pack(0, number, row)
+        named = clear if len(clear) <= _HOP else without_hop(clear)
+        if self.encrypt and not plain:
+            return clear + self._cipher.encrypt(nonce, body, named)
+        return clear + body + self._cipher.encrypt(nonce, b"", named + body)
+
+    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        nonce = _nonce.pack(0, number, row)
+        named = clear if len(clear) <= _HOP else without_hop(clear)
+        try:
+            if self.encrypt and not plain:
+                return self._cipher.decrypt(nonce, rest, named)
+            body = rest[:-TAG_LEN]
+            self._cipher.decrypt(nonce, rest[-TAG_LEN:], named + body)
+        except InvalidTag:
+            raise TagError("the tag does not match: damaged, forged, or of another start of the sender") from None
+        return body
+
+
+def without_hop(clear: bytes) -> bytes:
+    """Header and what else stands before the body, without the hop count of an addressed packet."""
+    return clear[:_HOP] + clear[_HOP + 1 :] if clear[0] & 4 else clear
+
+
+def subkey(key: bytes, src_id: int, boot: int) -> bytes:
+    """The key of one start of one robot: HKDF-SHA256 with salt ``gr-ros2 version 1``, and src_id and boot as info."""
+    return HKDF(SHA256(), _SUBKEY_LEN, _SALT, _info.pack(src_id, boot)).derive(key)
+
+
+class Keys:
+    """What a fleet seals with.
+
+    :param keys: 32 bytes each; the first is used, all are accepted; none where nothing is sealed
+    :param mode: ``none`` sends and takes packets with a CRC; otherwise sealed ones only, whether encrypted or not
+    :raises ConfigError: a key of another length, or a mode that does not go with them
+    """
+
+    def __init__(self, keys: Sequence[bytes] = (), mode: SealMode = "none") -> None:
+        if any(len(key) != KEY_LEN for key in keys):
+            raise ConfigError(f"a key has {KEY_LEN} bytes; make one with gr-ros2 key new FILE")
+        if (mode == "none") != (not keys):
+            remedy = "set key to a file (gr-ros2 key new FILE)" if not keys else "leave key out, or change seal"
+            raise ConfigError(f"seal = {mode!r} with {len(keys)} keys; {remedy}")
+        self.mode = mode
+        self._keys = tuple(keys)
+
+    @property
+    def sealed(self) -> bool:
+        """Whether packets carry a tag."""
+        return bool(self._keys)
+
+    @property
+    def trailer_len(self) -> int:
+        """Bytes of a trailer."""
+        return TAG_LEN if self._keys else CRC_LEN
+
+    @property
+    def encrypts(self) -> bool:
+        """Whether bodies are encrypted."""
+        return self.mode == "encrypt"
+
+    def own(self, src_id: int, boot: int) -> Trailer:
+        """What one's own packets end with."""
+        if not self._keys:
+            return Checksum(boot)
+        return Seal(self._keys[0], src_id, boot, encrypt=self.encrypts)
+
+    def candidates(self, src_id: int, boot: int, *, encrypt: bool) -> list[Trailer]:
+        """What another robot's packets may end with."""
+        if not self._keys:
+            return [Checksum(boot)]
+        return [Seal(key, src_id, boot, encrypt=encrypt) for key in self._keys]

@@ -1,0 +1,147 @@
+"""Entries of version 1 that carry no message: hellos, requests and reports.
+
+Law: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
+"""
+
+from __future__ import annotations
+
+from struct import Struct
+from struct import error as struct_error
+from typing import NamedTuple
+
+from gr_ros2.errors import EncodeError, EntryBoundsError
+
+_HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
+
+_heard = Struct(">BI")
+_hello = Struct(">IIBI")
+_mark = Struct(">BI")
+_report = Struct(">BHHQB")
+HELLO_LEN = 2 + _hello.size
+MARK_LEN = _mark.size
+REPORT_LEN = 2 + _report.size
+HEARD_LEN = 2 + _heard.size
+
+
+class Hello(NamedTuple):
+    """Who is there.
+
+    :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
+    :param turns: how often the 16-bit packet number has come round, 0..2^32-1
+    :param capabilities: ``CAN_HEAR`` and ``ENCRYPTS``; other bits are to be ignored
+    :param digest: CRC-32 of the robot's table of topics, 0 where it has none
+    :param marks: (topic id, CRC-32 of the message as it is on the air) of messages kept for robots that join late
+    """
+
+    boot: int
+    turns: int
+    capabilities: int
+    digest: int
+    marks: tuple[tuple[int, int], ...] = ()
+
+
+CAN_HEAR = 1
+"""The robot receives too, and reports what it hears."""
+ENCRYPTS = 2
+"""Bodies of the robot's packets are encrypted; otherwise sealed packets are authenticated only."""
+
+
+class Ask(NamedTuple):
+    """A request for messages kept for robots that join late.
+
+    :param src_id: whose messages
+    :param topic_ids: of which topics, 240 for the table
+    """
+
+    src_id: int
+    topic_ids: bytes
+
+
+class Report(NamedTuple):
+    """What arrived of one robot's packets.
+
+    :param src_id: whose packets
+    :param boot: the low 16 bits of that robot's boot number
+    :param number: newest number that the map is about, mod 2^16
+    :param arrived: bit i says that packet ``number - i`` is here, 64 bits
+    :param settled: nothing older than the map is wanted
+    :param loss: share of packets lost lately, 0..127 in 1/128
+    """
+
+    src_id: int
+    boot: int
+    number: int
+    arrived: int
+    settled: bool
+    loss: int
+
+
+class Heard(NamedTuple):
+    """The sender has heard a start of another robot. To that robot it proves that the packet is no replay of an
+    earlier one.
+
+    :param src_id: of the other robot
+    :param boot: number of its start, 0..2^32-1
+    """
+
+    src_id: int
+    boot: int
+
+
+Control = Hello | Ask | Report | Heard
+
+
+def write_control(entry: Control) -> bytes:
+    """The bytes of an entry.
+
+    :raises EncodeError: a field out of range
+    """
+    try:
+        if isinstance(entry, Report):
+            source, boot, number, arrived, settled, loss = entry
+            if not 0 <= loss < 128:
+                raise EncodeError(f"loss {loss} of a report is not in 0..127")
+            name, data = _REPORT, _report.pack(source, boot, number, arrived, settled << 7 | loss)
+        elif isinstance(entry, Hello):
+            marks = b"".join(_mark.pack(*mark) for mark in entry.marks)
+            name, data = _HELLO, _hello.pack(*entry[:4]) + marks
+        elif isinstance(entry, Heard):
+            name, data = _HEARD, _heard.pack(*entry)
+        else:
+            name, data = _ASK, bytes((entry.src_id,)) + entry.topic_ids
+        return bytes((name, len(data))) + data
+    except (struct_error, ValueError) as error:
+        raise EncodeError(f"a field of {entry} is out of range ({error})") from error
+
+
+def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | None]:
+    """Where the entry after the one at ``position`` begins, and that one; None for a kind that is not known.
+
+    :raises EntryBoundsError: it runs past ``end``, or is no multiple of what it holds
+    """
+    name = body[position]
+    start = position + 2
+    if start > end or start + body[position + 1] > end:
+        raise EntryBoundsError(f"a control entry runs past byte {end}")
+    stop = start + body[position + 1]
+    size = stop - start
+    if name == _REPORT:
+        if size != _report.size:
+            raise EntryBoundsError(f"a report of {size} bytes")
+        source, boot, number, arrived, tail = _report.unpack_from(body, start)
+        return stop, Report(source, boot, number, arrived, tail > 127, tail & 127)
+    if name == _HELLO:
+        if size < _hello.size or (size - _hello.size) % _mark.size:
+            raise EntryBoundsError(f"a hello of {size} bytes")
+        marks = tuple(_mark.iter_unpack(body[start + _hello.size : stop]))
+        boot, turns, capabilities, digest = _hello.unpack_from(body, start)
+        return stop, Hello(boot, turns, capabilities, digest, marks)
+    if name == _HEARD:
+        if size != _heard.size:
+            raise EntryBoundsError(f"a note of {size} bytes that a robot was heard")
+        return stop, Heard(*_heard.unpack_from(body, start))
+    if name == _ASK:
+        if size < 2:
+            raise EntryBoundsError(f"a request of {size} bytes")
+        return stop, Ask(body[start], body[start + 1 : stop])
+    return stop, None

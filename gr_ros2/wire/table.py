@@ -1,0 +1,89 @@
+"""The table of topics that a robot announces: a message of version 1 on topic ``TABLE_TOPIC``.
+
+Laws: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(rows)) == rows``; equal tables have
+equal bytes, so that their CRC-32 says whether a receiver has the newest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
+
+_FORMAT = 1
+_QOS, _RELIABLE, _LATCHED = 3, 4, 8
+_FIXED = 4
+
+
+class Row(NamedTuple):
+    """One topic.
+
+    :param topic_id: 0..239
+    :param name: as registered, relative to the robot's namespace or absolute with leading slash
+    :param type_name: ``package/msg/Type``
+    :param qos: 0 default, 1 latency, 2 bulk
+    :param reliable: its publishers are reliable: messages are delivered in their order
+    :param latched: its publishers keep messages for late joiners (transient-local)
+    :param depth: of their history, 1..255; 0 not known
+    :param codec: how its messages are coded where they are, '' not at all; up to the codec what it says
+    """
+
+    topic_id: int
+    name: str
+    type_name: str
+    qos: int = 0
+    reliable: bool = False
+    latched: bool = False
+    depth: int = 0
+    codec: str = ""
+
+
+def write_table(rows: Iterable[Row]) -> bytes:
+    """The bytes of a table.
+
+    :raises EncodeError: a field out of range, or a text of more than 255 bytes
+    """
+    parts = [bytes((_FORMAT,))]
+    for row in rows:
+        texts = [text.encode() for text in (row.name, row.type_name, row.codec)]
+        if not 0 <= row.topic_id < 240 or not 0 <= row.qos < 3 or not 0 <= row.depth < 256:
+            raise EncodeError(f"a field of {row} is out of range")
+        if max(map(len, texts)) > 255:
+            raise EncodeError(f"{row}: name, type and codec have at most 255 bytes each")
+        flags = row.qos | row.reliable * _RELIABLE | row.latched * _LATCHED
+        parts.append(bytes((row.topic_id, flags, row.depth)))
+        parts += [bytes((len(text),)) + text for text in texts]
+    return b"".join(parts)
+
+
+def read_table(data: bytes) -> tuple[Row, ...]:
+    """The rows of a table.
+
+    :raises WireError: VersionError (a layout that is not known), EntryBoundsError (cut off) or EntryKindError
+    """
+    if data[:1] != bytes((_FORMAT,)):
+        raise VersionError(f"a table of topics of layout {data[:1].hex() or 'none'}")
+    rows: list[Row] = []
+    position = 1
+    while position < len(data):
+        if position + _FIXED > len(data):
+            raise EntryBoundsError(f"row {len(rows)} of a table runs past byte {len(data)}")
+        topic_id, flags, depth = data[position : position + 3]
+        position += 3
+        texts: list[str] = []
+        for _ in range(3):
+            start = position + 1
+            if start > len(data) or start + data[position] > len(data):
+                raise EntryBoundsError(f"a text in row {len(rows)} of a table runs past byte {len(data)}")
+            position = start + data[position]
+            try:
+                texts.append(data[start:position].decode())
+            except UnicodeDecodeError as error:
+                raise EntryKindError(f"a text in row {len(rows)} of a table is no UTF-8") from error
+        if topic_id >= 240 or flags & _QOS == _QOS or flags > 15 or any(row.topic_id == topic_id for row in rows):
+            raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in row {len(rows)} of a table")
+        name, type_name, codec = texts
+        reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
+        rows.append(Row(topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec))
+    return tuple(rows)

@@ -1,0 +1,424 @@
+"""Version 1 on the wire, byte for byte; ``docs/reference/wire-format.md`` is its page.
+
+A packet is a header, a body and a trailer. A *source* packet carries entries and has a number of its own. A *standing*
+packet stands at the number of a source packet, told apart from others there by its row: a *repair* combines the bodies
+of source packets, a *control* packet carries hellos, reports and requests.
+
+Laws: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back as the
+same values; a body says nothing of the number of its packet, so that it can be combined with others and recovered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from struct import Struct
+from struct import error as struct_error
+from typing import NamedTuple
+from zlib import crc32
+
+from gr_ros2.errors import (
+    CrcError,
+    EncodeError,
+    EntryBoundsError,
+    EntryKindError,
+    LengthError,
+    PadError,
+    VarintError,
+    VersionError,
+    WindowError,
+)
+from gr_ros2.wire.control import Control, read_control, write_control
+
+VERSION = 1
+BROADCAST = 255
+
+HEADER_LEN = 4
+ADDRESS_LEN = 2
+"""Bytes that destination and hop count add to the header of an addressed packet."""
+STANDING_LEN = 2
+"""Bytes of window and row. A source packet leaves as many free, so that its body fits a repair."""
+CRC_LEN = 4
+TAG_LEN = 8
+
+QOS_STANDING = 3
+"""Value of the two QoS bits in packets that are no source packets."""
+ROWS = 128
+"""Standing packets at one number at most."""
+MAX_WINDOW = 127
+"""Numbers that a repair spans at most."""
+
+MAX_TOPICS = 240
+TABLE_TOPIC = 240
+"""Topic id of the table of topics (``table``), which is a message like any other."""
+MAX_MESSAGE = 1 << 24
+"""Bytes of the largest message."""
+MAX_BACK = (1 << 21) - 1
+"""Packets that a message may span at most."""
+
+_SEALED, _ADDRESSED = 8, 4
+_MASKED = _CLEAR = _OLDEST = 0x80
+_CODED, _FILL = 0x20, 0x10
+_WHOLE, _FIRST, _MIDDLE, _LAST = range(4)
+
+_header = Struct(">BBH")
+_session = Struct(">II")
+
+
+class Header(NamedTuple):
+    """What stands before the body.
+
+    :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is no source packet
+    :param sealed: the trailer is an 8-byte tag, not a CRC-32
+    :param src_id: 0..254
+    :param number: of the source packet, or of the one at which a standing packet stands; mod 2^16
+    :param dst_id: 0..254 in an addressed packet, otherwise 255
+    :param hop: hop count of an addressed packet, 0..255
+    """
+
+    qos: int
+    sealed: bool
+    src_id: int
+    number: int
+    dst_id: int = BROADCAST
+    hop: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return HEADER_LEN if self.dst_id == BROADCAST else HEADER_LEN + ADDRESS_LEN
+
+
+class Part(NamedTuple):
+    """A message, or a fragment of one.
+
+    :param topic_id: 0..239, or 240 for the table of topics
+    :param payload: these bytes of the message
+    :param back: how many source packets ago the message began
+    :param offset: where in the message the payload stands, bytes
+    :param last: whether the message ends with it
+    :param coded: whether the message is coded (compressed), its first byte naming how
+    """
+
+    topic_id: int
+    payload: bytes
+    back: int = 0
+    offset: int = 0
+    last: bool = True
+    coded: bool = False
+
+
+Entry = Part | Control
+
+
+class Standing(NamedTuple):
+    """What follows the header of a packet that is no source packet.
+
+    :param row: 0..127; with the number, the packet's identity
+    :param mask: bit i says that source packet ``number - i`` is part of the combination; 0 in a control packet
+    :param oldest: nothing older than the window is worth anything any more
+    :param clear: the entries are not encrypted (a hello, without which nobody could decrypt anything)
+    :param size: bytes on the wire
+    """
+
+    row: int
+    mask: int = 0
+    oldest: bool = False
+    clear: bool = False
+    size: int = STANDING_LEN
+
+
+def session_crc(boot: int, turns: int) -> int:
+    """The CRC-32 of what a packet does not carry but belongs to; ``crc`` goes on from it.
+
+    :param boot: boot number of the sender
+    :param turns: how often its packet number has come round
+    """
+    return crc32(_session.pack(boot, turns))
+
+
+def crc(data: bytes, session: int) -> bytes:
+    """CRC-32 (IEEE 802.3, the one of zlib) over boot number, turns and packet, big-endian."""
+    return crc32(data, session).to_bytes(CRC_LEN, "big")
+
+
+def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False) -> int:
+    """Bytes of the longest body of a source packet."""
+    used = HEADER_LEN + addressed * ADDRESS_LEN + STANDING_LEN + (TAG_LEN if sealed else CRC_LEN)
+    return max(packet_len - used, 0)
+
+
+def write_header(header: Header) -> bytes:
+    """The 4 or 6 bytes of a header.
+
+    :raises EncodeError: for a field out of range
+    """
+    qos, sealed, src_id, number, dst_id, hop = header
+    addressed = dst_id != BROADCAST
+    try:
+        if not 0 <= qos <= QOS_STANDING or not 0 <= src_id < BROADCAST:
+            raise EncodeError(f"qos {qos} or src_id {src_id} of {header} is out of range")
+        first = VERSION << 4 | sealed * _SEALED | addressed * _ADDRESSED | qos
+        data = _header.pack(first, src_id, number)
+        return data + bytes((dst_id, hop)) if addressed else data
+    except (struct_error, ValueError) as error:
+        raise EncodeError(f"a field of {header} is out of range ({error})") from error
+
+
+def read_header(data: bytes, packet_len: int) -> Header:
+    """The header of a packet of at most ``packet_len`` bytes; nothing is checked beyond it.
+
+    :raises LengthError: too long, or too short for header and trailer
+    :raises VersionError: not version 1
+    """
+    size = len(data)
+    if size > packet_len or size < HEADER_LEN + CRC_LEN:
+        raise LengthError(f"{size} bytes where packet_len is {packet_len}")
+    first, src_id, number = _header.unpack_from(data)
+    if first >> 4 != VERSION:
+        raise VersionError(f"version {first >> 4}; this decoder reads version {VERSION}")
+    if first & (_SEALED | _ADDRESSED):
+        least = HEADER_LEN + (TAG_LEN if first & _SEALED else CRC_LEN) + (ADDRESS_LEN if first & _ADDRESSED else 0)
+        if size < least:
+            raise LengthError(f"{size} bytes; a packet of this kind has at least {least}")
+        if first & _ADDRESSED:
+            return Header(first & 3, first & _SEALED != 0, src_id, number, data[4], data[5])
+    return Header(first & 3, first & _SEALED != 0, src_id, number)
+
+
+def write_standing(standing: Standing) -> bytes:
+    """Window, row and mask. A mask is written where the combination leaves out packets of its window.
+
+    :raises EncodeError: for a field out of range
+    """
+    row, mask, oldest, clear, _ = standing
+    window = mask.bit_length()
+    if not 0 <= row < ROWS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)) or oldest > mask:
+        raise EncodeError(f"{standing}: a row is 0..127, a mask has up to 127 bits and the lowest set")
+    second = row | oldest * _OLDEST
+    if not mask:
+        return bytes((clear * _CLEAR, second))
+    if mask + 1 == 1 << window:
+        return bytes((window, second))
+    return bytes((window | _MASKED, second)) + mask.to_bytes((window + 7) // 8, "little")
+
+
+def read_standing(data: bytes, start: int, end: int) -> Standing:
+    """Window, row and mask from byte ``start`` of a packet whose trailer begins at ``end``.
+
+    :raises EntryBoundsError: they run into the trailer
+    :raises WindowError: bits that do not go together
+    """
+    if start + STANDING_LEN > end:
+        raise EntryBoundsError(f"window and row run past byte {end}")
+    window, row = data[start] & 127, data[start + 1] & 127
+    flag, oldest = data[start] & _MASKED, data[start + 1] & _OLDEST != 0
+    if not window:
+        if oldest:
+            raise WindowError("a control packet that says which packets are too old")
+        return Standing(row, 0, False, flag != 0)
+    if not flag:
+        return Standing(row, (1 << window) - 1, oldest)
+    size = STANDING_LEN + (window + 7) // 8
+    if start + size > end:
+        raise EntryBoundsError(f"the mask of {window} numbers runs past byte {end}")
+    mask = int.from_bytes(data[start + STANDING_LEN : start + size], "little")
+    if not mask & 1 or mask.bit_length() != window or mask + 1 == 1 << window:
+        raise WindowError(f"mask {mask:#x} does not begin and end a window of {window}, or leaves nothing out")
+    return Standing(row, mask, oldest, False, size)
+
+
+def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
+    """How much of a message goes into what is free of a body.
+
+    :param room: bytes free
+    :param remaining: bytes of the message not yet sent
+    :param back: source packets since it began; without meaning at offset 0
+    :param offset: bytes of it sent
+    :return: bytes of payload (-1 where nothing goes in) and bytes of the entry. A fragment that is not the last one
+        fills the body.
+    """
+    head = 2 + (_varint_len(back) + _varint_len(offset) if offset else 0)
+    if remaining < room - head:
+        return remaining, head + 1 + remaining
+    most = min(room - head, remaining)
+    if most < 0 or (not most and remaining):
+        return -1, 0
+    return most, head + most
+
+
+def write_body(entries: Sequence[Entry], room: int) -> bytes:
+    """The bytes of some entries, no padding.
+
+    :param room: the longest body; the last entry ends there without saying its length where it can
+    :raises EncodeError: a field out of range, or more bytes than ``room``
+    """
+    parts: list[bytes] = []
+    free = room
+    for entry in entries:
+        data = _write_part(entry, free) if isinstance(entry, Part) else write_control(entry)
+        free -= len(data)
+        parts.append(data)
+    if free < 0:
+        raise EncodeError(f"{room - free} bytes of entries do not fit a body of {room}")
+    return b"".join(parts)
+
+
+def read_body(body: bytes, room: int) -> list[Entry]:
+    """The entries of a body. Zeros may follow them; entries of kinds that are not known are left out.
+
+    :param room: the longest body on this link
+    :raises WireError: EntryBoundsError, EntryKindError, VarintError or PadError
+    """
+    entries: list[Entry] = []
+    position, end = 0, min(len(body), room)
+    while position < end:
+        name = body[position]
+        if not name:
+            break
+        if name > TABLE_TOPIC + 1:
+            position, control = read_control(body, position, end)
+            if control is not None:
+                entries.append(control)
+            continue
+        if position + 2 > end:
+            raise EntryBoundsError(f"the header of an entry runs past byte {end}")
+        flags = body[position + 1]
+        position += 2
+        if flags & _FILL:
+            if flags & 15 or len(body) < room:
+                raise EntryKindError(f"an entry that fills its body, with flags {flags:#x} in a body of {len(body)}")
+            length = -1
+        else:
+            if position >= end:
+                raise EntryBoundsError(f"the header of an entry runs past byte {end}")
+            length = (flags & 15) << 8 | body[position]
+            position += 1
+        kind = flags >> 6
+        back = offset = 0
+        if kind >= _MIDDLE:
+            back, position = _read_varint(body, position, end)
+            offset, position = _read_varint(body, position, end)
+            if not offset:
+                raise EntryKindError("a later fragment at the begin of its message")
+        stop = end if length < 0 else position + length
+        if stop > end or position > stop:
+            raise EntryBoundsError(f"an entry of {length} bytes runs past byte {end}")
+        if kind and stop == position:
+            raise EntryKindError("a fragment of no bytes")
+        if back > MAX_BACK or offset + stop - position > MAX_MESSAGE:
+            raise VarintError(f"a fragment {back} packets and {offset} bytes after the begin of its message")
+        coded = flags & _CODED != 0
+        entries.append(Part(name - 1, body[position:stop], back, offset, not kind or kind == _LAST, coded))
+        position = stop
+    if body.count(0, position) != len(body) - position:
+        raise PadError(f"bytes from {position} on are not all zero")
+    return entries
+
+
+def _write_part(part: Part, room: int) -> bytes:
+    topic_id, payload, back, offset, last, coded = part
+    size = len(payload)
+    kind = (_LAST if last else _MIDDLE) if offset else (_WHOLE if last else _FIRST)
+    if not 0 <= topic_id <= TABLE_TOPIC:
+        raise EncodeError(f"topic id {topic_id} is not in 0..{TABLE_TOPIC}")
+    if not 0 <= offset <= MAX_MESSAGE - size or not 0 <= back <= MAX_BACK or (back and not offset):
+        raise EncodeError(f"a fragment {back} packets and {offset} bytes after the begin of its message, {size} long")
+    if kind and not size:
+        raise EncodeError("a fragment has at least one byte")
+    place = _varint(back) + _varint(offset) if offset else b""
+    flags = kind << 6 | coded * _CODED
+    if 2 + len(place) + size == room:
+        return bytes((topic_id + 1, flags | _FILL)) + place + payload
+    if size > 0xFFF:
+        raise EncodeError(f"an entry of {size} bytes")
+    return bytes((topic_id + 1, flags | size >> 8, size & 255)) + place + payload
+
+
+def _varint(value: int) -> bytes:
+    """Seven bits a byte, the lowest first; the top bit says that more follow."""
+    if value < 128:
+        return bytes((value,))
+    parts = bytearray()
+    while value > 127:
+        parts.append(value & 127 | 128)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)
+
+
+def _varint_len(value: int) -> int:
+    return 1 if value < 128 else (value.bit_length() + 6) // 7
+
+
+def _read_varint(body: bytes, position: int, end: int) -> tuple[int, int]:
+    value = shift = 0
+    while position < end:
+        byte = body[position]
+        position += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            if not byte and shift:
+                raise VarintError("a number with more bytes than it needs")
+            return value, position
+        shift += 7
+        if shift > 21:
+            raise VarintError("a number of more than 4 bytes")
+    raise EntryBoundsError(f"a number runs past byte {end}")
+
+
+class Packet(NamedTuple):
+    """A packet that is not sealed, as a value: for tools, tests and other implementations.
+
+    :param entries: of a source or control packet
+    :param standing: of a repair or control packet
+    :param combined: of a repair, as long as the longest body that it combines
+    """
+
+    header: Header
+    entries: tuple[Entry, ...] = ()
+    standing: Standing | None = None
+    combined: bytes = b""
+
+
+def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed: bool = True) -> bytes:
+    """The bytes of a packet that is not sealed.
+
+    :param packet_len: bytes of the longest packet on this link
+    :param fixed: whether every packet has as many; otherwise only as many as needed
+    :raises EncodeError: a field out of range, or more than fits
+    """
+    header, entries, standing, combined = packet
+    if header.sealed or (standing is None) == (header.qos == QOS_STANDING):
+        raise EncodeError(f"{header}: a sealed packet, or a standing one without its window and row")
+    room = body_room(packet_len, addressed=header.dst_id != BROADCAST)
+    data = write_header(header)
+    if standing is not None:
+        data += write_standing(standing)
+    data += combined if standing is not None and standing.mask else write_body(entries, room)
+    full = packet_len - CRC_LEN
+    if len(data) > full:
+        raise EncodeError(f"{len(data) + CRC_LEN} bytes do not fit packet_len {packet_len}")
+    data = data.ljust(full, b"\0") if fixed else data
+    return data + crc(data, session_crc(boot, turns))
+
+
+def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> Packet:
+    """Read a packet that is not sealed.
+
+    :param packet_len: bytes of the longest packet on this link
+    :param boot: boot number of the sender, from its hello
+    :raises WireError: LengthError, VersionError, CrcError, WindowError, EntryBoundsError, EntryKindError, VarintError
+        or PadError, in this order of checks
+    """
+    header = read_header(data, packet_len)
+    if header.sealed or crc(data[:-CRC_LEN], session_crc(boot, turns)) != data[-CRC_LEN:]:
+        raise CrcError("CRC-32 does not match, or the packet is sealed")
+    room = body_room(packet_len, addressed=header.dst_id != BROADCAST)
+    start, end = header.size, len(data) - CRC_LEN
+    if header.qos != QOS_STANDING:
+        return Packet(header, tuple(read_body(data[start:end], room)))
+    standing = read_standing(data, start, end)
+    start += standing.size
+    if standing.mask:
+        return Packet(header, (), standing, data[start:end])
+    return Packet(header, tuple(read_body(data[start:end], room)), standing)

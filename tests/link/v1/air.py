@@ -1,0 +1,98 @@
+"""A slotted channel between endpoints of version 1, for tests: who sends what is heard by all others, or lost."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+from gr_ros2.config import TopicOptions
+from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.events import Delivered, Event
+from gr_ros2.link.v1.sealing import Keys, SealMode
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.registry import Registry, Topic
+
+KEY = bytes(range(32))
+SLOT_S = 1 / 75
+
+
+def registry(**options: TopicOptions) -> Registry:
+    """Topics by name with their options; odom, scan and map where none are named."""
+    named = options or {"odom": TopicOptions(), "scan": TopicOptions(queue="latest"), "map": TopicOptions(qos="bulk")}
+    return Registry([Topic(n, name, "std_msgs/msg/String", option) for n, (name, option) in enumerate(named.items())])
+
+
+def keys(mode: SealMode) -> Keys:
+    return Keys((KEY,) if mode != "none" else (), mode)
+
+
+class Robot:
+    """An endpoint, what it told, and what it must not forget."""
+
+    def __init__(
+        self, src_id: int, topics: Registry | None = None, *, mode: SealMode = "none", **settings: Any
+    ) -> None:
+        self.src_id, self.topics = src_id, topics
+        self.keys = keys(mode)
+        self.settings = Settings(src_id, **{"packet_len": 64, **settings})
+        self.stored: dict[int, tuple[int, int]] = {}
+        self.boot = 1000 * src_id
+        self.events: list[Event] = []
+        self.start()
+
+    def start(self, boot: int | None = None) -> None:
+        """Start anew: everything but the stored state is forgotten."""
+        self.boot = self.boot + 1 if boot is None else boot
+        self.end = Endpoint(
+            self.topics,
+            self.settings,
+            boot=self.boot,
+            keys=self.keys,
+            heard=dict(self.stored),
+            save=lambda src_id, boot, floor: self.stored.__setitem__(src_id, (boot, floor)),
+            observer=self.events.append,
+        )
+        self.end.use_credit()
+
+    def slot(self, now: float) -> bytes | None:
+        """What it sends in a slot."""
+        if self.end.out_of_credit:
+            self.end.credit()
+        return self.end.next_packet(now)
+
+    def delivered(self, src_id: int | None = None) -> list[bytes]:
+        """Payloads delivered so far, by one robot or by all."""
+        found = [event for event in self.events if isinstance(event, Delivered)]
+        return [event.payload for event in found if src_id in (None, event.src_id)]
+
+
+class Air:
+    """Slots of a full-duplex channel; ``lost(sender, receiver)`` decides packet by packet."""
+
+    def __init__(self, *robots: Robot, loss: float = 0.0, seed: int = 1) -> None:
+        self.robots = list(robots)
+        self.now = 0.0
+        self.rng = random.Random(seed)
+        self.lost: Callable[[Robot, Robot], bool] = lambda _, __: self.rng.random() < loss
+        self.recorded: list[tuple[Robot, bytes]] = []
+
+    def step(self) -> None:
+        """One slot."""
+        for robot in self.robots:
+            data = robot.slot(self.now)
+            if data is not None:
+                self.recorded.append((robot, data))
+                for other in self.robots:
+                    if other is not robot and not self.lost(robot, other):
+                        other.end.receive(data, self.now + SLOT_S)
+        self.now += SLOT_S
+        for robot in self.robots:
+            robot.end.handle_timeout(self.now)
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
+        """So long, or until something is so; the time it took."""
+        begin = self.now
+        while self.now - begin < seconds and not until():
+            self.step()
+        return self.now - begin

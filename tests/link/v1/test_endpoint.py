@@ -1,0 +1,289 @@
+"""An endpoint of version 1: what it delivers, to whom, in which order, and what it does without being asked."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.config import TopicOptions
+from gr_ros2.errors import ConfigError
+from gr_ros2.link.v1.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.link.v1.settings import Settings
+from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, read_header
+from tests.link.v1.air import SLOT_S, Air, Robot, registry
+
+MODES: list[SealMode] = ["none", "authenticate", "encrypt"]
+ODOM, SCAN, MAP = 0, 1, 2
+LATCHED = TopicOptions(durability="transient_local", qos="bulk")
+
+
+def text(number: int, size: int = 40) -> bytes:
+    return f"message {number} ".encode().ljust(size, b".")
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("fixed", [True, False])
+def test_messages_cross_both_ways_with_nothing_known_beforehand(mode: SealMode, fixed: bool) -> None:
+    one, two = (Robot(n, registry(), mode=mode, fixed=fixed) for n in (1, 2))
+    air = Air(one, two, loss=0.2)
+    for number in range(60):
+        one.end.submit(ODOM, text(number), air.now)
+        two.end.submit(MAP, text(number, 300), air.now) if number % 10 == 0 else None
+        air.run(0.03)
+    air.run(2.0)
+    assert two.delivered() == [text(number) for number in range(60)]
+    assert one.delivered() == [text(number, 300) for number in range(0, 60, 10)]
+    rows = next(event.rows for event in two.events if isinstance(event, Announced))
+    assert [(row.name, row.type_name, row.reliable) for row in rows] == [
+        ("odom", "std_msgs/msg/String", True),
+        ("scan", "std_msgs/msg/String", False),
+        ("map", "std_msgs/msg/String", True),
+    ]
+    assert all(len(data) <= 64 and (len(data) == 64 or not fixed) for _, data in air.recorded)
+    assert not one.end.rejected
+    assert all((text(7) in data) is False for _, data in air.recorded if mode == "encrypt")
+
+
+def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+    air.run(1.5)
+    before = one.end.air["new"]
+    for number in range(100):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(0.05)
+    assert len(two.delivered()) == 100
+    assert one.end.air["new"] - before == 100
+    assert one.end.air["repair"] == 0
+
+
+def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None:
+    one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
+    air = Air(one, two)
+    air.run(0.5)
+    lose = [True]
+    air.lost = lambda *_: lose[0]
+    one.end.submit(SCAN, text(1), air.now)
+    air.run(2 * SLOT_S)
+    one.end.submit(SCAN, text(2), air.now)
+    air.run(2 * SLOT_S)
+    lose[0] = False
+    air.run(0.5)
+    assert two.delivered() == [text(2)]
+
+
+def test_a_message_waits_for_an_earlier_one_and_not_for_ever() -> None:
+    one, two = Robot(1, registry(), hears=False, repair="off"), Robot(2, hears=False, hold_s=0.3)
+    air = Air(one, two)
+    air.run(0.5)
+    lose = [True]
+    air.lost = lambda *_: lose[0]
+    one.end.submit(ODOM, text(1), air.now)
+    air.run(2 * SLOT_S)
+    lose[0] = False
+    one.end.submit(ODOM, text(2), air.now)
+    air.run(0.2)
+    assert two.delivered() == []
+    assert two.end.next_timeout() is not None
+    waited = air.run(1.0, lambda: bool(two.delivered()))
+    assert two.delivered() == [text(2)]
+    assert waited < 0.15
+
+
+def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> None:
+    topics = registry(odom=TopicOptions(), map=LATCHED)
+    one, two, late = Robot(1, topics), Robot(2), Robot(3)
+    air = Air(one, two)
+    one.end.submit(1, text(1, 700), air.now)
+    air.run(20.0)
+    assert two.delivered() == [text(1, 700)]
+    sent = one.end.air["new"]
+    air.run(60.0)
+    assert one.end.air["new"] == sent  # nothing is repeated: both have it
+    air.robots.append(late)
+    air.run(5.0, lambda: any(isinstance(event, Met) for event in late.events))
+    waited = air.run(5.0, lambda: bool(late.delivered()))
+    packets = -(-700 // 46)
+    assert late.delivered() == [text(1, 700)]
+    assert waited <= (packets + 2 * 4 + 4) * SLOT_S  # the map, two round trips of two slots each way, and the table
+    assert two.delivered() == [text(1, 700)]
+
+
+def test_where_nobody_can_ask_what_is_kept_is_repeated() -> None:
+    topics = registry(odom=TopicOptions(), map=LATCHED)
+    one, late = Robot(1, topics, hears=False, repeat_s=3.0), Robot(3, hears=False)
+    air = Air(one)
+    one.end.submit(1, text(1, 300), air.now)
+    air.run(5.0)
+    air.robots.append(late)
+    air.run(9.0)
+    assert late.delivered() == [text(1, 300)]
+    assert late.end.neighbours.get(1).inbox.repeats >= 1  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("who", ["sender", "receiver", "both"])
+def test_restarts_are_recovered_from_within_two_seconds(mode: SealMode, who: str) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
+    air = Air(one, two, loss=0.2)
+    number = 0
+    for restart in range(20):
+        if who != "receiver":
+            one.start()
+        if who != "sender":
+            two.start()
+        first = number
+        begin = air.now
+        while air.now - begin < 2.0:
+            one.end.submit(ODOM, text(number), air.now)
+            number += 1
+            air.run(0.03)
+        here = [int(payload.split()[1]) for payload in two.delivered()]
+        assert here == sorted(set(here)), f"restart {restart}"
+        assert here
+        assert here[-1] >= first + (number - first) // 2, f"restart {restart}: {here[-1]} of {first}..{number}"
+
+
+def test_a_sender_starts_before_its_receiver_and_the_other_way_round() -> None:
+    for first in (0, 1):
+        robots = [Robot(1, registry()), Robot(2)]
+        air = Air(robots[first])
+        robots[0].end.submit(ODOM, text(0), 0.0)
+        air.run(3.0)
+        air.robots.append(robots[1 - first])
+        air.run(0.2)
+        robots[0].end.submit(ODOM, text(1), air.now)
+        air.run(1.0)
+        assert text(1) in robots[1].delivered()
+
+
+def test_reports_lost_for_a_minute_cost_no_message() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two, loss=0.1)
+    air.run(1.0)
+    usual = air.lost
+    air.lost = lambda sender, receiver: sender is two or usual(sender, receiver)
+    for number in range(600):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(0.1)
+    air.lost = usual
+    air.run(3.0)
+    assert len(two.delivered()) >= 599
+    assert any(isinstance(event, Gone) for event in one.events)
+
+
+def test_packet_numbers_come_round() -> None:
+    one, two = Robot(1, registry(), mode="encrypt"), Robot(2, mode="encrypt")
+    air = Air(one, two)
+    air.run(0.2)
+    count = 66_500
+    for number in range(count):
+        one.end.submit(ODOM, text(number), air.now)
+        if number % 500 < 495 or number < 64_000:
+            data = one.slot(air.now)
+            assert data is not None
+            if number % 7:
+                two.end.receive(data, air.now)
+            air.now += 0.001
+        else:
+            air.step()
+        if number % 20 == 0:
+            air.step()
+            while (data := one.slot(air.now)) is not None and one.end.outbox.queued()[ODOM]:
+                two.end.receive(data, air.now)
+    air.run(2.0)
+    here = [int(payload.split()[1]) for payload in two.delivered()]
+    assert here == sorted(set(here))
+    assert here[-1] == count - 1
+    assert len(here) > 0.8 * count
+    assert one.end.window.newest > 65_536
+
+
+def test_a_packet_for_another_robot_is_not_ours() -> None:
+    one, two, three = Robot(1, registry(), dst_id=3), Robot(2), Robot(3)
+    air = Air(one, two, three)
+    one.end.submit(ODOM, text(1, 35), air.now)
+    air.run(2.0)
+    assert three.delivered() == [text(1, 35)]
+    assert two.delivered() == []
+    assert two.end.dropped["not_for_us"] > 0
+
+
+def test_a_long_message_is_given_up_when_its_memory_is_needed() -> None:
+    one, two = Robot(1, registry(), hears=False), Robot(2, hears=False, max_source_bytes=20_000)
+    air = Air(one, two)
+    one.end.submit(MAP, bytes(100_000), air.now)
+    air.run(40.0)
+    lost = [event for event in two.events if isinstance(event, Lost)]
+    assert lost
+    assert {event.reason for event in lost} <= {"memory", "expired", "given_up"}
+    assert two.end.neighbours.get(1).inbox.held <= 20_000  # type: ignore[union-attr]
+
+
+def test_an_announced_length_reserves_nothing() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+    air.run(1.0)
+    inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
+    inbox._take(inbox.newest, [Part(MAP, b"x", 0, MAX_MESSAGE - 1, True)], 0, repaired=False)
+    assert 0 < inbox.held < 200
+
+
+def test_a_message_beyond_the_largest_is_refused() -> None:
+    one = Robot(1, registry())
+    one.end.submit(MAP, bytes(MAX_MESSAGE + 1), 0.0)
+    assert [event.reason for event in one.events if isinstance(event, Refused)] == ["too_large"]
+
+
+def test_a_lifespan_ends_repair_and_message() -> None:
+    topics = registry(odom=TopicOptions(queue="deadline", deadline_ms=200))
+    one, two = Robot(1, topics, hears=False), Robot(2, hears=False)
+    air = Air(one, two)
+    air.run(2.5)
+    air.lost = lambda *_: True
+    one.end.submit(0, text(1), air.now)
+    air.run(0.25)
+    before = one.end.air["repair"]
+    assert before > 0
+    air.lost = lambda *_: False
+    air.run(1.0)
+    assert one.end.air["repair"] == before
+    assert two.delivered() == []
+
+
+def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
+    one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
+    air = Air(one, two)
+    air.run(0.5)
+    air.lost = lambda *_: True
+    one.end.submit(ODOM, text(1), air.now)
+    air.run(10.0)
+    air.lost = lambda *_: False
+    air.run(1.5)
+    assert two.delivered() == [text(1)]
+    packets = [data for robot, data in air.recorded if robot is one]
+    assert len({data[:6] if read_header(data, 64).qos == 3 else data[:4] for data in packets}) == len(packets)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_the_air_was_spent_on_adds_up(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
+    air = Air(one, two, loss=0.3)
+    for number in range(100):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(0.05)
+    sent = [event for event in one.events if isinstance(event, SentPacket)]
+    assert len(sent) == sum(one.end.air.values()) == sum(robot is one for robot, _ in air.recorded)
+    assert {event.kind for event in sent} == {"new", "repair", "hello"}
+    keys_sent = {part.key for event in sent for part in event.parts if part.topic_id == ODOM}
+    keys_here = [event.key for event in two.events if isinstance(event, Delivered)]
+    assert len(keys_here) == len(set(keys_here))
+    assert set(keys_here) <= keys_sent
+    assert any(event.repaired for event in two.events if isinstance(event, Delivered))
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for wrong in ({"packet_len": 30}, {"packet_len": 5000}, {"src_id": 255}):
+        with pytest.raises(ConfigError):
+            Settings(**{"src_id": 1, **wrong})
+    assert body_room(Settings(1, packet_len=40).packet_len, sealed=True) >= 20

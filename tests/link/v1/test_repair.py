@@ -1,0 +1,253 @@
+"""Repair: what is combined, what is recovered from it, and what happens when something in it is wrong."""
+
+from __future__ import annotations
+
+import random
+from math import inf
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
+from gr_ros2.link.v1.gf256 import combine
+from gr_ros2.link.v1.repair import GROUP, Life, Repair, RepairMode, RepairWindow
+from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
+
+ROOM = 24
+
+
+def body(number: int) -> bytes:
+    return random.Random(number).randbytes(1 + number % ROOM)
+
+
+def decoder(span: int = 4096) -> RepairDecoder:
+    return RepairDecoder(ROOM, lambda _: True, span)
+
+
+def window(mode: RepairMode = "idle", count: int = 0, **settings: float) -> RepairWindow:
+    made = RepairWindow(mode, ROOM, **settings)
+    for number in range(1, count + 1):
+        made.sent(number, body(number), b"packet %d" % number, (Life(),), number / 100)
+    return made
+
+
+def known(found: list[tuple[int, bytes]]) -> set[int]:
+    for number, recovered in found:
+        assert recovered.rstrip(b"\0") == body(number).rstrip(b"\0")
+    return {number for number, _ in found}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(1, 70_000), st.integers(20, 300), st.sampled_from((0.05, 0.2, 0.4)), st.integers(1, 127), st.randoms()
+)
+def test_whatever_is_recovered_is_what_was_sent(
+    first: int, count: int, loss: float, size: int, rng: random.Random
+) -> None:
+    receiver = decoder()
+    receiver.begin(first)
+    here: set[int] = set()
+    row = 0
+    for number in range(first, first + count):
+        if rng.random() >= loss:
+            here |= known(receiver.source(number, body(number)))
+        if rng.random() < 0.6:
+            row += 1
+            mask = rng.getrandbits(min(size, number - first + 1)) | 1
+            members = window_numbers(number, mask)
+            if rng.random() >= loss:
+                combined = combine(((member, body(member)) for member in members), row % ROWS)
+                here |= known(receiver.repair(number, mask, row % ROWS, combined))
+    assert all((number in receiver) == (number in here) for number in range(first, first + count))
+
+
+@pytest.mark.parametrize("first", [0, 65_536 - 64, 131_072 - 100])
+def test_a_full_window_is_recovered_from_as_many_repairs(first: int) -> None:
+    receiver = decoder()
+    receiver.begin(first)
+    numbers = range(first, first + MAX_WINDOW)
+    mask = (1 << MAX_WINDOW) - 1
+    found: set[int] = set()
+    for row in range(MAX_WINDOW):
+        assert not found
+        combined = combine(((number, body(number)) for number in numbers), row)
+        found |= known(receiver.repair(numbers[-1], mask, row, combined))
+    assert found == set(numbers)
+    assert receiver.equations == 0
+
+
+def test_one_wrong_repair_does_not_spread() -> None:
+    receiver = RepairDecoder(ROOM, lambda found: found.rstrip(b"\0") in (body(1), body(2), body(3)), 4096)
+    right = [combine([(1, body(1)), (2, body(2)), (3, body(3))], row) for row in range(5)]
+    receiver.repair(3, 7, 0, bytes(byte ^ 1 for byte in right[0]))
+    receiver.repair(3, 7, 1, right[1])
+    assert receiver.repair(3, 7, 2, right[2]) == []
+    assert receiver.counts["implausible"] == 1
+    assert receiver.equations == 0
+    receiver.repair(3, 7, 3, right[3])
+    receiver.repair(3, 7, 4, right[4])
+    assert known(receiver.source(2, body(2))) == {1, 2, 3}
+
+
+def test_equations_that_contradict_each_other_are_dropped() -> None:
+    receiver = decoder()
+    combined = combine([(1, body(1)), (2, body(2))], 5)
+    receiver.repair(2, 3, 5, combined)
+    assert receiver.equations == 1
+    assert receiver.repair(2, 3, 5, bytes(byte ^ 9 for byte in combined)) == []
+    assert (receiver.equations, receiver.counts["implausible"]) == (0, 1)
+
+
+def test_memory_is_bounded() -> None:
+    receiver = decoder(span=100)
+    for number in range(0, 5000, 2):
+        receiver.source(number, body(number))
+        receiver.repair(number, 0b1011, number % ROWS, b"x" * ROOM)
+    assert receiver.floor == 4998 - 99
+    assert sum(number in receiver for number in range(5000)) <= 100
+    assert receiver.equations <= 100
+    assert receiver.source(3, body(3)) == []
+    receiver.source(10**9, body(10**9))
+    assert sum(number in receiver for number in range(5000)) == 0
+
+
+def test_the_newest_live_packets_are_combined() -> None:
+    repair = window(count=10).next(0.2)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.mask, repair.oldest) == (10, (1 << 10) - 1, True)
+    assert repair.combined == combine(((number, body(number)) for number in range(1, 11)), repair.row)
+
+
+def test_one_live_packet_is_repeated_in_effect() -> None:
+    sender = window()
+    old, new = Life(), Life(expires=5.0)
+    sender.sent(1, b"old", b"", (old,), 0.0)
+    sender.sent(2, b"new", b"", (new,), 0.0)
+    old.over = True
+    repair = sender.next(1.0)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.mask) == (2, 1)
+    assert known_text(decoder(), repair) == b"new"
+    assert sender.next(5.0) is None  # too late for it
+
+
+def known_text(receiver: RepairDecoder, repair: Repair) -> bytes:
+    ((_, found),) = receiver.repair(repair.number, repair.mask, repair.row, repair.combined)
+    return found.rstrip(b"\0")
+
+
+def test_what_is_over_is_left_out_where_its_mask_fits() -> None:
+    sender = window()
+    lives = [Life() for _ in range(5)]
+    for number, life in enumerate(lives, 1):
+        sender.sent(number, b"short" if number < 5 else b"x" * number, b"", (life,), 0.0)
+    lives[2].over = True
+    repair = sender.next(0.0)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.mask) == (5, 0b11011)
+    sender.sent(6, b"x" * ROOM, b"", (Life(),), 0.0)  # no byte is left for a mask: the window goes without holes
+    repair = sender.next(0.0)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.mask) == (6, 0b111111)
+
+
+def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
+    sender = window()
+    long = Life()
+    for number in range(1, 301):
+        sender.sent(number, body(number), b"", (long,), 0.0)
+    seen = set()
+    for _ in range(9):
+        repair = sender.next(9.0)
+        assert isinstance(repair, Repair)
+        numbers = window_numbers(repair.number, repair.mask)
+        assert len(numbers) <= MAX_WINDOW
+        assert repair.oldest == (numbers[-1] == 1)
+        seen |= set(numbers)
+    assert seen == set(range(1, 301))
+
+
+def test_short_messages_are_repaired_beside_a_long_one() -> None:
+    sender = window()
+    long, short = Life(), Life()
+    for number in range(1, 301):
+        sender.sent(number, body(number), b"", (long,), 0.0)
+    sender.sent(301, b"short", b"", (short,), 0.0)
+    repairs = [sender.next(0.0) for _ in range(30)]
+    alone = [repair for repair in repairs if isinstance(repair, Repair) and (repair.number, repair.mask) == (301, 1)]
+    assert len(alone) == 10
+
+
+def test_a_row_is_used_once_per_number() -> None:
+    sender = window(count=1)
+    rows = [sender.take_row(1) for _ in range(ROWS)]
+    assert sorted(row for row in rows if row is not None) == list(range(ROWS))
+    assert sender.take_row(1) is None
+    assert sender.next(0.0) is None  # no repair can stand there any more
+    assert sender.take_row(2) is not None
+
+
+def test_a_packet_that_one_receiver_lacks_goes_again_as_it_was() -> None:
+    sender = window(count=5)
+    sender.report(9, 5, 0b10110, settled=True, loss=0.2, now=0.1)
+    assert [sender.next(0.1), sender.next(0.1)] == [b"packet 5", b"packet 2"]
+    assert isinstance(sender.next(0.1), Repair)  # both may have been lost again
+    sender.report(9, 5, 0b11111, settled=True, loss=0.2, now=0.2)
+    assert sender.next(0.3) is None
+
+
+def test_two_receivers_are_served_by_combinations() -> None:
+    sender = window(count=4)
+    sender.meet(8, 0.0)
+    sender.meet(9, 0.0)
+    sender.report(8, 4, 0b1110, settled=True, loss=0.1, now=0.1)
+    sender.report(9, 4, 0b1011, settled=True, loss=0.1, now=0.1)
+    repair = sender.next(0.2)
+    assert isinstance(repair, Repair)
+    assert {4, 2} <= set(window_numbers(repair.number, repair.mask))
+    sender.report(8, 4, 0b1111, settled=True, loss=0.1, now=0.3)
+    assert sender.next(0.3) is not None
+    sender.forget(9)
+    assert sender.next(0.4) is None
+
+
+def test_a_report_of_what_was_never_sent_confirms_nothing() -> None:
+    sender = window(count=3)
+    sender.report(9, 4, (1 << 64) - 1, settled=True, loss=0.0, now=0.1)
+    assert sender.unconfirmed(0.1)
+    assert not sender.receivers()
+
+
+def test_a_thrifty_sender_is_silent_without_losses_and_without_doubt() -> None:
+    sender = window("thrifty", 5)
+    assert sender.next(0.06) is None
+    sender.report(9, 4, 0b1111, settled=True, loss=0.0, now=0.06)
+    assert sender.next(0.07) is None
+    assert sender.next(9.0) is not None  # no report for long: the last packet may be lost
+    assert sender.next(9.0) is None
+
+
+def test_repair_that_cannot_keep_up_shrinks_its_window() -> None:
+    sender = window(count=40, expected_loss=0.4)
+    repair = sender.next(0.5)
+    assert isinstance(repair, Repair)
+    assert repair.mask.bit_count() == 1  # no idle slot so far: the newest message
+    for _ in range(20):
+        sender.next(0.5)
+    repair = sender.next(0.5)
+    assert isinstance(repair, Repair)
+    assert 8 <= repair.mask.bit_count() <= GROUP
+
+
+def test_off_is_off() -> None:
+    assert window("off", 5).next(1.0) is None
+
+
+def test_nothing_lives_longer_than_the_span() -> None:
+    sender = RepairWindow("idle", ROOM, span=100)
+    for number in range(1, 400):
+        sender.sent(number, b"x", b"", (Life(inf),), 0.0)
+    repair = sender.next(0.0)
+    assert isinstance(repair, Repair)
+    assert window_numbers(repair.number, repair.mask)[-1] >= 300

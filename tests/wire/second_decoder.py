@@ -1,0 +1,322 @@
+"""A second decoder of version 1, made from docs/reference/wire-format.md alone; it shares no code with gr_ros2.
+
+It opens packets of one sender, collects source bodies, solves repairs by Gauss-Jordan elimination over everything it
+has, and joins messages. It exists to find out whether the page says enough.
+"""
+
+from __future__ import annotations
+
+import hmac
+from hashlib import sha256
+
+
+class Refused(Exception):
+    """What the page says is to be refused; its text is the name."""
+
+
+def crc32(data: bytes) -> int:
+    """IEEE 802.3, bit by bit."""
+    value = 0xFFFFFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (0xEDB88320 if value & 1 else 0)
+    return value ^ 0xFFFFFFFF
+
+
+def times(a: int, b: int) -> int:
+    """In GF(256) with 0x11D."""
+    total = 0
+    for bit in range(8):
+        if b >> bit & 1:
+            total ^= a << bit
+    for bit in range(14, 7, -1):
+        if total >> bit & 1:
+            total ^= 0x11D << bit - 8
+    return total
+
+
+INVERSE = [0] + [next(b for b in range(1, 256) if times(a, b) == 1) for a in range(1, 256)]
+
+
+def coefficient(row: int, number: int) -> int:
+    return INVERSE[(128 + row % 128) ^ (number % 128)]
+
+
+def subkey(key: bytes, src_id: int, boot: int) -> bytes:
+    """HKDF-SHA256, one block of it."""
+    extracted = hmac.new(b"gr-ros2 version 1", key, sha256).digest()
+    info = bytes([src_id]) + boot.to_bytes(4, "big")
+    return hmac.new(extracted, info + b"\x01", sha256).digest()[:16]
+
+
+def unseal(key: bytes, nonce: bytes, associated: bytes, encrypted: bytes, tag: bytes) -> bytes:
+    """AES-CCM put together from AES of single blocks, as RFC 3610 has it (M = 8, L = 2)."""
+    from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+
+    def aes(block: bytes) -> bytes:
+        encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()
+        return encryptor.update(block)
+
+    def xor(a: bytes, b: bytes) -> bytes:
+        return bytes(x ^ y for x, y in zip(a, b, strict=False))
+
+    plain = b""
+    for counter in range(0, len(encrypted), 16):
+        stream = aes(b"\x01" + nonce + (counter // 16 + 1).to_bytes(2, "big"))
+        plain += xor(encrypted[counter : counter + 16], stream)
+    first = bytes([(64 if associated else 0) | 3 << 3 | 1]) + nonce + len(plain).to_bytes(2, "big")
+    blocks = first
+    if associated:
+        named = len(associated).to_bytes(2, "big") + associated
+        blocks += named + bytes(-len(named) % 16)
+    blocks += plain + bytes(-len(plain) % 16)
+    mac = bytes(16)
+    for at in range(0, len(blocks), 16):
+        mac = aes(xor(mac, blocks[at : at + 16]))
+    if xor(mac[:8], aes(b"\x01" + nonce + bytes(2))) != tag:
+        raise Refused("tag")
+    return plain
+
+
+def varint(body: bytes, at: int, end: int) -> tuple[int, int]:
+    value = 0
+    for place in range(4):
+        if at >= end:
+            raise Refused("entry_bounds")
+        byte = body[at]
+        at += 1
+        value += (byte & 127) * 128**place
+        if byte < 128:
+            if place and not byte:
+                raise Refused("varint")
+            return value, at
+    raise Refused("varint")
+
+
+def read_body(body: bytes, room: int) -> list[dict[str, object]]:
+    """The entries of a body as JSON-like values."""
+    entries: list[dict[str, object]] = []
+    at, end = 0, min(room, len(body))
+    while at < end and body[at]:
+        kind = body[at]
+        if kind >= 242:
+            if at + 2 > end or at + 2 + body[at + 1] > end:
+                raise Refused("entry_bounds")
+            content = body[at + 2 : at + 2 + body[at + 1]]
+            at += 2 + len(content)
+            entry = read_control(kind, content)
+            if entry is not None:
+                entries.append(entry)
+            continue
+        if at + 2 > end:
+            raise Refused("entry_bounds")
+        flags = body[at + 1]
+        at += 2
+        fills = flags & 0x10
+        length = 0
+        if fills:
+            if flags & 15 or len(body) < room:
+                raise Refused("entry_kind")
+        else:
+            if at >= end:
+                raise Refused("entry_bounds")
+            length = (flags & 15) * 256 + body[at]
+            at += 1
+        back = offset = 0
+        which = flags >> 6
+        if which >= 2:
+            back, at = varint(body, at, end)
+            offset, at = varint(body, at, end)
+            if not offset:
+                raise Refused("entry_kind")
+        stop = end if fills else at + length
+        if stop > end:
+            raise Refused("entry_bounds")
+        if which and stop <= at:
+            raise Refused("entry_kind")
+        if back >= 1 << 21 or offset + stop - at > 1 << 24:
+            raise Refused("varint")
+        entries.append(
+            {
+                "topic_id": kind - 1,
+                "payload": body[at:stop].hex(),
+                "back": back,
+                "offset": offset,
+                "last": which in (0, 3),
+                "coded": bool(flags & 0x20),
+            }
+        )
+        at = stop
+    if any(body[at:]):
+        raise Refused("pad")
+    return entries
+
+
+def read_control(kind: int, content: bytes) -> dict[str, object] | None:
+    def number(start: int, stop: int) -> int:
+        return int.from_bytes(content[start:stop], "big")
+
+    if kind == 0xF8:
+        if len(content) < 13 or (len(content) - 13) % 5:
+            raise Refused("entry_bounds")
+        marks = [[content[at], number(at + 1, at + 5)] for at in range(13, len(content), 5)]
+        return {
+            "hello": number(0, 4),
+            "turns": number(4, 8),
+            "capabilities": content[8],
+            "digest": number(9, 13),
+            "marks": marks,
+        }
+    if kind == 0xF9:
+        if len(content) < 2:
+            raise Refused("entry_bounds")
+        return {"ask": content[0], "topic_ids": list(content[1:])}
+    if kind == 0xFA:
+        if len(content) != 14:
+            raise Refused("entry_bounds")
+        tail = content[13]
+        return {
+            "report": content[0],
+            "boot": number(1, 3),
+            "number": number(3, 5),
+            "arrived": number(5, 13),
+            "settled": tail >= 128,
+            "loss": tail % 128,
+        }
+    if kind == 0xFB:
+        if len(content) != 5:
+            raise Refused("entry_bounds")
+        return {"heard": content[0], "boot": number(1, 5)}
+    return None
+
+
+def read_packet(
+    data: bytes, packet_len: int, boot: int, newest: int, *, key: bytes | None = None, encrypts: bool = False
+) -> dict[str, object]:
+    """One packet, opened: its fields, and ``body`` of a repair.
+
+    :param newest: packet number that the packet's is nearest to
+    """
+    if not 8 <= len(data) <= packet_len:
+        raise Refused("length")
+    if data[0] >> 4 != 1:
+        raise Refused("version")
+    sealed, addressed, qos = bool(data[0] & 8), bool(data[0] & 4), data[0] & 3
+    trailer, start = (8 if sealed else 4), (6 if addressed else 4)
+    if len(data) < start + trailer:
+        raise Refused("length")
+    low = data[2] * 256 + data[3]
+    number = newest - 32768 + (low - (newest - 32768)) % 65536
+    packet: dict[str, object] = {"qos": qos, "sealed": sealed, "src_id": data[1], "number": number}
+    if addressed:
+        packet["dst_id"], packet["hop"] = data[4], data[5]
+    end = len(data) - trailer
+    row, window, hello = 255, 0, False
+    if qos == 3:
+        if start + 2 > end:
+            raise Refused("entry_bounds")
+        window, row = data[start] % 128, data[start + 1] % 128
+        masked, oldest = data[start] >= 128, data[start + 1] >= 128
+        packet["row"], packet["oldest"] = row, oldest
+        start += 2
+        members = list(range(window))
+        if not window:
+            hello = masked
+            if oldest:
+                raise Refused("window")
+        elif masked:
+            size = (window + 7) // 8
+            if start + size > end:
+                raise Refused("entry_bounds")
+            mask = int.from_bytes(data[start : start + size], "little")
+            members = [bit for bit in range(size * 8) if mask >> bit & 1]
+            if not members or members[0] or members[-1] != window - 1 or len(members) == window:
+                raise Refused("window")
+            start += size
+        packet["members"] = [number - bit for bit in members]
+        packet["clear"] = hello
+    if sealed:
+        assert key is not None
+        nonce = bytes(4) + number.to_bytes(8, "big") + bytes([row])
+        associated = data[:start] if not addressed else data[:5] + data[6:start]
+        opened = subkey(key, data[1], boot)
+        if encrypts and not hello:
+            body = unseal(opened, nonce, associated, data[start:end], data[end:])
+        else:
+            body = data[start:end]
+            unseal(opened, nonce, associated + body, b"", data[end:])
+    else:
+        body = data[start:end]
+        turns = number >> 16
+        session = boot.to_bytes(4, "big") + turns.to_bytes(4, "big")
+        if crc32(session + data[:end]) != int.from_bytes(data[end:], "big"):
+            raise Refused("crc")
+    room = packet_len - (6 if addressed else 4) - 2 - trailer
+    if qos == 3 and window:
+        packet["body"] = body
+    else:
+        packet["entries"] = read_body(body, max(room, 0))
+        packet["body"] = body[:room]
+    return packet
+
+
+def solve(known: dict[int, bytes], repairs: list[tuple[int, list[int], bytes]], room: int) -> dict[int, bytes]:
+    """Bodies that follow from repairs (row, numbers, combination): Gauss-Jordan elimination, nothing clever."""
+    missing = sorted({number for _, numbers, _ in repairs for number in numbers} - set(known))
+    column = {number: at for at, number in enumerate(missing)}
+    rows: list[list[int]] = []
+    for row, numbers, combined in repairs:
+        left = [0] * len(missing)
+        right = list(combined.ljust(room, b"\0")[:room])
+        for number in numbers:
+            factor = coefficient(row, number)
+            if number in column:
+                left[column[number]] = factor
+            else:
+                for at, byte in enumerate(known[number]):
+                    right[at] ^= times(factor, byte)
+        rows.append(left + right)
+    done = 0
+    for at in range(len(missing)):
+        pivot = next((index for index in range(done, len(rows)) if rows[index][at]), None)
+        if pivot is None:
+            continue
+        rows[done], rows[pivot] = rows[pivot], rows[done]
+        inverse = INVERSE[rows[done][at]]
+        rows[done] = [times(inverse, value) for value in rows[done]]
+        for index, row_values in enumerate(rows):
+            if index != done and (factor := row_values[at]):
+                rows[index] = [a ^ times(factor, b) for a, b in zip(row_values, rows[done], strict=True)]
+        done += 1
+    found = {}
+    for row_values in rows[:done]:
+        columns = [at for at, value in enumerate(row_values[: len(missing)]) if value]
+        if len(columns) == 1:
+            found[missing[columns[0]]] = bytes(row_values[len(missing) :])
+    return found
+
+
+def messages(bodies: dict[int, bytes], room: int) -> dict[tuple[int, int, int], bytes]:
+    """Whole messages by (topic id, packet in which they began, place among its entries)."""
+    whole: dict[tuple[int, int, int], bytes] = {}
+    parts: dict[tuple[int, int], dict[int, tuple[bytes, bool, int]]] = {}
+    for number, body in bodies.items():
+        for place, entry in enumerate(read_body(body.ljust(room, b"\0"), room)):
+            if "topic_id" not in entry:
+                continue
+            topic, back, offset = (int(str(entry[name])) for name in ("topic_id", "back", "offset"))
+            payload, last = bytes.fromhex(str(entry["payload"])), bool(entry["last"])
+            if last and not offset:
+                whole[topic, number, place] = payload
+            else:
+                parts.setdefault((topic, number - back), {})[offset] = (payload, last, place)
+    for (topic, begin), pieces in parts.items():
+        payload, place, last = b"", 0, False
+        while len(payload) in pieces and not last:
+            piece, last, at = pieces[len(payload)]
+            place = place if payload else at
+            payload += piece
+        if last:
+            whole[topic, begin, place] = payload
+    return whole

@@ -1,0 +1,159 @@
+"""The vectors of version 1, read by the engine's decoder and by the second one, which was made from the page alone."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from runpy import run_path
+from typing import Any
+
+import pytest
+
+from gr_ros2.errors import WireError
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.events import Delivered
+from gr_ros2.link.v1.gf256 import coefficient
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
+from gr_ros2.wire import v1
+from gr_ros2.wire.table import Row, read_table
+from tests.link.v1.air import KEY, Robot, registry
+from tests.wire import second_decoder as second
+
+VECTORS: dict[str, Any] = json.loads((Path(__file__).parent.parent / "vectors" / "v1.json").read_text())
+
+
+def named(kind: str) -> Any:
+    return pytest.mark.parametrize("case", VECTORS[kind], ids=lambda case: case.get("name", case.get("hex", ""))[:40])
+
+
+@named("packets")
+def test_packets(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    packet = v1.decode(data, case["packet_len"], case["boot"], case["number"] >> 16)
+    assert packet.header._asdict() == case["header"]
+    assert v1.encode(packet, case["packet_len"], case["boot"], case["number"] >> 16, fixed=len(data) == 64) == data
+    read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
+    assert read["entries"] == case["entries"]
+    assert read["number"] == case["number"]
+    assert read.get("row") == case.get("row")
+
+
+@named("refused_bodies")
+def test_bodies_to_refuse(case: dict[str, Any]) -> None:
+    body = bytes.fromhex(case["hex"])
+    with pytest.raises(WireError) as ours:
+        v1.read_body(body, case["room"])
+    with pytest.raises(second.Refused) as theirs:
+        second.read_body(body, case["room"])
+    assert ours.value.kind == str(theirs.value) == case["error"]
+
+
+def test_coefficients() -> None:
+    for case in VECTORS["coefficients"]:
+        row, number = case["row"], case["number"]
+        assert coefficient(row, number) == second.coefficient(row, number) == case["coefficient"]
+
+
+@named("repairs")
+def test_repairs(case: dict[str, Any]) -> None:
+    room = v1.body_room(case["packet_len"])
+    here = {int(number): bytes.fromhex(body) for number, body in case["here"].items()}
+    missing = {int(number): bytes.fromhex(body).ljust(room, b"\0") for number, body in case["missing"].items()}
+    decoder = RepairDecoder(room, lambda _: True, 4096)
+    decoder.begin(min(here | missing))
+    found = {}
+    for number, body in here.items():
+        decoder.source(number, body)
+    equations = []
+    for text in case["repairs"]:
+        data = bytes.fromhex(text)
+        packet = v1.decode(data, case["packet_len"], case["boot"], case["newest"] >> 16)
+        assert packet.standing is not None
+        standing = packet.standing
+        found.update(decoder.repair(case["newest"], standing.mask, standing.row, packet.combined))
+        read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
+        assert read["members"] == case["members"]
+        members, body = read["members"], read["body"]
+        assert isinstance(members, list)
+        assert isinstance(body, bytes)
+        equations.append((standing.row, members, body))
+    assert found == missing
+    if len(missing) < 20:  # the second decoder takes its time
+        assert second.solve(here, equations, room) == missing
+    else:
+        short = [(row, members, body[:3]) for row, members, body in equations]
+        assert second.solve({}, short, 3) == {number: body[:3] for number, body in missing.items()}
+
+
+@named("sealed")
+def test_sealed_packets(case: dict[str, Any]) -> None:
+    data, key = bytes.fromhex(case["hex"]), bytes.fromhex(case["key"])
+    assert subkey(key, 1, case["boot"]).hex() == second.subkey(key, 1, case["boot"]).hex() == case["subkey"]
+    read = second.read_packet(
+        data, case["packet_len"], case["boot"], case["newest"], key=key, encrypts=case["encrypts"]
+    )
+    assert read["entries"] == case["entries"]
+    mode: SealMode = "encrypt" if case["encrypts"] else "authenticate"
+    header = v1.read_header(data, 64)
+    start, row, plain = header.size, SOURCE_ROW, False
+    if header.qos == v1.QOS_STANDING:
+        standing = v1.read_standing(data, start, len(data) - 8)
+        start, row, plain = start + standing.size, standing.row, standing.clear
+    trailer = Keys((key,), mode).own(1, case["boot"])
+    body = trailer.open(data[:start], data[start:], case["number"], row, plain=plain)
+    assert trailer.close(data[:start], body, case["number"], row, plain=plain) == data
+    for wrong in (case["newest"] + 65_536, case["newest"]):
+        with pytest.raises(second.Refused, match="tag"):
+            damaged = data[:-1] + bytes((data[-1] ^ 1,)) if wrong == case["newest"] else data
+            second.read_packet(damaged, 64, case["boot"], wrong, key=key, encrypts=case["encrypts"])
+
+
+def test_the_vectors_are_what_their_tool_writes() -> None:
+    tool = Path(__file__).parents[2] / "tools" / "write-v1-vectors"
+    space = run_path(str(tool))
+    assert json.loads(json.dumps(space["vectors"]())) == VECTORS
+
+
+def test_tables() -> None:
+    for case in VECTORS["tables"]:
+        assert read_table(bytes.fromhex(case["hex"])) == tuple(Row(**row) for row in case["rows"])
+
+
+@pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
+def test_the_second_decoder_understands_a_whole_link(mode: SealMode) -> None:
+    """Half of the packets are lost; what repairs bring back is what the engine delivers, and nothing else."""
+    one, two = Robot(1, registry(), mode=mode, hears=False), Robot(2, mode=mode, hears=False)
+    rng = random.Random(9)
+    room = v1.body_room(64, sealed=mode != "none")
+    bodies: dict[int, bytes] = {}
+    equations: list[tuple[int, list[int], bytes]] = []
+    now, newest = 0.0, 0
+    for index in range(160):
+        now += 1 / 75
+        if index % 8 == 0 and index < 120:
+            one.end.submit(index % 3, rng.randbytes(rng.choice((20, 130))), now)
+        data = one.slot(now)
+        if data is None or (rng.random() < 0.4 and index > 20):
+            continue
+        two.end.receive(data, now)
+        read = second.read_packet(data, 64, one.boot, newest, key=KEY, encrypts=mode == "encrypt")
+        newest = max(newest, int(str(read["number"])))
+        body = read["body"]
+        assert isinstance(body, bytes)
+        if read["qos"] != 3:
+            bodies[int(str(read["number"]))] = body.ljust(room, b"\0")[:room]
+        elif read["members"]:
+            members = read["members"]
+            assert isinstance(members, list)
+            equations.append((int(str(read["row"])), members, body))
+    assert equations
+    bodies |= second.solve(bodies, equations, room)
+    whole = second.messages(bodies, room)
+    delivered = {
+        (event.topic_id, event.key.number, event.key.place): event.payload
+        for event in two.events
+        if isinstance(event, Delivered)
+    }
+    assert len(delivered) >= 10
+    assert delivered.items() <= whole.items()

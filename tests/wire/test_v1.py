@@ -1,0 +1,234 @@
+"""Version 1's bytes: properties, sizes, and every small corruption."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.errors import WireError
+from gr_ros2.wire import v1
+from gr_ros2.wire.control import Ask, Heard, Hello, Report
+from gr_ros2.wire.table import Row, read_table, write_table
+from gr_ros2.wire.v1 import Header, Packet, Part, Standing, decode, encode
+
+U8, U16, U32, U64 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32, 64))
+BOOT = 0x01020304
+
+
+def headers(qos: st.SearchStrategy[int], sealed: st.SearchStrategy[bool]) -> st.SearchStrategy[Header]:
+    source = st.integers(0, 254)
+    address = st.just((v1.BROADCAST, 0)) | st.tuples(st.integers(0, 254), U8)
+    return st.tuples(qos, sealed, source, U16, address).map(lambda values: Header(*values[:4], *values[4]))
+
+
+@st.composite
+def parts(draw: st.DrawFn) -> Part:
+    offset = draw(st.just(0) | st.integers(1, v1.MAX_MESSAGE - 40))
+    last = draw(st.booleans())
+    payload = draw(st.binary(min_size=0 if last and not offset else 1, max_size=40))
+    back = draw(st.integers(0, v1.MAX_BACK)) if offset else 0
+    return Part(draw(st.integers(0, v1.TABLE_TOPIC)), payload, back, offset, last, draw(st.booleans()))
+
+
+marks = st.lists(st.tuples(U8, U32), max_size=7).map(tuple)
+controls = (
+    st.builds(Hello, U32, U32, U8, U32, marks)
+    | st.builds(Ask, U8, st.binary(min_size=1, max_size=9))
+    | st.builds(Heard, U8, U32)
+    | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127))
+)
+entries = st.lists(parts() | controls, max_size=6).map(tuple)
+
+
+@st.composite
+def standings(draw: st.DrawFn, control: bool) -> Standing:
+    row = draw(st.integers(0, 127))
+    if control:
+        return Standing(row, clear=draw(st.booleans()))
+    mask = draw(st.integers(0, (1 << 127) - 1)) | 1
+    size = len(v1.write_standing(Standing(row, mask)))
+    return Standing(row, mask, draw(st.booleans()), size=size)
+
+
+@st.composite
+def packets(draw: st.DrawFn) -> tuple[Packet, int, bool]:
+    kind = draw(st.sampled_from(("source", "control", "repair")))
+    qos = st.integers(0, 2) if kind == "source" else st.just(v1.QOS_STANDING)
+    header = draw(headers(qos, st.just(False)))
+    fixed = draw(st.booleans())
+    if kind == "repair":
+        standing = draw(standings(control=False))
+        combined = draw(st.binary(max_size=60))
+        least = header.size + standing.size + len(combined) + v1.CRC_LEN
+        packet_len = least + draw(st.integers(0, 20))
+        combined = combined.ljust(packet_len - least + len(combined), b"\0") if fixed else combined
+        return Packet(header, (), standing, combined), packet_len, fixed
+    standing = draw(standings(control=True)) if kind == "control" else None
+    inside = draw(entries)
+    used = len(v1.write_body(inside, 1 << 20))
+    room = used - draw(st.integers(0, 1)) if _last_is_part(inside) else used  # without its length byte, it just fits
+    packet_len = max(room + draw(st.just(0) | st.integers(0, 20)), 2) + header.size + v1.STANDING_LEN + v1.CRC_LEN
+    return Packet(header, inside, standing), packet_len, fixed
+
+
+def _last_is_part(inside: tuple[v1.Entry, ...]) -> bool:
+    return bool(inside) and isinstance(inside[-1], Part)
+
+
+@given(packets(), U32, U32)
+def test_what_is_written_reads_back(case: tuple[Packet, int, bool], boot: int, turns: int) -> None:
+    packet, packet_len, fixed = case
+    data = encode(packet, packet_len, boot, turns, fixed=fixed)
+    assert len(data) <= packet_len
+    assert not fixed or len(data) == packet_len
+    assert decode(data, packet_len, boot, turns) == packet
+
+
+@given(packets(), st.data())
+def test_another_start_of_the_sender_and_every_flipped_bit_are_refused(
+    case: tuple[Packet, int, bool], draw: st.DataObject
+) -> None:
+    packet, packet_len, fixed = case
+    data = encode(packet, packet_len, BOOT, 7, fixed=fixed)
+    flip = draw.draw(st.integers(0, len(data) * 8 - 1))
+    damaged = bytearray(data)
+    damaged[flip // 8] ^= 1 << flip % 8
+    for boot, turns, bytes_ in ((BOOT + 1, 7, data), (BOOT, 8, data), (BOOT, 7, bytes(damaged)), (BOOT, 7, data[:-1])):
+        with pytest.raises(WireError):
+            decode(bytes_, packet_len, boot, turns)
+
+
+@given(st.binary(max_size=80), st.integers(0, 80))
+def test_any_body_reads_or_is_refused_by_name(body: bytes, room: int) -> None:
+    try:
+        found = v1.read_body(body, room)
+    except WireError as error:
+        assert error.kind in {"entry_bounds", "entry_kind", "varint", "pad"}
+        return
+    again = v1.write_body(found, room)
+    assert v1.read_body(again, room) == found or len(again) < room
+
+
+@given(headers(st.integers(0, 3), st.booleans()), st.binary(min_size=8, max_size=9))
+def test_headers_read_back(header: Header, trailer: bytes) -> None:
+    assert v1.read_header(v1.write_header(header) + trailer, 64) == header
+
+
+@given(st.binary(max_size=24), st.integers(0, 24))
+def test_any_window_and_row_read_or_are_refused_by_name(data: bytes, start: int) -> None:
+    try:
+        standing = v1.read_standing(data, start, len(data))
+    except WireError as error:
+        assert error.kind in {"entry_bounds", "window"}
+        return
+    again = v1.write_standing(standing)
+    assert v1.read_standing(again, 0, len(again))[:4] == standing[:4]
+    assert standing.size <= len(data) - start
+
+
+@given(
+    st.integers(1, 200),
+    st.integers(0, 300),
+    st.integers(0, v1.MAX_BACK),
+    st.integers(1, v1.MAX_MESSAGE - 300),
+    st.booleans(),
+)
+def test_what_is_said_to_fit_does_fit(room: int, remaining: int, back: int, offset: int, begins: bool) -> None:
+    offset, back = (0, 0) if begins else (offset, back)
+    if not begins and not remaining:
+        return
+    taken, used = v1.fit(room, remaining, back, offset)
+    if taken < 0:
+        assert room < 11
+        return
+    assert taken == remaining or used == room
+    part = Part(1, bytes(taken), back, offset, taken == remaining)
+    data = v1.write_body([part], room)
+    assert len(data) == used
+    assert v1.read_body(data, room) == [part]
+
+
+@pytest.mark.parametrize(("sealed", "overhead"), [(False, 13), (True, 17)])
+def test_the_overhead_of_a_whole_message_is_that_of_version_0(sealed: bool, overhead: int) -> None:
+    room = v1.body_room(64, sealed=sealed)
+    message = bytes(64 - overhead)
+    assert v1.fit(room, len(message), 0, 0) == (len(message), room)
+    assert v1.fit(room, len(message) + 1, 0, 0) == (len(message) + 1, room)  # one more: the length goes unsaid
+
+
+def test_an_odometry_message_takes_as_many_packets_as_in_version_0() -> None:
+    room, offset, packets = v1.body_room(64), 0, 0
+    while offset < 724:
+        taken, _ = v1.fit(room, 724 - offset, packets, offset)
+        offset += taken
+        packets += 1
+    assert packets == 15
+
+
+def test_entries_of_kinds_not_known_are_skipped() -> None:
+    part = Part(3, b"x")
+    body = bytes((0xF5, 3, 1, 2, 3)) + v1.write_body([part], 40)
+    assert v1.read_body(body, 40) == [part]
+
+
+@pytest.mark.parametrize(
+    ("body", "kind"),
+    [
+        ("01", "entry_bounds"),  # no flags
+        ("0100", "entry_bounds"),  # no length
+        ("010005aabb", "entry_bounds"),  # five bytes promised
+        ("010f", "entry_bounds"),
+        ("0110", "entry_kind"),  # fills a body that is shorter than the longest
+        ("014000", "entry_kind"),  # a first fragment of no bytes
+        ("0180010000aa", "entry_kind"),  # a later fragment at the begin
+        ("018001008100aa", "varint"),  # 1 in two bytes
+        ("0180010080808080aa", "varint"),
+        ("01800100ffffff7faa", "varint"),  # beyond 16 MB
+        ("f201", "entry_bounds"),
+        ("fa0100", "entry_bounds"),  # a report of one byte
+        ("f80100", "entry_bounds"),
+        ("f90100", "entry_bounds"),
+        ("fb0100", "entry_bounds"),
+        ("010001aa0001", "pad"),
+    ],
+)
+def test_bodies_are_refused_by_name(body: str, kind: str) -> None:
+    with pytest.raises(WireError) as caught:
+        v1.read_body(bytes.fromhex(body), 40)
+    assert caught.value.kind == kind
+
+
+def test_an_addressed_packet_is_two_bytes_longer() -> None:
+    message = bytes(49)
+    packet = Packet(Header(0, False, 1, 5, dst_id=7, hop=2), (Part(0, message),))
+    assert decode(encode(packet, 64, BOOT), 64, BOOT) == packet
+    with pytest.raises(WireError):
+        encode(packet._replace(entries=(Part(0, bytes(51)),)), 64, BOOT)
+
+
+rows = st.builds(
+    Row,
+    st.integers(0, 239),
+    st.text(max_size=30),
+    st.text(max_size=30),
+    st.integers(0, 2),
+    st.booleans(),
+    st.booleans(),
+    U8,
+    st.text(max_size=20),
+)
+
+
+@given(st.lists(rows, max_size=20, unique_by=lambda row: row.topic_id))
+def test_a_table_reads_back(table: list[Row]) -> None:
+    assert read_table(write_table(table)) == tuple(table)
+
+
+@given(st.binary(max_size=60).map(lambda data: b"\1" + data))
+def test_any_table_reads_or_is_refused_by_name(data: bytes) -> None:
+    try:
+        table = read_table(data)
+    except WireError:
+        return
+    assert read_table(write_table(table)) == table
