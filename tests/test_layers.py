@@ -74,7 +74,14 @@ WITHOUT_BACKENDS = (
 )
 MAX_LINES = 500
 
-KNOW_THEIR_VERSION = ("wire/", "link/sender.py", "link/receiver.py", "link/reassemble.py", "link/sequence.py")
+KNOW_THEIR_VERSION = (
+    "wire/",
+    "link/sender.py",
+    "link/receiver.py",
+    "link/reassemble.py",
+    "link/partials.py",
+    "link/sequence.py",
+)
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
 COMPARES_WITH_VERSION_0 = ("race/settings.py",)
 SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "config", "registry"}
