@@ -78,6 +78,7 @@ KNOW_THEIR_VERSION = (
     "link/sender.py",
     "link/receiver.py",
     "link/reassemble.py",
+    "link/partials.py",
     "link/sequence.py",
     "link/v1/",
 )

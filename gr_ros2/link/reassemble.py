@@ -22,8 +22,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.sequence import Pace
 from gr_ros2.wire import unwrap
 from gr_ros2.wire.v0 import V0, Entry
@@ -36,54 +37,6 @@ _STALL_S = 0.5
 _HISTORY = 128
 _RESTART_JUMP = 4096
 _NOWHERE = (-1, -1)
-_FRAGMENT_COST = 64
-"""Bytes of bookkeeping counted per held fragment."""
-
-
-@dataclass(slots=True, eq=False)
-class Partial:
-    """A message of which not all fragments are here. ``number`` is its entry id unwrapped."""
-
-    topic_id: int
-    entry_id: int
-    number: int
-    total: int
-    flags: int
-    last: float
-    fragments: dict[int, bytes] = field(default_factory=dict)
-    size: int = 0
-    following: int = 0
-    """The index that an orderly sender sends next."""
-    doubtful: bool = False
-    """Whether the sender used its id for another message at the same time."""
-
-    def contradicts(self, entry: Entry, flags: int) -> bool:
-        """Whether an entry of the same id cannot be of this message."""
-        held = self.fragments.get(entry.index)
-        return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
-
-    def goes_on_with(self, entry: Entry) -> bool:
-        """Whether an entry is the next of this message, or one that it has already."""
-        return not self.doubtful and (entry.index == self.following or entry.index in self.fragments)
-
-    def add(self, entry: Entry, now: float) -> int:
-        """Hold a fragment; returns by how many bytes the memory in use grew."""
-        self.last = now
-        if entry.index in self.fragments:
-            return 0
-        self.fragments[entry.index] = entry.payload
-        self.following = entry.index + 1
-        cost = len(entry.payload) + _FRAGMENT_COST
-        self.size += cost
-        return cost
-
-    @property
-    def complete(self) -> bool:
-        return len(self.fragments) == self.total
-
-    def payload(self) -> bytes:
-        """The message, once complete."""
-        return b"".join(self.fragments[index] for index in range(self.total))
 
 
 @dataclass(slots=True)
@@ -105,12 +58,16 @@ class Context:
 
 
 class TopicReassembler:
-    """Everything held of one source and topic."""
+    """Decides which entries of one source and topic are of one message.
 
-    def __init__(self, topic_id: int) -> None:
-        self.topic_id = topic_id
-        self.partials: dict[int, Partial] = {}
+    :param partials: holds the incomplete ones
+    """
+
+    def __init__(self, src_id: int, topic_id: int, partials: Partials) -> None:
         self.missed_ids = 0
+        self._src_id, self._topic_id = src_id, topic_id
+        self._partials = partials
+        self._mine = partials.of(src_id, topic_id)
         self._newest: int | None = None
         self._history: deque[tuple[int, int, int, int]] = deque(maxlen=_HISTORY)
         """(packet position, message number, index, epoch) of the last entries."""
@@ -123,10 +80,10 @@ class TopicReassembler:
         """The furthest packet position that had an entry of this topic."""
         self._pace = Pace(window=16, least=8)
 
-    def accept(self, entry: Entry, context: Context) -> tuple[bytes | Partial, list[Partial]]:
+    def accept(self, entry: Entry, context: Context) -> tuple[bytes | None, list[Partial]]:
         """Take one entry.
 
-        :returns: the completed message's bytes or the message it went to, and the messages it ended
+        :returns: the message it completed, if any, and the incomplete messages it ended
         """
         ended: list[Partial] = []
         number = self._number(entry.entry_id)
@@ -134,7 +91,7 @@ class TopicReassembler:
         if entry.index and clean and self._orderly:
             _, last, last_index, _ = self._history[-1]
             self._orderly = number == last and last_index <= entry.index <= last_index + 1
-        if self.partials and not (clean or self._orderly):
+        if self._mine and not (clean or self._orderly):
             ended += self.clear()
         if self._out_of_order(number, entry.index, context):
             ended += self.clear()
@@ -146,29 +103,27 @@ class TopicReassembler:
         self._latest = max(self._latest, (number, entry.index))
         self._top = max(self._top, context.position)
         doubtful = False
-        if self.partials:
+        if self._mine:
             ended += self._overtaken(context)
-            held = self.partials.get(entry.entry_id)
+            held = self._mine.get(entry.entry_id)
             if held is not None:
                 contradicts = held.contradicts(entry, context.flags)
                 self._orderly &= not (contradicts and clean)
                 if contradicts or not (self._orderly or held.goes_on_with(entry)):
-                    ended.append(self.partials.pop(entry.entry_id))
+                    ended.append(self._partials.take(held))
                     doubtful = not self._orderly
         if entry.total == 1:
             return entry.payload, ended
-        partial = self.partials.get(entry.entry_id)
+        partial = self._mine.get(entry.entry_id)
         if partial is None:
-            partial = Partial(self.topic_id, entry.entry_id, number, entry.total, context.flags, context.now)
-            partial.doubtful = doubtful
-            self.partials[entry.entry_id] = partial
-        return partial, ended
+            partial = Partial(
+                self._src_id, self._topic_id, entry.entry_id, number, entry.total, context.flags, doubtful
+            )
+        return self._partials.add(partial, entry, context.now), ended
 
     def clear(self) -> list[Partial]:
         """End everything held."""
-        ended = list(self.partials.values())
-        self.partials.clear()
-        return ended
+        return [self._partials.take(partial) for partial in list(self._mine.values())]
 
     def reset(self) -> list[Partial]:
         """End everything held and forget ids, order and pace: what follows is of another time."""
@@ -208,7 +163,7 @@ class TopicReassembler:
             self.missed_ids += number - self._newest - 1
             self._pace.observe(now, number - self._newest)
             self._newest = number
-        elif number < self._newest and index == 0 and self.missed_ids and entry_id not in self.partials:
+        elif number < self._newest and index == 0 and self.missed_ids and entry_id not in self._mine:
             self.missed_ids -= 1
 
     def _overtaken(self, context: Context) -> Iterator[Partial]:
@@ -216,6 +171,6 @@ class TopicReassembler:
         assert newest is not None
         waited = self._pace.duration(_PATIENT if context.steady else OVERTAKEN)
         patience = max(waited, _STALL_S) if context.steady else waited
-        for entry_id, partial in list(self.partials.items()):
+        for partial in list(self._mine.values()):
             if newest - partial.number >= OVERTAKEN or context.now - partial.last > patience:
-                yield self.partials.pop(entry_id)
+                yield self._partials.take(partial)

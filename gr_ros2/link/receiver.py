@@ -6,7 +6,7 @@ name; memory is bounded per source and in all; time is an argument and never goe
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -15,7 +15,8 @@ from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
 from gr_ros2.link.outcome import ROWS, Row
-from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
+from gr_ros2.link.partials import Partial, Partials
+from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
 from gr_ros2.wire import BROADCAST
@@ -53,7 +54,6 @@ class _Source:
     sequence: SequenceTracker = field(default_factory=SequenceTracker)
     topics: dict[int, TopicReassembler] = field(default_factory=dict)
     latched: dict[int, bytes] = field(default_factory=dict)
-    size: int = 0
     epoch: int = 0
 
 
@@ -76,9 +76,7 @@ class Receiver:
         self.stats = ReceiverStats()
         self._codec = codec
         self._sources: dict[int, _Source] = {}
-        self._partials: OrderedDict[Partial, int] = OrderedDict()
-        """Everything incomplete and its source, longest without a new fragment first."""
-        self._size = 0
+        self._partials = Partials()
 
     def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
         """Take the bytes of one packet; the events it causes, in order."""
@@ -93,17 +91,15 @@ class Receiver:
         events.append(Received(data, packet))
         source = self._admit(packet, now)
         if source is not None:
-            events += self._take(source, packet, data, now)
+            self._take(source, packet, data, now, events)
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Give up what has waited ``reassembly_timeout`` for its next fragment."""
-        ended: list[Partial] = []
-        for partial in self._partials:
-            if partial.last + self.config.reassembly_timeout > now:
-                break
-            ended.append(partial)
-        return [self._abandon(partial, Row.EXPIRED) for partial in ended]
+        events: list[ReceiverEvent] = []
+        while (at := self.next_timeout()) is not None and at <= now:
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.EXPIRED))
+        return events
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
@@ -126,7 +122,7 @@ class Receiver:
     @property
     def held_bytes(self) -> int:
         """Memory in use for incomplete messages."""
-        return self._size
+        return self._partials.size
 
     def _admit(self, packet: Packet, now: float) -> _Source | None:
         """The source of a packet that concerns us."""
@@ -142,20 +138,21 @@ class Receiver:
         if source is None:
             if len(self._sources) >= self.config.max_sources:
                 idle = min(self._sources, key=lambda src_id: self._sources[src_id].last)
-                if now - self._sources[idle].last < SOURCE_IDLE_S or self._sources[idle].size:
+                if now - self._sources[idle].last < SOURCE_IDLE_S or self._partials.size_of(idle):
                     self.stats.dropped["max_sources"] += 1
                     return None
                 del self._sources[idle]
+                self._partials.forget(idle)
             source = self._sources[packet.src_id] = _Source(now)
         source.last = now
         return source
 
-    def _take(self, source: _Source, packet: Packet, data: bytes, now: float) -> list[ReceiverEvent]:
+    def _take(self, source: _Source, packet: Packet, data: bytes, now: float, events: list[ReceiverEvent]) -> None:
         placed = source.sequence.place(packet.seq, data, now)
         if placed.arrival is Arrival.DUPLICATE:
             self.stats.dropped["duplicate"] += 1
-            return []
-        events: list[ReceiverEvent] = []
+            return
+        src_id = packet.src_id
         steady = placed.arrival is Arrival.NEXT
         if not steady:
             source.epoch += 1
@@ -164,35 +161,30 @@ class Receiver:
             if placed.arrival is Arrival.LATE:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:
-                ended = [partial for topic in source.topics.values() for partial in topic.reset()]
-                events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
+                for topic in source.topics.values():
+                    events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in topic.reset()]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
             if entry.topic_id >= len(self.registry):
                 self.stats.dropped["unknown_topic"] += 1
                 continue
-            topic = source.topics.get(entry.topic_id)
-            if topic is None:
-                topic = source.topics[entry.topic_id] = TopicReassembler(entry.topic_id)
-            missed = topic.missed_ids
-            result, ended = topic.accept(entry, context)
-            self.stats.message_loss_est += topic.missed_ids - missed
-            events += [self._forget(partial, packet.src_id, Row.LOST_FRAGMENTS) for partial in ended]
-            if isinstance(result, Partial):
-                grown = result.add(entry, now)
-                source.size += grown
-                self._size += grown
-                self._partials[result] = packet.src_id
-                self._partials.move_to_end(result)
-                if not result.complete:
-                    continue
-                self._release(result)
-                result = result.payload()
-            events += self._deliver(source, packet, entry.topic_id, entry.entry_id, result)
+            reassembler = source.topics.get(entry.topic_id)
+            if reassembler is None:
+                reassembler = TopicReassembler(src_id, entry.topic_id, self._partials)
+                source.topics[entry.topic_id] = reassembler
+            missed = reassembler.missed_ids
+            message, ended = reassembler.accept(entry, context)
+            self.stats.message_loss_est += reassembler.missed_ids - missed
+            if ended:
+                events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in ended]
+            if message is not None:
+                events += self._deliver(source, packet, entry.topic_id, entry.entry_id, message)
         source.epoch += placed.arrival is Arrival.LATE
-        events += self._bound(source, packet.src_id)
-        return events
+        while self._partials.size_of(src_id) > self.config.max_source_bytes:
+            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), Row.MEMORY))
+        while self._partials.size > self.config.max_bytes:
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.MEMORY))
 
     def _deliver(
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
@@ -217,35 +209,8 @@ class Receiver:
         self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
-    def _bound(self, source: _Source, src_id: int) -> list[ReceiverEvent]:
-        """Give up the oldest incomplete messages where memory is over its bounds."""
-        events: list[ReceiverEvent] = []
-        while source.size > self.config.max_source_bytes:
-            oldest = next(partial for partial, owner in self._partials.items() if owner == src_id)
-            events.append(self._abandon(oldest, Row.MEMORY))
-        while self._size > self.config.max_bytes:
-            events.append(self._abandon(next(iter(self._partials)), Row.MEMORY))
-        return events
-
-    def _abandon(self, partial: Partial, reason: Row) -> Lost:
-        """Give up a message its topic still holds."""
-        src_id = self._partials[partial]
-        del self._sources[src_id].topics[partial.topic_id].partials[partial.entry_id]
-        return self._forget(partial, src_id, reason)
-
-    def _forget(self, partial: Partial, src_id: int, reason: Row) -> Lost:
-        """Book a message its topic no longer holds as lost."""
-        source = self._sources[src_id]
-        source.size -= partial.size
-        self._size -= partial.size
-        del self._partials[partial]
-        self.stats.lost[src_id, partial.topic_id, reason.value] += 1
+    def _given_up(self, partial: Partial, row: Row) -> Lost:
+        """Book an incomplete message that is held no longer."""
+        self.stats.lost[partial.src_id, partial.topic_id, row.value] += 1
         self.stats.message_loss_est += 1
-        return Lost(src_id, partial.topic_id, reason, partial.entry_id)
-
-    def _release(self, partial: Partial) -> None:
-        """Free the memory of a message that completed."""
-        source = self._sources[self._partials.pop(partial)]
-        source.size -= partial.size
-        self._size -= partial.size
-        del source.topics[partial.topic_id].partials[partial.entry_id]
+        return Lost(partial.src_id, partial.topic_id, row, partial.entry_id)

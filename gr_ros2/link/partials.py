@@ -1,0 +1,115 @@
+"""The incomplete messages of all sources: the one place that holds them, knows their order and counts their bytes.
+
+Laws: a message is here from its first fragment until it is completed or taken off, and then nowhere; ``size`` is the
+sum over all that are here; the order is that of their last new fragment, the longest ago first.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from gr_ros2.wire.v0 import Entry
+
+_FRAGMENT_COST = 64
+"""Bytes of bookkeeping counted per held fragment."""
+
+
+@dataclass(slots=True, eq=False)
+class Partial:
+    """A message of which not all fragments are here.
+
+    :ivar number: its entry id unwrapped
+    :ivar last: s, when its last fragment came
+    :ivar size: bytes that it takes
+    :ivar following: the index that an orderly sender sends next
+    :ivar doubtful: the sender used its id for another message at the same time
+    """
+
+    src_id: int
+    topic_id: int
+    entry_id: int
+    number: int
+    total: int
+    flags: int
+    doubtful: bool = False
+    last: float = 0.0
+    fragments: dict[int, bytes] = field(default_factory=dict)
+    size: int = 0
+    following: int = 0
+
+    def contradicts(self, entry: Entry, flags: int) -> bool:
+        """Whether an entry of the same id cannot be of this message."""
+        held = self.fragments.get(entry.index)
+        return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
+
+    def goes_on_with(self, entry: Entry) -> bool:
+        """Whether an entry is the next of this message, or one that it has already."""
+        return not self.doubtful and (entry.index == self.following or entry.index in self.fragments)
+
+
+class Partials:
+    """See the module's first lines."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        """Bytes of all."""
+        self._sizes: Counter[int] = Counter()
+        self._in_order: OrderedDict[Partial, None] = OrderedDict()
+        self._of: dict[tuple[int, int], dict[int, Partial]] = {}
+
+    def of(self, src_id: int, topic_id: int) -> dict[int, Partial]:
+        """Those of a source and topic by entry id: always the same dictionary, to be read only."""
+        return self._of.setdefault((src_id, topic_id), {})
+
+    def size_of(self, src_id: int) -> int:
+        """Bytes of those of a source."""
+        return self._sizes[src_id]
+
+    def oldest(self, src_id: int | None = None) -> Partial:
+        """The one without a new fragment for longest, of a source or of all; there is one."""
+        return next(partial for partial in self._in_order if src_id is None or partial.src_id == src_id)
+
+    def __iter__(self) -> Iterator[Partial]:
+        """In their order."""
+        return iter(self._in_order)
+
+    def add(self, partial: Partial, entry: Entry, now: float) -> bytes | None:
+        """Hold a fragment of a message, which may be its first.
+
+        :return: the whole message where that completes it, which is then here no more
+        """
+        partial.last = now
+        if partial not in self._in_order:
+            self.of(partial.src_id, partial.topic_id)[partial.entry_id] = partial
+            self._in_order[partial] = None
+        elif entry.index in partial.fragments:
+            self._in_order.move_to_end(partial)
+            return None
+        else:
+            self._in_order.move_to_end(partial)
+        partial.fragments[entry.index] = entry.payload
+        partial.following = entry.index + 1
+        cost = len(entry.payload) + _FRAGMENT_COST
+        partial.size += cost
+        self.size += cost
+        self._sizes[partial.src_id] += cost
+        if len(partial.fragments) < partial.total:
+            return None
+        self.take(partial)
+        return b"".join([partial.fragments[index] for index in range(partial.total)])
+
+    def take(self, partial: Partial) -> Partial:
+        """Hold a message no longer."""
+        del self._in_order[partial]
+        del self._of[partial.src_id, partial.topic_id][partial.entry_id]
+        self.size -= partial.size
+        self._sizes[partial.src_id] -= partial.size
+        return partial
+
+    def forget(self, src_id: int) -> None:
+        """A source without incomplete messages is gone."""
+        for key in [key for key in self._of if key[0] == src_id]:
+            del self._of[key]
+        del self._sizes[src_id]
