@@ -1,17 +1,20 @@
-# Everything a person needs: make demo, make test, make bench, make lint, make grc.
+# Everything a person needs: make demo, make test, make quick, make bench, make lint, make grc.
 # Set-up happens by itself and is remembered in .venv/stamp-*.
 
 PYTHON := /usr/bin/python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench lint format examples grc setup setup-dev clean
+.PHONY: demo test quick bench lint format examples grc setup setup-dev clean
 
 demo: setup
 	$(BIN)/gr-ros2 demo
 
 test: setup-dev
-	$(BIN)/pytest $(PYTEST_ARGS)
+	$(BIN)/pytest -n auto --dist loadgroup $(PYTEST_ARGS)
+
+quick: setup-dev
+	$(BIN)/pytest -n auto --dist loadgroup -m "not slow" $(PYTEST_ARGS)
 
 bench: setup-dev
 	$(BIN)/python -m bench
@@ -35,7 +38,7 @@ grc: setup
 setup: $(VENV)/stamp-run
 setup-dev: $(VENV)/stamp-dev
 
-$(VENV)/stamp-run: tools/install-system requirements.txt setup.py
+$(VENV)/stamp-run: tools/install-system requirements.txt setup.py $(wildcard gr_ros2/phy/kernels/*.cpp gr_ros2/phy/kernels/*.h)
 	tools/install-system run
 	test -x $(BIN)/pip || $(PYTHON) -m venv --system-site-packages $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-input -r requirements.txt
@@ -48,4 +51,4 @@ $(VENV)/stamp-dev: $(VENV)/stamp-run requirements-dev.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist *.egg-info gr_ros2/phy/kernels/*.so

@@ -1,12 +1,52 @@
 """Package metadata; it stands here and not in pyproject.toml because colcon reads it from here."""
 
+import platform
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+
+KERNELS = "gr_ros2/phy/kernels"
+COMPILE = [
+    "-std=c++17",
+    "-O3",
+    "-fvisibility=hidden",
+    # What lets sums be taken in any order. Never -ffast-math: linked with it, a library turns denormals off for the
+    # whole process, and what is compiled with it takes NaN for a number.
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-signed-zeros",
+    "-fassociative-math",
+]
+VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if platform.machine() in ("x86_64", "AMD64") else {})
+"""Libraries of compiled kernels: for every processor of the architecture (64-bit ARM has NEON), and for newer ones."""
 
 
 def files(pattern: str) -> list[str]:
     return [str(path) for path in sorted(Path().glob(pattern))]
+
+
+def kernels(variant: str, flags: list[str]) -> Extension:
+    """One library; without a compiler it is left out, and numpy does its work."""
+    return Extension(
+        f"gr_ros2.phy.kernels.{variant}",
+        sources=files(f"{KERNELS}/*.cpp"),
+        depends=files(f"{KERNELS}/*.h"),
+        extra_compile_args=[*COMPILE, *flags],
+        language="c++",
+        optional=True,
+    )
+
+
+class BuildKernels(build_ext):
+    """Objects of each variant in a folder of its own."""
+
+    def build_extension(self, ext: Extension) -> None:
+        shared, self.build_temp = self.build_temp, str(Path(self.build_temp) / ext.name.rpartition(".")[2])
+        try:
+            super().build_extension(ext)
+        finally:
+            self.build_temp = shared
 
 
 setup(
@@ -32,6 +72,8 @@ setup(
             "compression/dictionaries/*",
         ]
     },
+    ext_modules=[kernels(variant, flags) for variant, flags in VARIANTS.items()],
+    cmdclass={"build_ext": BuildKernels},
     # What a ROS 2 workspace looks for; GRC finds the blocks in share by the hook of colcon.pkg.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gr_ros2"]),
@@ -42,6 +84,7 @@ setup(
         ("lib/gr_ros2", ["resource/link"]),
     ],
     install_requires=[
+        "apsw>=3.46",
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
         "cyclonedds==11.0.1",

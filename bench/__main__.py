@@ -21,6 +21,9 @@ BENCHMARKS = {
     "ofdm": "bench.runs",
     "husky": "bench.runs",
     "links": "bench.links",
+    "receivers": "bench.receivers",
+    "half_points": "bench.receivers",
+    "rates": "bench.phys",
     "drive": "bench.phys",
     "beside": "bench.phys",
     "stop": "bench.stop",
@@ -28,7 +31,7 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("drive", "sweep")
+LONG = ("half_points", "drive", "sweep")
 """Many minutes: only when named."""
 
 

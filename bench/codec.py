@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from bench.report import Row, median_of
-from gr_ros2.wire import Entry, Packet, decode, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 
 PACKET_LEN, PACKETS, REPEATS = 64, 20_000, 9
 TARGET = 150_000
@@ -18,7 +18,7 @@ def codec() -> list[Row]:
     def rate() -> float:
         begin = time.perf_counter()
         for packet in packets:
-            decode(encode(packet, PACKET_LEN), PACKET_LEN)
+            V0.decode(V0.encode(packet, PACKET_LEN), PACKET_LEN)
         return PACKETS / (time.perf_counter() - begin)
 
     return [Row("codec: encode + decode, 64 B", median_of(REPEATS, rate), "packets/s", "≥", TARGET)]

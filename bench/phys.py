@@ -24,7 +24,6 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated
 from gr_ros2.phy.threads import quicken_threads
@@ -36,8 +35,8 @@ LEAST = 0.95
 """Share of the bare flowgraph's packets/s that is left with source and sink."""
 BATCH_SAMPLES = 2_000_000
 REPEATS = 3
-_SMALL = b"\0\1\0\0" + bytes(44)
-"""A message that is one packet."""
+_HEADERS = 16
+"""Bytes of a packet that are no message, when it holds one."""
 _COUNTS = {"lora": (1500, 20)}
 _COUNT = (4000, 200)
 """Packets for a rate, and for a latency."""
@@ -99,8 +98,30 @@ def _beside(name: str) -> list[Row]:
     ]  # fmt: skip
 
 
-def _phy(name: str) -> Phy:
-    phy: Phy = PHY.load(name)(PACKET_LEN, 1e6)
+def rates() -> list[Row]:
+    """Links with source and sink: OFDM on compiled kernels beside numpy and GNU Radio's blocks, in turn."""
+    short = {kernels: _phy("ofdm", kernels=kernels) for kernels in ("auto", "numpy")}
+    dense = [_phy("ofdm", 1500, kernels=kernels, payload_modulation="64qam") for kernels in ("auto", "numpy")]
+    stock = _phy("ofdm", detection_threshold="stock")
+    runs: dict[Phy, list[tuple[float, float]]] = {}
+    for _ in range(REPEATS):
+        for phy in (*short.values(), *dense, stock):
+            runs.setdefault(phy, []).append(_ours(phy, *_COUNT))
+    rate, wait = ({phy: median(one[place] for one in all_) for phy, all_ in runs.items()} for place in (0, 1))
+    ours, plain = short.values()
+    bits = 8e-6 * (dense[0].packet_len - _HEADERS)
+    speed = f"{rate[ours]:,.0f} instead of {rate[plain]:,.0f}; GNU Radio's blocks {rate[stock]:,.0f}"
+    times = f"{wait[ours] * 1e3:.2f} instead of {wait[plain] * 1e3:.2f} ms; GNU Radio's blocks {wait[stock] * 1e3:.2f}"
+    return [
+        Row("ofdm, 64 B: packets/s over those with numpy", rate[ours] / rate[plain], "", "≥", 4, "{:.1f}", speed),
+        Row("ofdm, 64 B: latency of one over that with numpy", wait[ours] / wait[plain], "", "≤", 0.5, "{:.2f}", times),
+        Row("ofdm 64qam, 1,500 B: messages", bits * rate[dense[0]], "Mbit/s", "≥", 40, "{:.1f}",
+            f"numpy {bits * rate[dense[1]]:.1f}"),
+    ]  # fmt: skip
+
+
+def _phy(name: str, packet_len: int = PACKET_LEN, **settings: Any) -> Phy:
+    phy: Phy = PHY.load(name)(packet_len, 1e6, **settings)
     return phy
 
 
@@ -110,7 +131,7 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     poster, taker, graph = _Poster(), _Taker(), gr.top_block()
     transmitter, receiver = phy.transmitter(), phy.receiver(aside=True)
     graph.msg_connect(poster, "out", transmitter, "pdus")
-    graph.connect(transmitter, Channel(ChannelConfig(), phy), receiver)
+    graph.connect(transmitter, receiver)
     graph.msg_connect(receiver, "pdus", taker, "in")
     graph.start()
     phy.prefer_latency()
@@ -134,13 +155,14 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """The same from a message at the source to the message at the sink."""
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     robot, base = _Graph(1), _Graph(2)
-    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=PACKET_LEN, backpressure=True)
-    sink = RosSink(registry, middleware=base, packet_len=PACKET_LEN)
+    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=phy.packet_len, backpressure=True)
+    sink = RosSink(registry, middleware=base, packet_len=phy.packet_len)
+    message = b"\0\1\0\0" + bytes(phy.packet_len - _HEADERS - 4)
     with LoopbackLink(phy, source, sink, pace="flow"):
         phy.prefer_latency()
-        single = _latency(lambda: robot.callback(_SMALL), lambda: base.counter.published, few)
+        single = _latency(lambda: robot.callback(message), lambda: base.counter.published, few)
         begin = time.perf_counter()
-        feeder = threading.Thread(target=lambda: [robot.callback(_SMALL) for _ in range(many)])
+        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)])
         feeder.start()
         _wait(lambda: base.counter.published, few + many)
         rate = many / (time.perf_counter() - begin)

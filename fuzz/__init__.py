@@ -1,1 +1,1 @@
-"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.wire`, `python -m fuzz.receiver`."""
+"""Harnesses that throw arbitrary bytes at what must stand them: `python -m fuzz.wire` and so on."""

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from functools import partial
 
-from fuzz.loop import main
+from fuzz.loop import main, within
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent, Rejected, Sender
 from gr_ros2.registry import Registry
-from gr_ros2.wire import CRC_LEN, crc16
+from gr_ros2.wire.v0 import with_crc, without_crc
 
 PACKET_LEN = 40
-_STEP = PACKET_LEN - CRC_LEN + 1
+_BODY_LEN = len(without_crc(bytes(PACKET_LEN)))
+BASE_S, BYTE_S = 2e-3, 1e-5
+"""s of processor time that a script may take, and more for each byte of it."""
+_STEP = 1 + _BODY_LEN
 _WAITS_S = (0.0, 0.0, 0.001, 0.03, 0.6, 2.0, 70.0, 1e6)
 _REGISTRY = Registry.from_rows({"a": "std_msgs/String", "map": "std_msgs/String", "c": "std_msgs/String"})
 _CONFIG = SinkConfig(packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096, max_bytes=8192, robot_id=9)
@@ -20,13 +24,17 @@ _CONFIG = SinkConfig(packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096
 
 def receiver(data: bytes) -> None:
     """A script of packets: each a byte that says how long to wait and whether the CRC is right, then its bytes."""
+    within(BASE_S + BYTE_S * len(data), lambda: partial(_hear, data))
+
+
+def _hear(data: bytes) -> None:
     engine = Receiver(_REGISTRY, _CONFIG)
     events: list[ReceiverEvent] = []
     now = 0.0
     given = 0
     for wait, intact, body in steps(data):
         now += wait
-        packet = body + (crc16(body).to_bytes(CRC_LEN, "big") if intact else b"\0\0")
+        packet = with_crc(body) if intact else body + b"\0\0"
         events += engine.receive(packet, now)
         given += 1
         assert engine.held_bytes <= _CONFIG.max_bytes
@@ -59,7 +67,7 @@ def corpus() -> list[bytes]:
             sender.submit(number % 3, rng.randbytes(rng.choice((4, 30, 100))), 0.0)
         packets = []
         while (packet := sender.next_packet(0.0)) is not None:
-            packets.append(bytes([rng.randrange(4)]) + packet[:-CRC_LEN])
+            packets.append(bytes([rng.randrange(4)]) + without_crc(packet))
         scripts.append(packets)
     shuffled = rng.sample(scripts[0], len(scripts[0]))
     thinned = [packet for packet in scripts[1] if rng.random() < 0.7]

@@ -23,12 +23,12 @@ from gr_ros2.names import (
     checked_namespace_form,
     checked_topic_form,
 )
+from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
+from gr_ros2.yaml_bounds import read_bounded
 from gr_ros2.yaml_text import parse_yaml
 
-BROADCAST = 255
-MIN_PACKET_LEN, MAX_PACKET_LEN = 14, 4095
-SINGLE_ENTRY_OVERHEAD = 13
-"""Bytes of a packet with one entry that are not payload: header 5, topic ids 1, entry header 5, CRC 2."""
+MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
+MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
 
 _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 _T = TypeVar("_T")
@@ -46,7 +46,7 @@ _KINDS = {
 """What a value is asked to be, by what pydantic calls it."""
 
 PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
-RobotId = Annotated[int, Field(ge=-1, le=254)]
+RobotId = Annotated[int, Field(ge=-1, lt=BROADCAST)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -57,6 +57,7 @@ MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
+Kernels = Literal["auto", "numpy"]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -137,7 +138,7 @@ class SourceConfig:
     topics: tuple[str, ...] = ()
     namespace: Namespace = ""
     robot_id: RobotId = -1
-    dst_id: Annotated[int, Field(ge=0, le=255)] = BROADCAST
+    dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
@@ -159,12 +160,17 @@ class SourceConfig:
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:
-        if self.min_fragment > self.packet_len - SINGLE_ENTRY_OVERHEAD:
+        most = self.wire_format.single_entry_payload(self.packet_len)
+        if self.min_fragment > most:
             raise ValueError(
-                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; "
-                f"at most {self.packet_len - SINGLE_ENTRY_OVERHEAD}"
+                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; at most {most}"
             )
         return self
+
+    @property
+    def wire_format(self) -> Format:
+        """The version that packets are written in."""
+        return format_of(0)
 
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
@@ -215,7 +221,7 @@ class SinkConfig:
     publisher_depth: Count = 10
     reassembly_timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     robot_id: RobotId = -1
-    max_sources: Annotated[int, Field(ge=1, le=256)] = 16
+    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1)] = 16
     max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000
     max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
     compression: bool = False
@@ -331,12 +337,15 @@ class PhyConfig:
     :param name: a name of ``gr_ros2.phy.PHY``
     :param sample_rate: samples/s; 0 = chosen by the experiment to carry ``headroom`` times the offered load
     :param headroom: capacity over offered load where sample_rate is 0
+    :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
+        numpy = the reference, several times slower
     :param options: settings of that PHY, by its constructor's parameter names
     """
 
     name: str = "ofdm"
     sample_rate: Seconds = 0.0
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    kernels: Kernels = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -448,10 +457,11 @@ def _class_at(cls: Any, loc: tuple[Any, ...]) -> Any:
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """One YAML file as a mapping.
 
-    :raises ConfigError: when it cannot be read, is no mapping, or has a key twice; names file and line
+    :raises ConfigError: when it cannot be read, is no mapping, has a key twice, or is past what
+        :mod:`gr_ros2.yaml_bounds` allows; names file and line
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_bounded(Path(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
     values = parse_yaml(text, str(path))

@@ -1,4 +1,4 @@
-"""The registry: which topics cross the link and which nibble stands for each (the paper, section 4.3).
+"""The registry: which topics cross the link and which number stands for each (the paper, section 4.3).
 
 Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
 """
@@ -16,8 +16,9 @@ from typing import overload
 from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
+from gr_ros2.wire import FORMATS
 
-MAX_TOPICS = 16
+MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
@@ -42,7 +43,7 @@ def normalize_type(text: str) -> str:
 class Topic:
     """One row.
 
-    :param topic_id: nibble on the wire, 0..15
+    :param topic_id: its number on the wire
     :param name: as registered, relative to the robot's namespace or absolute with leading slash
     :param type_name: ``package/msg/Type``
     """
@@ -76,7 +77,7 @@ class Topic:
 
 
 class Registry(Sequence[Topic]):
-    """At most 16 topics, indexed by topic id.
+    """At most ``MAX_TOPICS`` topics, indexed by topic id.
 
     :raises RegistryError: too many, none, or duplicate names
     """
@@ -85,7 +86,7 @@ class Registry(Sequence[Topic]):
         if not topics:
             raise RegistryError("no topics; add rows of the form name,type", path)
         if len(topics) > MAX_TOPICS:
-            raise RegistryError(f"{len(topics)} topics; a topic id is 4 bits, so at most {MAX_TOPICS}", path)
+            raise RegistryError(f"{len(topics)} topics; a link carries at most {MAX_TOPICS}", path)
         names: dict[str, Topic] = {}
         for topic in topics:
             same = names.setdefault(topic.name.lstrip("/"), topic)
@@ -207,7 +208,7 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
         if len(row) > len(columns) or len(row) < 2:
             raise RegistryError(f"{len(row)} columns where {len(columns)} were expected: {','.join(row)!r}", path, line)
         if topic_id >= MAX_TOPICS:
-            raise RegistryError(f"topic 17, {row[0]!r}: a topic id is 4 bits, so at most {MAX_TOPICS}", path, line)
+            raise RegistryError(f"topic {MAX_TOPICS + 1}, {row[0]!r}: a link carries at most {MAX_TOPICS}", path, line)
         if row[0].lstrip("/") in seen:
             raise RegistryError(
                 f"duplicate topic {row[0]!r}; it stands first in line {seen[row[0].lstrip('/')]}", path, line

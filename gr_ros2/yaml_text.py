@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.yaml_bounds import check_bounds
 
 
 class _Loader(yaml.SafeLoader):
@@ -33,9 +34,11 @@ def parse_yaml(text: str, where: str, what: str = "") -> Any:
 
     :param where: what errors begin with, for instance the file name
     :param what: of which errors speak, where that is not the whole of ``where``
-    :raises ConfigError: when it is no YAML, or has a key twice; names the key and its lines
+    :raises ConfigError: when it is no YAML, is past what :mod:`gr_ros2.yaml_bounds` allows,
+        or has a key twice; names the key and its lines
     """
     try:
+        check_bounds(text)
         return yaml.load(text, _Loader)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error

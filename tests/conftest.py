@@ -3,21 +3,67 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
 
 from gr_ros2.record.result import Result
+from tests import domains
 from tests.record.results import RESULT
 
 # Helpers that assert say what they saw, as tests do.
-pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support")
+pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support", "tests.waiting")
 
 # Machines are shared and noisy: no example has a deadline. CI draws the same examples each time, so that a red run
 # means a change; `make test` elsewhere draws new ones.
 settings.register_profile("here", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
+
+# A test that names no domain is on one of this process's own, and tests never meet robots on the network.
+os.environ.update(ROS_DOMAIN_ID=str(domains.domain()), ROS_LOCALHOST_ONLY="1")
+# What a person has set for their own robots is not for tests.
+for name in ("CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "ZENOH_CONFIG_OVERRIDE", "ZENOH_SESSION_CONFIG_URI"):
+    os.environ.pop(name, None)
+
+# A shell script's background jobs ignore Ctrl-C, and so would every program that a test starts and interrupts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+GROUPS = {
+    "cluster": "Dask with two workers",
+    "installed": "a wheel and a virtual environment",
+    "platform": "GRC with all its blocks",
+}
+"""Fixtures that are dear to make: tests that share one run in one worker, so that it is made once."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Workers of ``-n auto``: tests mostly wait, for radios in real time and for other programs, so two per core."""
+    return 2 * len(os.sched_getaffinity(0))
+
+
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """In several processes, groups stay together, and slow tests begin first, so that none is waited for at the end."""
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    for item in items:
+        for name in GROUPS.keys() & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.xdist_group(name))
+    if os.environ.get("PYTEST_XDIST_WORKER"):
+        items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
+@pytest.fixture(autouse=True)
+def _domains_of_one_test() -> Iterator[None]:
+    """DDS domains are a test's own until it ends."""
+    yield
+    domains.give_back()
 
 
 @pytest.fixture

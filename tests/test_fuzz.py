@@ -4,22 +4,51 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+import fuzz.compression
+import fuzz.doorbell
 import fuzz.receiver
 import fuzz.wire
-from fuzz.loop import Harness, inputs, run
+from fuzz.loop import Harness, inputs, run, within
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import fuzz.kernels
 
 ROOT = Path(__file__).parents[1]
-HARNESSES = {"wire": (fuzz.wire.wire, fuzz.wire.corpus), "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus)}
+HARNESSES = {
+    "wire": (fuzz.wire.wire, fuzz.wire.corpus),
+    "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+    "compression": (fuzz.compression.compression, fuzz.compression.corpus),
+    "doorbell": (fuzz.doorbell.doorbell, fuzz.doorbell.corpus),
+    "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
+}
+COUNTS = {"wire": 20_000, "receiver": 1_500, "compression": 2_000, "doorbell": 1_000, "dashboard": 300, "kernels": 400}
+if find_spec("bokeh") is not None:
+    import fuzz.dashboard
+
+    HARNESSES["dashboard"] = (fuzz.dashboard.dashboard, fuzz.dashboard.corpus)
 
 
-@pytest.mark.parametrize(("name", "count"), [("wire", 20_000), ("receiver", 1_500)])
+@pytest.mark.parametrize(("name", "count"), COUNTS.items())
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
+    if name not in HARNESSES:
+        pytest.skip("needs GNU Radio 3.10 and bokeh: pip install 'gr-ros2[dashboard]'")
     harness, corpus = HARNESSES[name]
-    run(harness, corpus(), seed=1, count=count)
+    tried = 0
+
+    def counted(data: bytes) -> None:
+        nonlocal tried
+        harness(data)
+        tried += 1
+
+    run(counted, corpus(), seed=1, count=count)
+    assert tried == count
 
 
 @pytest.mark.parametrize("name", HARNESSES)
@@ -27,7 +56,7 @@ def test_equal_seeds_give_equal_inputs(name: str) -> None:
     corpus = HARNESSES[name][1]()
 
     def first(seed: int) -> list[bytes]:
-        return [data for _, data in zip(range(100), inputs(corpus, seed), strict=False)]
+        return [data for _, data in zip(range(len(corpus) + 100), inputs(corpus, seed), strict=False)]
 
     assert first(3) == first(3)
     assert first(3) != first(4)
@@ -52,6 +81,18 @@ def test_a_failing_input_is_named() -> None:
     harness: Harness = fails
     with pytest.raises(AssertionError, match="ValueError: too long; replay with --replay 61"):
         run(harness, [b"abc"], seed=0, count=10_000)
+
+
+def test_what_takes_too_long_is_noticed() -> None:
+    within(60.0, lambda: lambda: None)
+    with pytest.raises(AssertionError, match=r"ms of processor time, at most 0.00 ms are allowed"):
+        within(0.0, lambda: lambda: sum(range(1000)))
+
+
+def test_what_paid_for_something_else_is_tried_again() -> None:
+    tries = iter([200_000, 0, 0])
+    within(1e-3, lambda: partial(sum, range(100 * next(tries))))
+    assert next(tries) == 0
 
 
 @pytest.mark.parametrize("name", HARNESSES)

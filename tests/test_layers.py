@@ -11,16 +11,17 @@ from pathlib import Path
 import pytest
 
 import gr_ros2
+import gr_ros2.wire
 
 ROOT = Path(gr_ros2.__file__).resolve().parent
 MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
 
 LAYERS = (
     {"errors"},
-    {"names", "yaml_text"},
-    {"config", "backends"},
+    {"wire", "names", "yaml_bounds"},
+    {"yaml_text"},
+    {"config", "backends", "backlog", "guard"},
     {"registry", "settings_file"},
-    {"wire"},
     {"link"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path"},
@@ -72,6 +73,12 @@ WITHOUT_BACKENDS = (
     "gr_ros2.cli.main",
 )
 MAX_LINES = 500
+
+KNOW_THEIR_VERSION = ("wire/", "link/sender.py", "link/receiver.py", "link/reassemble.py", "link/sequence.py")
+"""The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
+COMPARES_WITH_VERSION_0 = ("race/settings.py",)
+SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "config", "registry"}
+"""Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
 _GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}
 """What makes a generator of one's own; anything else of ``random`` and ``numpy.random`` is the global one."""
@@ -157,6 +164,29 @@ def test_wire_and_link_are_pure(module: str) -> None:
     outside = {name.split(".")[0] for name in imports(MODULES[module])} - {"gr_ros2"}
     assert outside - set(sys.stdlib_module_names) <= PURE_CODECS
     assert not outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_nothing_but_its_engines_knows_a_version_of_the_wire_format(module: str) -> None:
+    inside = [name for name in imports(MODULES[module]) if name.startswith("gr_ros2.wire.")]
+    public = {f"gr_ros2.wire.{name}" for name in gr_ros2.wire.__all__}
+    known = module.startswith(KNOW_THEIR_VERSION) or module in COMPARES_WITH_VERSION_0
+    assert known or set(inside) <= public
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if part(module) in SPEAKS_OF_PACKETS])
+def test_no_width_of_a_field_stands_outside_of_the_wire(module: str) -> None:
+    """``x & 255``, ``x % 256``, ``randrange(256)``, ``x << 4``: written by who knows that a field has 8 or 4 bits."""
+    widths = {15, 16, 255, 256, 0xFFFF, 1 << 16}
+    found = []
+    for node in ast.walk(MODULES[module]):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.BitAnd, ast.Mod, ast.LShift, ast.RShift)):
+            operands = [side.value for side in (node.left, node.right) if isinstance(side, ast.Constant)]
+            if any(isinstance(value, int) and (value in widths or value in (4, 8)) for value in operands):
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Call) and dotted(node.func).endswith("randrange"):
+            found += [ast.unparse(node) for arg in node.args if isinstance(arg, ast.Constant) and arg.value in widths]
+    assert found == []
 
 
 @pytest.mark.parametrize("package", CONFINED)

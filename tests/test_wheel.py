@@ -21,6 +21,7 @@ from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.compression.dictionary import shipped
 from gr_ros2.settings_file import BUILTIN_DIR
 from gr_ros2.grc_path import example, grc_path
+from gr_ros2.phy.kernels.library import loaded
 print(json.dumps({
     "package": str(Path(gr_ros2.__file__).parent),
     "blocks": sorted(path.name for path in grc_path().iterdir()),
@@ -28,6 +29,7 @@ print(json.dumps({
     "scenarios": sorted(path.name for path in BUILTIN_DIR.iterdir()),
     "dissector": DISSECTOR.read_text(),
     "dictionary": shipped().number,
+    "kernels": loaded().functions is not None,
 }))
 """
 
@@ -57,6 +59,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment
 
 
+@pytest.mark.slow
 def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
     python = installed / "bin" / "python"
     # Isolated and elsewhere: the tree is not on its path.
@@ -72,9 +75,12 @@ def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
         assert found[name] == tracked(folder), folder
     assert found["dissector"] == (package / "wireshark" / "gr_ros2.lua").read_text()
     assert found["dictionary"] > 0
+    assert found["kernels"] == bool(shutil.which("g++"))
 
 
-def test_its_command_runs(installed: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_its_command_runs(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # a tree on it would come before the wheel
     command = [installed / "bin" / "gr-ros2"]
     listed = subprocess.run([*command, "scenarios"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     assert "paper-ofdm-paced" in listed

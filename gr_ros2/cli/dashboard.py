@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
+import socket
 import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from http.client import HTTPConnection, HTTPException
 from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 
 from gr_ros2.backends import uninterrupted
-from gr_ros2.cli.doorbell import Doorbell, neighbours, ring
+from gr_ros2.cli.doorbell import Doorbell, neighbours, receive, ring
 from gr_ros2.errors import BackendMissingError, ConfigError, RunError
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
+_ANSWER_S, _ANSWER_BYTES = 2.0, 4096
+_log = logging.getLogger(__name__)
 
 dashboard_option = click.option(
     "--dashboard",
@@ -53,14 +55,20 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
         def serve(address: str, port: int) -> str:
             if not urls:
                 dashboard = dashboards.enter_context(_make(address, port))
-                seen.add(dashboard)
+                seen.invite(dashboard)
                 urls.append(dashboard.url)
             return urls[0]
 
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
         # Closed before the dashboards are, so that nobody can ask for one more by then.
-        with Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))}):
+        with ExitStack() as doorbell:
+            try:
+                doorbell.enter_context(
+                    Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))})
+                )
+            except (OSError, RunError) as error:
+                _log.warning("`gr-ros2 dashboard` cannot find this program (%s)", error)
             yield seen
 
 
@@ -71,6 +79,7 @@ def _make(address: str, port: int) -> Dashboard:
     except ModuleNotFoundError as error:
         package = (error.name or "bokeh").split(".")[0]
         raise BackendMissingError(f"the dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error
+    logging.getLogger("bokeh.protocol").setLevel(logging.CRITICAL)  # it prints what viewers send that is no message
     for name in ("bokeh", "tornado"):  # they warn of every viewer that leaves
         logging.getLogger(name).setLevel(logging.ERROR)
     return Dashboard(address, port)
@@ -125,11 +134,11 @@ def parse_place(text: str) -> tuple[str, int]:
 
 
 def _answers(address: str, port: int) -> bool:
-    connection = HTTPConnection(address, port, timeout=2)
+    """Whether a dashboard is there. Whatever else is, it gets two seconds and a few thousand bytes."""
+    deadline = time.monotonic() + _ANSWER_S
     try:
-        connection.request("GET", "/alive")
-        return b'"instance"' in connection.getresponse().read()
-    except (OSError, HTTPException):
+        with socket.create_connection((address, port), _ANSWER_S) as connection:
+            connection.sendall(b"GET /alive HTTP/1.0\r\n\r\n")
+            return b'"instance"' in receive(connection, _ANSWER_BYTES, deadline, b'"instance"')
+    except (OSError, ValueError, OverflowError):
         return False
-    finally:
-        connection.close()

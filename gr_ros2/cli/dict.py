@@ -17,7 +17,7 @@ from gr_ros2.cli.console import console
 from gr_ros2.compression import Dictionary, LinkCodec, load, shipped
 from gr_ros2.compression.train import learn
 from gr_ros2.errors import ConfigError
-from gr_ros2.middleware.bag_files import bag_definitions, read_bag
+from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.registry import Registry
 
 _HELD_BACK = 4
@@ -48,9 +48,13 @@ def train(*, bag: Path, out: Path, topics: str, size: int) -> None:
         kinds[message.topic] = message.type_name
         if len(messages[message.topic]) < _MAX_MESSAGES:
             messages[message.topic].append(message.payload)
+    contents = bag_contents(bag)
     missing = [name for name in wanted if name not in kinds]
     if missing:
-        raise ConfigError(f"bag {bag}: no messages of topic {missing[0]!r}")
+        why = contents.left_out.get(missing[0])
+        raise ConfigError(
+            f"bag {bag}: no messages of topic {missing[0]!r}{f', which is left out: {why}' if why else ''}"
+        )
     few = [topic for topic, payloads in messages.items() if len(payloads) < _FEWEST]
     for topic in few:
         del messages[topic]
@@ -65,12 +69,14 @@ def train(*, bag: Path, out: Path, topics: str, size: int) -> None:
         ],
         out.stem,
         base=shipped(),
-        definitions={name: text for name, text in bag_definitions(bag).items() if name in kinds.values()},
+        definitions={name: text for name, text in contents.texts.items() if name in kinds.values()},
         zstd_size=size,
     )
     made.save(out)
     held_back = {topic: payloads[::_HELD_BACK] for topic, payloads in messages.items()}
     console().print(_gains(made, kinds, held_back))
+    for line in contents.remarks:
+        print(line)
     if few:
         print(f"left out, fewer than {_FEWEST} messages: {', '.join(sorted(few))}")
     print(f"{out}: id {made.digest[:4]}, {len(made.types)} types; both ends need it, under `dictionaries:`")

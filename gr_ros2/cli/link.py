@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,10 @@ from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import set_option
 from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.guard import Guard
 from gr_ros2.radio.config import LinkConfig, load_link
 
 if TYPE_CHECKING:
@@ -35,27 +38,32 @@ _SHOW_S = 0.5
 @pcap_option
 def link(
     config: Path, duration: float | None, overrides: tuple[str, ...], dashboard: str | None, pcap: Path | None
-) -> None:
+) -> int:
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
     settings = load_link(config, overrides)
     # These need GNU Radio, which a wrong setting must not wait for.
     with uninterrupted():
         from gr_ros2.radio.link import RobotLink
-        from gr_ros2.run.watch import EventSink, Fanout
+        from gr_ros2.run.watch import Onlookers
 
     console = make_console()
-    with audience(dashboard, console, settings.name) as onlookers, capture(pcap) as captures, ExitStack() as stack:
-        running = RobotLink(settings, observer=Fanout[EventSink]([onlookers, *captures]), instrumented=True)
+    with audience(dashboard, console, settings.name) as visitors, capture(pcap) as captures, ExitStack() as stack:
+        onlookers = Onlookers([visitors, *captures], apart=True)
+        stack.callback(onlookers.run_ended, None)
+        running = RobotLink(settings, observer=onlookers, instrumented=True)
         stack.callback(running.stop)
         try:
             running.start()
             onlookers.run_started(_live(running))
-            console.print(_opening(running), soft_wrap=True)
             _show(console, running, duration)
         except KeyboardInterrupt:
             pass  # how a link ends
-        onlookers.run_ended(None)
-        console.print(status_line(running.stats()), soft_wrap=True)
+        stats = running.stats()
+        stack.close()
+        console.print(status_line(stats), soft_wrap=True)
+        for line in running.incomplete():
+            console.print(line, soft_wrap=True)
+        return FAILED if running.incomplete() else 0
 
 
 def _live(running: RobotLink) -> LiveRun:
@@ -79,11 +87,14 @@ def _opening(running: Any) -> str:
     phy, front_end, source = running.phy, running.front_end, running.source
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
-    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}; Ctrl-C ends it"
+    runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
+    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{runs_on}; Ctrl-C ends it"
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:
-    """Show one status line until the time is over or nothing more can come."""
+    """Say what runs, then show one status line until the time is over or nothing more can come."""
+    said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
+    said(say, _opening(running))
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
     with Status("", console=console) if live else ExitStack() as status:
@@ -92,10 +103,10 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
             if isinstance(status, Status):
-                status.update(status_line(running.stats()))
+                said(status.update, status_line(running.stats()))
             elif time.monotonic() - shown >= LOG_S:
                 shown = time.monotonic()
-                console.print(status_line(running.stats()), soft_wrap=True)
+                said(say, status_line(running.stats()))
 
 
 def status_line(stats: Mapping[str, Any]) -> str:

@@ -119,6 +119,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # Whoever read our output (`| head`) has gone: not an error, but Python must not flush into it at exit.
         sys.stdout = open(os.devnull, "w")
         return 0
+    except OSError as error:
+        # Where a file is written it is named by who writes it; this is what is left, such as our own output.
+        return _fail(f"{error.filename or 'a file or the output'}: {error.strerror or error}", FAILED)
     return status if isinstance(status, int) else 0
 
 

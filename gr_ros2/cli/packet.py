@@ -9,12 +9,11 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.capture import DEFAULT_PACKET_LEN, from_hex, packets_in
-from gr_ros2.config import BROADCAST, MAX_PACKET_LEN, MIN_PACKET_LEN
+from gr_ros2.config import MAX_PACKET_LEN, MIN_PACKET_LEN
 from gr_ros2.errors import ConfigError, WireError
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, decode, pad_len
+from gr_ros2.wire import BROADCAST, QOS_NAMES, Packet, decode, format_of
 
-_QOS_NAMES = ("default", "latency", "bulk", "default")
 _SHOWN = 16
 """Payload bytes printed of an entry."""
 
@@ -75,9 +74,9 @@ def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[
 def _lines(number: int, packet: Packet, packet_len: int, registry: Registry | None) -> Iterator[str]:
     destination = f"{packet.dst_id} (broadcast)" if packet.dst_id == BROADCAST else str(packet.dst_id)
     flags = "".join([", compressed" if packet.compressed else "", ", encrypted" if packet.encrypted else ""])
-    pad = pad_len(packet_len, [len(entry.payload) for entry in packet.entries])
+    pad = sum(span.size for span in format_of(packet.version).layout(packet, packet_len) if span.kind == "pad")
     yield (
-        f"packet {number}: {packet_len} bytes, version {packet.version}, qos {_QOS_NAMES[packet.qos]}{flags}, "
+        f"packet {number}: {packet_len} bytes, version {packet.version}, qos {QOS_NAMES[packet.qos]}{flags}, "
         f"src {packet.src_id}, dst {destination}, seq {packet.seq}, hop {packet.hop}, "
         f"{len(packet.entries)} entries, {pad} bytes PAD, CRC ok"
     )
@@ -87,7 +86,7 @@ def _lines(number: int, packet: Packet, packet_len: int, registry: Registry | No
             known = entry.topic_id < len(registry)
             topic += f" ({registry[entry.topic_id].name if known else 'not in the registry'})"
         yield (
-            f"  entry {index}: topic {topic}, entry_id {entry.entry_id}, index {entry.index} of {entry.total}, "
+            f"  entry {index}: topic {topic}, {entry.describe()}, "
             f"payload {len(entry.payload)} bytes: {_preview(entry.payload)}"
         )
 

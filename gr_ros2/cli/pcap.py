@@ -2,7 +2,8 @@
 
 A pcapng file of link type USER0 with two interfaces, `sent` (packets composed by a source of ours) and `received`
 (packets the PHY handed to the sink). Laws: a packet is in the file as soon as its call returns; the file ends after a
-whole record whatever happens to the process; times are wall time, also of runs in simulated time, which start now.
+whole record whatever happens to the process or the disk; times are wall time, also of runs in simulated time, which
+start now.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.errors import ConfigError, RunError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ _ORDER_MAGIC = 0x1A2B3C4D
 _OPT_APPLICATION, _OPT_NAME, _OPT_TIME_RESOLUTION, _OPT_FLAGS = 4, 2, 9, 2
 _INBOUND, _OUTBOUND = 1, 2
 _NANOSECONDS = 9
+_CLOSE_S = 1.0
 
 
 class PacketCapture:
@@ -48,19 +50,26 @@ class PacketCapture:
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._offset = time.time() - clock()
+        self.name = f"capture {path}"
+        self.packets = 0
+        """Packets in the file."""
+        self._path = path
         self._lock = threading.Lock()
+        self._size = 0
+        self._failed: RunError | None = None
+        application = _option(_OPT_APPLICATION, b"gr-ros2")
+        head = [_block(_SECTION, struct.pack("<IHHq", _ORDER_MAGIC, 1, 0, -1), application)]
+        for name in (b"sent", b"received"):
+            options = _option(_OPT_NAME, name) + _option(_OPT_TIME_RESOLUTION, bytes([_NANOSECONDS]))
+            head.append(_block(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0), options))
         try:
             # Unbuffered: what a process wrote before it was killed is what there is to look at.
             self._file = path.open("wb", buffering=0)
+            self._put(b"".join(head))
         except OSError as error:
             raise ConfigError(
                 f"--pcap {path}: cannot be written ({error.strerror}); name a file in a folder of yours"
             ) from error
-        application = _option(_OPT_APPLICATION, b"gr-ros2")
-        self._file.write(_block(_SECTION, struct.pack("<IHHq", _ORDER_MAGIC, 1, 0, -1), application))
-        for name in (b"sent", b"received"):
-            options = _option(_OPT_NAME, name) + _option(_OPT_TIME_RESOLUTION, bytes([_NANOSECONDS]))
-            self._file.write(_block(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0), options))
 
     def run_started(self, run: LiveRun) -> None:
         """Take the run's clock."""
@@ -69,22 +78,27 @@ class PacketCapture:
     def run_ended(self, result: Result | None) -> None:
         """Whoever opened the capture closes it."""
 
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - an EventSink's signature
-        """Write a packet that leaves."""
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
+        """Write a packet that leaves.
+
+        :raises RunError: when that fails, and whenever it has failed before
+        """
         if isinstance(event, SentPacket):
             self._write(_SENT, event.data, event.now)
 
     def packet_received(self, data: bytes, now: float) -> None:
-        """Write a packet that arrived."""
+        """Write a packet that arrived; see above."""
         self._write(_RECEIVED, data, now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """What became of packets is not in a capture."""
 
     def close(self) -> None:
-        """Idempotent."""
-        with self._lock:
-            self._file.close()
+        """Idempotent. A write that hangs, as into a pipe nobody reads, is left behind."""
+        if self._lock.acquire(timeout=_CLOSE_S):
+            with suppress(OSError):  # every record has been written by now
+                self._file.close()
+            self._lock.release()
 
     def __enter__(self) -> PacketCapture:
         return self
@@ -100,8 +114,25 @@ class PacketCapture:
         direction = _OUTBOUND if interface == _SENT else _INBOUND
         record = _block(_PACKET, fixed + _padded(data), _option(_OPT_FLAGS, struct.pack("<I", direction)))
         with self._lock:
-            if not self._file.closed:
-                self._file.write(record)
+            if self._failed is not None:
+                raise self._failed
+            if self._file.closed:
+                return
+            try:
+                self._put(record)
+            except OSError as error:
+                with suppress(OSError):  # a pipe keeps the half of a record that it took
+                    self._file.truncate(self._size)
+                self._failed = RunError(f"after {self.packets} packets: {error.strerror}")
+                raise self._failed from error
+            self.packets += 1
+
+    def _put(self, data: bytes) -> None:
+        """Write all of it: a disk that is nearly full takes a part first."""
+        left = memoryview(data)
+        while left:
+            left = left[self._file.write(left) :]
+        self._size += len(data)
 
 
 pcap_option = click.option(

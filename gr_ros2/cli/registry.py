@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -19,7 +20,7 @@ from gr_ros2.config import DEFAULT_MIDDLEWARE, TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
-from gr_ros2.middleware.bag_files import bag_topics
+from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.names import checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
@@ -111,8 +112,11 @@ def from_bag(*, bag: Path, namespace: str, topics: str, out: Path | None) -> Non
 
     Its QoS columns are what the publishers offered when the bag was recorded.
     """
-    found = bag_topics(bag)
-    _write(registry_csv(found, namespace, _names(topics), bag), unfit(found), out)
+    contents = bag_contents(bag)
+    found = [topic.info for topic in contents.topics.values()]
+    _write(registry_csv(found, namespace, _names(topics), bag), {**contents.left_out, **unfit(found)}, out)
+    for line in contents.differences:
+        print(line, file=sys.stderr)
 
 
 def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from gr_ros2.run.scenario import Scenario, load_scenario
 @click.argument("recording", metavar="IN", type=click.Path(path_type=Path))
 @click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
 @click.option("--scenario", "name", type=SCENARIO, required=True, help="Whose link: a built-in name or a YAML file.")
-@click.option("--topics", help="Absolute names with commas between; the registry is then made of the recording.")
+@click.option("--topics", help="Names with commas between; the registry is then made of the recording.")
 @click.option("--seed", type=int, help="Seed of channel and sender.")
 @click.option("--duration", type=float, default=0.0, help="Seconds of the recording; default 0 = all of it.")
 @set_option(Scenario)
@@ -44,6 +44,8 @@ def replay(
     result = done.outcome.result
     left_out = f"; left out: {', '.join(done.left_out)}" if done.left_out else ""
     console.print(f"Carried: {', '.join(done.carried)}{left_out}", soft_wrap=True)
+    for line in done.remarks:
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
     packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())
     console.print(f"packets: {packets}\n")
     console.print(summary_table([result]))

@@ -16,6 +16,7 @@ from rich.text import Text
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
@@ -50,16 +51,16 @@ def _with_options(function: Any) -> Any:
 @click.command()
 @click.argument("scenario", type=SCENARIO)
 @_with_options
-def run(scenario: str, **options: Any) -> None:
+def run(scenario: str, **options: Any) -> int:
     """Run SCENARIO, a built-in name or a YAML file, and write its result."""
-    _run(scenario, **options)
+    return _run(scenario, **options)
 
 
 @click.command()
 @_with_options
-def demo(**options: Any) -> None:
+def demo(**options: Any) -> int:
     """Two simulated robots: the topics of one cross an OFDM link and come out at the other."""
-    _run("demo", **options)
+    return _run("demo", **options)
 
 
 def _run(
@@ -72,7 +73,7 @@ def _run(
     overrides: tuple[str, ...],
     dashboard: str | None,
     pcap: Path | None,
-) -> None:
+) -> int:
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
@@ -87,8 +88,10 @@ def _run(
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
     if scenario.repetitions == 1:
         _report_run(console, scenario, outcome, out)
+        results = [outcome.result]
     else:
         _report_repetitions(console, scenario, results, out)
+    return FAILED if any(result.incomplete for result in results) else 0
 
 
 def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
@@ -130,6 +133,9 @@ def _report_repetitions(console: Console, scenario: Scenario, results: Sequence[
     if not results:
         return
     console.print(as_table(repetition_grid(results)))
+    for number, result in enumerate(results):
+        for line in result.incomplete:
+            console.print(f"rep-{number}: {line}", soft_wrap=True)
     kept = f"{REPETITIONS_FILE}, the runs in rep-0 to {repetition_folder(out, len(results) - 1).name}"
     if len(results) < scenario.repetitions:
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
@@ -158,7 +164,7 @@ def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
         )
         console.print(
             f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a packet of {scenario.packet_len} B takes "
-            f"{phy['airtime_samples']} samples, {phy['airtime_s'] * 1e3:.2f} ms",
+            f"{phy['airtime_samples']} samples, {phy['airtime_s'] * 1e3:.2f} ms; runs on {phy['runs_on']}",
             soft_wrap=True,
         )
     packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())

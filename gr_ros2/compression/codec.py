@@ -6,16 +6,17 @@ as it is.
 
 Laws: a coded message is at most one byte longer than the message; what comes out is the message that went in, but for
 alignment gaps (zero) and for fields that were asked to be quantised (within their bound); decoding arbitrary bytes
-raises CodecError and nothing else, and never makes more than ``max_size`` bytes; a dictionary that is not held, or is
+raises CodecError and nothing else, never makes more than ``max_size`` bytes, and takes time in proportion to the bytes
+decoded (``bounds``); a dictionary that is not held, or is
 another one, is an UnknownDictionaryError.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 
+from gr_ros2.compression import bounds
 from gr_ros2.compression.dictionary import OWN, SHIPPED, Dictionary, load, shipped
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.frames import Zstd
@@ -23,11 +24,12 @@ from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Types
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")
 """Values of a topic's option ``codec``; auto takes fields where the type is known, zstd where not or where shorter."""
-MAX_MESSAGE = 255 * 4082
-"""Bytes; what version 0 can carry uncompressed."""
+MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in FORMATS.values())
+"""Bytes; what a link can carry uncompressed."""
 
 STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
 
@@ -94,7 +96,7 @@ class TopicCodec:
         self._mode: str = topic.options.codec
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
-        self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders(topic, item, max_size) for item in sets}
+        self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders(topic, item) for item in sets}
         self._coders = next(
             (
                 self._held[item.number.to_bytes(1, "big") + item.prefix]
@@ -135,6 +137,7 @@ class TopicCodec:
         if not coded:
             raise DamagedError("damaged message: it is empty")
         number, codec = coded[0] >> 4, coded[0] & 15
+        max_size = min(self._max_size, bounds.largest(len(coded)))
         if coded[0] == STORED:
             if len(coded) - 1 > self._max_size:
                 raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
@@ -142,7 +145,7 @@ class TopicCodec:
         if codec not in (ZSTD, FIELDS, FIELDS_AND_MORE) or (number == 0 and codec != ZSTD):
             raise CodecError(f"unknown codec {codec} with dictionaries {number}")
         if number == 0:
-            return self._plain.decompress(coded[1:], self._max_size)
+            return self._plain.decompress(coded[1:], max_size)
         start = 3 if number == OWN else 1
         coders = self._held.get(bytes([number]) + coded[1:start])
         if coders is None:
@@ -152,10 +155,10 @@ class TopicCodec:
         if codec == ZSTD:
             if coders.zstd is None:
                 raise UnknownDictionaryError(f"dictionaries {number} have none for {coders.type_name}")
-            return coders.zstd.decompress(body, self._max_size)
+            return coders.zstd.decompress(body, max_size)
         if coders.fields is None:
             raise UnknownDictionaryError(f"the definition of {coders.type_name} is not known here")
-        return coders.fields.decode(body, codec == FIELDS_AND_MORE)
+        return coders.fields.decode(body, codec == FIELDS_AND_MORE, max_size)
 
     def canonical(self, payload: bytes) -> bytes:
         """See LinkCodec. A message that is stored by configuration keeps its gaps."""
@@ -169,30 +172,29 @@ class TopicCodec:
 
     def _zstd(self, payload: bytes) -> bytes:
         coders = self._coders
+        least = bounds.least(len(payload))
         if coders.zstd is None:
-            return b"\x01" + self._plain.compress(payload)
-        return coders.heads[ZSTD] + coders.zstd.compress(payload)
+            return b"\x01" + self._plain.compress(payload, least=least)
+        return coders.heads[ZSTD] + coders.zstd.compress(payload, least=least)
 
 
 class _Coders:
-    """What one set of dictionaries offers for one topic, made when first needed."""
+    """What one set of dictionaries offers for one topic.
 
-    def __init__(self, topic: Topic, dictionary: Dictionary, max_size: int) -> None:
+    All of it is made at once: what comes from the air never makes a receiver prepare what it could have had ready.
+
+    :ivar tree: the type, None where it is not known
+    :ivar fields: None where the type is not known
+    :ivar zstd: None where the set has no dictionary for the type
+    """
+
+    def __init__(self, topic: Topic, dictionary: Dictionary) -> None:
         self.type_name = topic.type_name
-        self._dictionary, self._max_size = dictionary, max_size
-        self._entry = dictionary.types.get(topic.type_name)
         self.heads = [bytes([dictionary.number << 4 | codec]) + dictionary.prefix for codec in range(4)]
         own = {name: entry.definition for name, entry in dictionary.types.items() if entry.definition}
         self.tree = Types(own).tree(topic.type_name)
-
-    @cached_property
-    def fields(self) -> FieldsCodec | None:
-        """None where the type is not known."""
-        if self.tree is None:
-            return None
-        return FieldsCodec(self.tree, self._dictionary.model(self.type_name), Zstd(), self._max_size)
-
-    @cached_property
-    def zstd(self) -> Zstd | None:
-        """None where the set has no dictionary for the type."""
-        return Zstd(self._entry.zstd) if self._entry is not None and self._entry.zstd else None
+        self.fields: FieldsCodec | None = None
+        if self.tree is not None:
+            self.fields = FieldsCodec(self.tree, dictionary.model(self.type_name), Zstd())
+        entry = dictionary.types.get(topic.type_name)
+        self.zstd = Zstd(entry.zstd) if entry is not None and entry.zstd else None

@@ -16,7 +16,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -79,8 +79,11 @@ class Dictionary:
     def model(self, type_name: str) -> Model:
         """For the codec ``fields``; the words and constants serve types without an entry too."""
         entry = self.types.get(type_name, TypeEntry())
-        words = Words([word.encode() + b"\0" for word in self.words])
-        return Model(words, Constants(self.constants), entry.classes, entry.templates)
+        return Model(*self._lists, entry.classes, entry.templates)
+
+    @cached_property
+    def _lists(self) -> tuple[Words, Constants]:
+        return Words([word.encode() + b"\0" for word in self.words]), Constants(self.constants)
 
     def save(self, path: str | Path) -> None:
         """Write the file.
@@ -120,7 +123,7 @@ def load(path: str | Path, number: int = OWN) -> Dictionary:
         return _parse(json.loads(Path(path).read_text(encoding="utf-8")), number)
     except OSError as error:
         raise ConfigError(f"dictionary {path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"dictionary {path}: no dictionary of format {FORMAT} ({reason})") from error
 

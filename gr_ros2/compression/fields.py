@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
-from gr_ros2.compression import bulk
+from gr_ros2.compression import bounds, bulk
 from gr_ros2.compression.ballast import Value, pop_ballast, push_ballast
 from gr_ros2.compression.floats import (
     pop_double,
@@ -31,7 +32,6 @@ from gr_ros2.compression.plan import (
     INTEGER,
     MATRIX,
     MAX_CODED_ITEMS,
-    MAX_SLOTS,
     OCTETS,
     QUATERNION,
     SINGLE,
@@ -48,7 +48,7 @@ from gr_ros2.errors import DamagedError
 MAX_NUMBER = 8192
 """Bytes of the number part: what MAX_SLOTS values can need; more is damage."""
 _REMEMBERED = 128
-"""Things of a kind that are remembered; then memory starts anew."""
+"""Things of a kind that are remembered."""
 _LAYOUTS_TRIED = 4
 
 _HEADERS = [bytes((0, order, 0, options)) for order in (1, 0) for options in range(4)]
@@ -75,12 +75,14 @@ class FieldsCodec:
     """Codes the messages of one type.
 
     :param tree: the type
-    :param max_size: bytes of a message, more is not decoded
     """
 
-    def __init__(self, tree: Composite, model: Model, zstd: Zstd, max_size: int) -> None:
-        self._tree, self._model, self._zstd, self._max_size = tree, model, zstd, max_size
+    def __init__(self, tree: Composite, model: Model, zstd: Zstd) -> None:
+        self._tree, self._model, self._zstd = tree, model, zstd
         self._open = tree.open
+        empty = outline(tree, repeat(0), MAX_CODED_ITEMS)
+        self._fixed = len(empty.items) if empty is not None and empty.codable else None
+        """Items of a message whose sequences are empty; None where no message of the type can be coded."""
         self._recent: dict[int, list[Layout]] = {}
         self._layouts: dict[tuple[tuple[int, ...], tuple[int, ...], bytes, int], Layout] = {}
         self._prepared: dict[tuple[int, ...], Prepared] = {}
@@ -114,7 +116,7 @@ class FieldsCodec:
             return None
         layout, values = found
         prepared = self._prepare(layout.shape.counts)
-        if prepared is None or not prepared.codable:
+        if prepared is None or not prepared.codable or self._fixed is None:
             return None
         blob = b""
         ways: list[tuple[int, int]] = []
@@ -132,15 +134,18 @@ class FieldsCodec:
         number = to_bytes(x)
         if len(number) > MAX_NUMBER:
             return None
+        wanted = bounds.least(layout.size, len(prepared.plan.items) - self._fixed)
+        number = number.rjust(wanted - len(blob), b"\0")
         return (varint(len(number)) + number + blob, True) if blob else (number, False)
 
-    def decode(self, coded: bytes, with_blob: bool) -> bytes:
+    def decode(self, coded: bytes, with_blob: bool, max_size: int) -> bytes:
         """The message.
 
+        :param max_size: bytes; more are not made
         :raises DamagedError: no such message, or a larger one than is taken
         """
         try:
-            return self._decode(coded, with_blob)
+            return self._decode(coded, with_blob, max_size)
         except (IndexError, ValueError, OverflowError, struct.error) as error:
             if isinstance(error, DamagedError):
                 raise
@@ -258,7 +263,10 @@ class FieldsCodec:
 
     # Decoding
 
-    def _decode(self, coded: bytes, with_blob: bool) -> bytes:
+    def _decode(self, coded: bytes, with_blob: bool, max_size: int) -> bytes:
+        if self._fixed is None:
+            raise DamagedError("damaged message: too many parts")
+        max_items = min(MAX_CODED_ITEMS, self._fixed + bounds.most_items(len(coded)))
         blob = b""
         if with_blob:
             length, start = read_varint(coded, 0)
@@ -275,10 +283,10 @@ class FieldsCodec:
         counts: tuple[int, ...] = ()
         if self._open:
             taken: list[int] = []
-            x = self._pop_counts(x, self._tree, taken)
+            x = self._pop_counts(x, self._tree, taken, max_items)
             counts = tuple(taken)
-        prepared = self._prepare(counts, MAX_CODED_ITEMS)
-        if prepared is None or not prepared.codable:
+        prepared = self._prepare(counts, max_items)
+        if prepared is None or not prepared.codable or len(prepared.plan.items) > max_items:
             raise DamagedError("damaged message: too many parts")
         values = prepared.blank.copy()
         values[0], values[-1] = header, bytes(tail)
@@ -301,28 +309,26 @@ class FieldsCodec:
             values[index] = (
                 bulk.swapped(value, 8) if big and slot.kind == MATRIX and isinstance(value, bytes) else value
             )
-        self._take_blob(blob, packed, arrays, values)
+        self._take_blob(blob, packed, arrays, values, max_size)
         layout = self._layout(Shape(BIG if big else LITTLE, counts, tuple(texts), tail), header)
-        if layout is None or layout.size > self._max_size:
-            raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
+        if layout is None or layout.size > max_size:
+            raise DamagedError(f"damaged message: larger than {max_size} bytes")
         return layout.pack(*values)
 
-    def _pop_counts(self, x: int, node: Node, taken: list[int]) -> int:
+    def _pop_counts(self, x: int, node: Node, taken: list[int], most: int) -> int:
         if isinstance(node, Composite):
             for _, member in node.members:
-                x = self._pop_counts(x, member, taken)
+                x = self._pop_counts(x, member, taken, most)
         elif isinstance(node, Repeat):
             count = node.count
             if count is None:
                 x, count = pop_natural(x)
-                if count > self._max_size:
-                    raise DamagedError(f"damaged message: a sequence of {count} elements")
                 taken.append(count)
             if is_open(node.element):
                 for _ in range(count):
-                    if len(taken) > MAX_SLOTS:
+                    if len(taken) > most:
                         raise DamagedError("damaged message: too many sequences")
-                    x = self._pop_counts(x, node.element, taken)
+                    x = self._pop_counts(x, node.element, taken, most)
         return x
 
     def _pop_live(self, x: int, prepared: Prepared, values: list[Any]) -> tuple[int, list[tuple[int, int]]]:
@@ -368,12 +374,12 @@ class FieldsCodec:
             raise DamagedError("damaged message: more than was wanted")
         return _remember(self._values, known, tuple(found))
 
-    def _take_blob(self, blob: bytes, packed: int, arrays: Sequence[_Array], values: list[Any]) -> None:
+    def _take_blob(self, blob: bytes, packed: int, arrays: Sequence[_Array], values: list[Any], max_size: int) -> None:
         """Put the arrays and long strings of the second part into their places."""
         size = sum(array.length for array in arrays)
-        if size > self._max_size:
-            raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
-        raw = self._zstd.decompress(blob, self._max_size, size) if packed == _ZSTD else blob
+        if size > max_size:
+            raise DamagedError(f"damaged message: larger than {max_size} bytes")
+        raw = self._zstd.decompress(blob, max_size, size) if packed == _ZSTD else blob
         if len(raw) != size:
             raise DamagedError(f"damaged message: {len(raw)} bytes of arrays instead of {size}")
         big = values[0][1] == 0
@@ -385,8 +391,8 @@ class FieldsCodec:
 
 
 def _remember(memory: dict[_K, _V], key: _K, value: _V) -> _V:
-    """Keep something that can always be made again."""
+    """Keep something that can always be made again, and forget what has been kept for longest."""
     if len(memory) >= _REMEMBERED:
-        memory.clear()
+        del memory[next(iter(memory))]
     memory[key] = value
     return value

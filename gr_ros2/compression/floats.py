@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from struct import Struct
 
 from gr_ros2.compression.number import MASK, SCALE_BITS, Table, pop_natural, pop_rank, push_natural, push_rank
@@ -86,10 +85,13 @@ CLASSES: Mapping[str, FloatClass] = {
 DEFAULT_CLASS = "a"
 
 
-@cache
+_CLASS_TABLES = {letter: made.table() for letter, made in CLASSES.items()}
+"""Made at once, so that no message has to wait for one."""
+
+
 def class_table(letter: str) -> Table:
     """The model of a class (KeyError for an unknown letter)."""
-    return CLASSES[letter].table()
+    return _CLASS_TABLES[letter]
 
 
 class Constants:

@@ -24,6 +24,8 @@ _DICTIONARY_MAGIC = b"\x37\xa4\x30\xec"
 _SINGLE_SEGMENT_WITH_SIZE = b"\xa0"
 """Frame header descriptor: window = content, 4 bytes of content size, no dictionary id, no checksum (RFC 8878)."""
 _COMPRESSED_BLOCK = 2
+_EMPTY_BLOCK = bytes(3)
+"""The header of a raw block of no bytes that is not the last."""
 _MAX_BLOCK = 1 << 21
 
 
@@ -43,8 +45,12 @@ class Zstd:
         }
         self._compressor = zstd.ZstdCompressor(options=options, zstd_dict=self._dictionary)
 
-    def compress(self, data: bytes, sized: bool = True) -> bytes:
-        """The coded form; with ``sized`` false the varint is only the flag, for a size that both ends know."""
+    def compress(self, data: bytes, sized: bool = True, least: int = 0) -> bytes:
+        """The coded form.
+
+        :param sized: false: the varint is only the flag, for a size that both ends know
+        :param least: bytes that the coded form has to have; a shorter one begins with empty blocks
+        """
         frame: bytes = self._compressor.compress(data, self._compressor.FLUSH_FRAME)
         descriptor = frame[4]
         single_segment = descriptor & 0x20
@@ -53,6 +59,9 @@ class Zstd:
         block = int.from_bytes(frame[header : header + 3], "little")
         alone = block & 7 == _COMPRESSED_BLOCK << 1 | 1 and (block >> 3) == len(frame) - header - 3
         body = frame[header + 3 * alone :]
+        if len(body) + 1 < least:
+            alone, body = False, frame[header:]
+            body = _EMPTY_BLOCK * -(-(least - 1 - len(body)) // len(_EMPTY_BLOCK)) + body
         return varint((len(data) if sized else 0) << 1 | alone) + body
 
     def decompress(self, coded: bytes, max_size: int, size: int | None = None) -> bytes:

@@ -9,7 +9,7 @@ that every NaN survives; what is coded how depends on the type and on sequence l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from operator import itemgetter
 from struct import Struct
@@ -38,9 +38,9 @@ _TIME = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, which would make preparing a message for the first time take a third longer
 class Slot:
-    """One thing to code.
+    """One thing to code. Never changed.
 
     :param index: of its (first) item
     :param real: of its (first) item among the floats, -1 for none; BULK: 0 for floats
@@ -74,11 +74,16 @@ class Outline:
     max_items: int = 4 * MAX_PARTS
 
     @property
+    def codable(self) -> bool:
+        """Whether the values are few enough to be coded one by one."""
+        return len(self.live) + len(self.ballast) <= MAX_SLOTS
+
+    @property
     def bulk(self) -> list[Slot]:
         return [slot for slot in self.live if slot.kind == BULK]
 
 
-def outline(tree: Composite, counts: Sequence[int], max_items: int = 4 * MAX_PARTS) -> Outline | None:
+def outline(tree: Composite, counts: Iterable[int], max_items: int = 4 * MAX_PARTS) -> Outline | None:
     """The outline for given sequence lengths; None where there would be more items."""
     made = Outline(max_items=max_items)
     try:

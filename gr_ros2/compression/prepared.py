@@ -12,7 +12,7 @@ from typing import Any
 from gr_ros2.compression.ballast import Value, Words, pop_ballast
 from gr_ros2.compression.floats import DEFAULT_CLASS, Constants, class_table
 from gr_ros2.compression.number import Table
-from gr_ros2.compression.plan import MATRIX, MAX_SLOTS, Outline
+from gr_ros2.compression.plan import MATRIX, Outline
 
 PARTS = 15
 """Symbol for ballast that is none of the type's templates 0..14."""
@@ -39,7 +39,7 @@ class Prepared:
     def __init__(self, plan: Outline, model: Model, counts: tuple[int, ...]) -> None:
         self.plan = plan
         self.counts = counts
-        self.codable = len(plan.live) + len(plan.ballast) <= MAX_SLOTS
+        self.codable = plan.codable
         self.tables = [class_table(model.classes.get(slot.path, DEFAULT_CLASS)) for slot in plan.live]
         self.backward = list(zip(plan.live, self.tables, strict=True))[::-1]
         self.forward = self.backward[::-1]

@@ -92,7 +92,7 @@ class Types:
         self._trees: dict[str, Composite | None] = {}
 
     def tree(self, type_name: str) -> Composite | None:
-        """The tree of a type; None where it is unknown or has a member of a kind we do not know (wstring)."""
+        """The tree of a type; None where it is unknown, or has a wstring or an array of no elements."""
         if type_name not in self._trees:
             try:
                 self._trees[type_name] = self._composite(type_name, ())
@@ -117,6 +117,8 @@ class Types:
         if node_type is Nodetype.NAME:
             return self._composite(detail, above)
         element, length = detail
+        if node_type is Nodetype.ARRAY and not length:
+            raise KeyError("an array of no elements")  # any number of them would fit into no bytes
         node, count = self._node(element, above), length if node_type is Nodetype.ARRAY else None
         return Repeat(node, count, count is None or is_open(node))
 

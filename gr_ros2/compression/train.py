@@ -35,7 +35,6 @@ MAX_WORDS, MAX_CONSTANTS, MAX_TEMPLATES = 1000, 250, 15
 _COMMON = 0.02
 """A constant or ballast is worth a place from this share of a type's messages on."""
 _VALUES_PER_CLASS = 150
-_LARGEST_SIZE = 1 << 20
 
 
 def learn(
@@ -146,7 +145,7 @@ class _Seen:
 
 
 def _codec(tree: Composite | None, model: Model) -> FieldsCodec | None:
-    return None if tree is None else FieldsCodec(tree, model, Zstd(), _LARGEST_SIZE)
+    return None if tree is None else FieldsCodec(tree, model, Zstd())
 
 
 def _bits(kind: int, samples: Sequence[Any], table: Table, constants: Constants) -> int:

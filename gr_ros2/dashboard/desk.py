@@ -51,6 +51,7 @@ class Radio:
 class Desk:
     """A :class:`gr_ros2.run.watch.Watcher` that keeps a snapshot for others to draw."""
 
+    name = "dashboard"
     instruments = True
 
     def __init__(self) -> None:

@@ -8,15 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
-from gr_ros2.dashboard.views import EntryView, PacketView
+from gr_ros2.dashboard.views import PacketView, SpanView
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, WireError, decode, pad_len
+from gr_ros2.wire import QOS_NAMES, Packet, Span, WireError, decode, format_of
 
 NO_COLOUR = -1
 """Of a topic that is not ours."""
-
-_QOS = ("default", "latency", "bulk", "default")
-_SEQ_MODULUS = 256
 
 
 def packet_views(
@@ -39,38 +36,41 @@ def packet_views(
         except WireError as error:
             views.append(PacketView(t - start, len(data), refused=f"{error.kind}: {error}"))
             continue
+        wire = format_of(packet.version)
         before = last_seq.get(packet.src_id)
-        missing = 0 if before is None else (packet.seq - before - 1) % _SEQ_MODULUS
+        missing = 0 if before is None else (packet.seq - before - 1) % (1 << wire.number_bits)
         last_seq[packet.src_id] = packet.seq
-        entries = tuple(
-            EntryView(
-                registry[entry.topic_id].name if entry.topic_id < len(registry) else f"topic {entry.topic_id}",
-                colours.get((packet.src_id, entry.topic_id), NO_COLOUR),
-                entry.entry_id,
-                entry.index,
-                entry.total,
-                len(entry.payload),
-            )
-            for entry in packet.entries
-        )
         views.append(
             PacketView(
                 t - start,
                 len(data),
                 version=packet.version,
-                qos=_QOS[packet.qos],
+                qos=QOS_NAMES[packet.qos],
                 compressed=packet.compressed,
                 encrypted=packet.encrypted,
                 src_id=packet.src_id,
                 dst_id=packet.dst_id,
                 seq=packet.seq,
                 hop=packet.hop,
-                entries=entries,
-                pad=pad_len(packet_len, [len(entry.payload) for entry in packet.entries]),
+                entries=len(packet.entries),
+                spans=tuple(
+                    _span(span, packet.src_id, registry, colours)
+                    for span in wire.layout(packet, packet_len)
+                    if span.size
+                ),
                 missing=missing,
             )
         )
     return tuple(views)
+
+
+def _span(span: Span, src_id: int, registry: Registry, colours: Mapping[tuple[int, int], int]) -> SpanView:
+    entry = span.entry
+    if entry is None:
+        return SpanView(span.kind, span.size)
+    name = registry[entry.topic_id].name if entry.topic_id < len(registry) else f"topic {entry.topic_id}"
+    text = f"{name} {entry.label} {len(entry.payload)} B"
+    return SpanView(span.kind, span.size, text, colours.get((src_id, entry.topic_id), NO_COLOUR))
 
 
 @lru_cache(maxsize=64)

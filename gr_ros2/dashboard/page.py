@@ -263,8 +263,9 @@ class Page:
         document = self.document
         document.title = "gr-ros2 · live"
         texts = [self._html[name] for name in ("tiles", "topics", "paths", "packets")]
-        for root in (*plots, channel, *texts):
-            document.add_root(root)
+        with document.models.freeze():  # otherwise every root makes it walk through all models again
+            for root in (*plots, channel, *texts):
+                document.add_root(root)
         document.template = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=False).get_template(
             "page.html.j2"
         )

@@ -1,16 +1,19 @@
 """The dashboard's web server: one thread of its own beside a run, any number of viewers.
 
-Laws: without a viewer it does little more than count; on a loopback address unless told otherwise, and only pages it
+Laws: without a viewer it does little more than count, and with as many as are let in (``door``) it leaves the link most
+of a core; on a loopback address unless told otherwise, and only pages it
 served itself may talk to it; closing it shows every viewer the last picture first and leaves no thread.
 """
 
 from __future__ import annotations
 
 import asyncio
+import secrets
 import socket
 import threading
 import uuid
 from concurrent.futures import Future
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -20,11 +23,11 @@ from bokeh.document import Document
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
-from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import RequestHandler
 
 from gr_ros2.dashboard.desk import TICK_S, Desk
+from gr_ros2.dashboard.door import SETTINGS, Front, Room, keep
 from gr_ros2.dashboard.page import Page
 from gr_ros2.errors import ConfigError
 from gr_ros2.record.result import Result
@@ -51,6 +54,7 @@ class Dashboard(Desk):
         self.port = port
         self._instance = uuid.uuid4().hex
         self._pages: set[Page] = set()
+        self._room = Room()
         self._loop: IOLoop | None = None
         self._thread: threading.Thread | None = None
 
@@ -69,16 +73,18 @@ class Dashboard(Desk):
 
         :raises ConfigError: when address and port cannot be had
         """
+        if not 0 <= self.port <= 65535:  # a socket would take it modulo 65536
+            raise ConfigError(f"dashboard = {self.address}:{self.port}: a port is 0 to 65535")
         started: Future[None] = Future()
         self._thread = threading.Thread(target=self._serve, args=(started,), name="gr-ros2-dashboard", daemon=True)
         self._thread.start()
         try:
             started.result()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a name that is none is no OSError
             self._thread.join()
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split())
             raise ConfigError(
-                f"dashboard = {self.address}:{self.port}: cannot be served there ({error.strerror or error}); "
-                "choose another port"
+                f"dashboard = {self.address}:{self.port}: cannot be served there ({reason}); choose another port"
             ) from error
 
     def close(self) -> None:
@@ -106,21 +112,11 @@ class Dashboard(Desk):
         asyncio.set_event_loop(asyncio.new_event_loop())
         loop = IOLoop.current()
         try:
-            sockets, self.port = bind_sockets(self.address, self.port)
-        except OSError as error:
+            server = self._build(loop)
+        except Exception as error:  # noqa: BLE001 - raised again by the thread that waits for it
             loop.close(all_fds=True)
             started.set_exception(error)
             return
-        pages = BokehTornado(
-            {"/": Application(FunctionHandler(self._open))},
-            extra_websocket_origins=self._origins(),
-            extra_patterns=[("/alive", _Alive, {"instance": self._instance})],
-            check_unused_sessions_milliseconds=_UNUSED_MS,
-            unused_session_lifetime_milliseconds=_UNUSED_MS,
-        )
-        http = HTTPServer(pages)
-        http.add_sockets(sockets)
-        server = BaseServer(loop, pages, http)
         server.start()
         for callback, seconds in ((self._beat, TICK_S), (self._glance, _LOOK_S)):
             PeriodicCallback(callback, seconds * 1000).start()
@@ -130,16 +126,36 @@ class Dashboard(Desk):
         server.stop()
         loop.close(all_fds=True)
 
+    def _build(self, loop: IOLoop) -> BaseServer:
+        sockets, self.port = bind_sockets(self.address, self.port)
+        pages = BokehTornado(
+            {"/": Application(FunctionHandler(self._open))},
+            extra_websocket_origins=self._origins(),
+            extra_patterns=[("/alive", _Alive, {"instance": self._instance})],
+            check_unused_sessions_milliseconds=_UNUSED_MS,
+            unused_session_lifetime_milliseconds=_UNUSED_MS,
+            secret_key=secrets.token_bytes(32),
+            **SETTINGS,
+        )
+        keep(pages, self._room)
+        http = Front(pages)
+        http.add_sockets(sockets)
+        return BaseServer(loop, pages, http)
+
     def _origins(self) -> list[str]:
         """Hosts by which the page may be opened."""
         hosts = {self.address, "localhost"} if self.address in ("127.0.0.1", "::1") else {self.address}
         if self.address in _ANY:
             name = socket.gethostname()
-            hosts = {"localhost", "127.0.0.1", name, socket.getfqdn(), *socket.gethostbyname_ex(name)[2]}
+            hosts = {"localhost", "127.0.0.1", name, socket.getfqdn()}
+            with suppress(OSError):  # a host that nobody resolves, itself neither
+                hosts.update(socket.gethostbyname_ex(name)[2])
         return [f"{_in_url(host)}:{self.port}" for host in sorted(hosts)]
 
     def _open(self, document: Document) -> None:
         """A viewer comes."""
+        if not self._room.enter(document):
+            return  # a WebSocket came without asking for its page, and there is no room
         page = Page(document, self, self._instance)
         self._pages.add(page)
         document.on_session_destroyed(lambda _context: self._pages.discard(page))

@@ -86,8 +86,10 @@ class _Source:
         """Serial -> topic id, time of submission, digest; until the first fragment leaves."""
         self.away: OrderedDict[tuple[int, int, bytes], float] = OrderedDict()
         """Topic id, entry id, digest -> time of submission."""
-        self.repeats: OrderedDict[Key, None] = OrderedDict()
-        """Topic id and entry id whose latest use was a repeat."""
+        self.left_as: OrderedDict[int, tuple[int, int, bytes]] = OrderedDict()
+        """Serial -> key in ``away``."""
+        self.repeats: OrderedDict[Key, int] = OrderedDict()
+        """Topic id and entry id whose latest use was a repeat -> serial of the message repeated."""
 
 
 class DashboardState:
@@ -345,15 +347,17 @@ class DashboardState:
 
     def _left(self, source: _Source, event: SentPacket) -> None:
         for entry in event.entries:
-            if entry.serial < 0:
-                source.repeats[entry.topic_id, entry.entry_id] = None
+            if entry.repeat:
+                source.repeats[entry.topic_id, entry.entry_id] = entry.serial
                 _bound(source.repeats)
                 continue
             message = source.open.pop(entry.serial, None)
             if message is not None:  # its first fragment
                 topic_id, t_sent, digest = message
                 source.repeats.pop((topic_id, entry.entry_id), None)
+                source.left_as[entry.serial] = (topic_id, entry.entry_id, digest)
                 source.away[topic_id, entry.entry_id, digest] = t_sent
+                _bound(source.left_as)
                 _bound(source.away)
 
     def _delivered(self, event: Delivered, now: float) -> None:
@@ -361,9 +365,13 @@ class DashboardState:
         source = self._sources.get(event.src_id)
         t_sent = None
         if source is not None:
-            t_sent = source.away.pop((event.topic_id, event.entry_id, _digest(event.payload)), None)
-            if t_sent is None and (event.topic_id, event.entry_id) in source.repeats:
-                return
+            digest = _digest(event.payload)
+            t_sent = source.away.pop((event.topic_id, event.entry_id, digest), None)
+            repeated = source.repeats.get((event.topic_id, event.entry_id))
+            if t_sent is None and repeated is not None:
+                t_sent = source.away.pop(source.left_as.get(repeated, (-1, -1, b"")), None)
+                if t_sent is None:
+                    return
         topic = self._topic(key)
         topic.delivered += 1
         topic.delivered_bytes += len(event.payload)

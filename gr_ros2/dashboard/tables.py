@@ -10,9 +10,9 @@ from collections.abc import Callable
 from html import escape
 
 from gr_ros2.dashboard.packets import NO_COLOUR
-from gr_ros2.dashboard.views import PacketView, Snapshot, TopicView
+from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.report.figures import COLOURS, row_colour, row_order
-from gr_ros2.wire import CRC_LEN, ENTRY_HEADER_LEN, HEADER_LEN
+from gr_ros2.wire import BROADCAST
 
 Number = float | int | None
 
@@ -198,17 +198,14 @@ def _packet(packet: PacketView) -> str:
             "</div></div>"
         )
     flags = ("C" if packet.compressed else "") + ("E" if packet.encrypted else "") or "–"
-    to = "all" if packet.dst_id == 255 else str(packet.dst_id)
-    ids = (len(packet.entries) + 1) // 2
-    chips = "".join(
-        f'<i class="entry" style="flex:{entry.size + ENTRY_HEADER_LEN};background:{colour(entry.colour)}">'
-        f"{escape(entry.topic)} #{entry.entry_id} {entry.index + 1}/{entry.total} {entry.size} B</i>"
-        for entry in packet.entries
-    )
-    pad = f'<i class="pad" style="flex:{packet.pad}"></i>' if packet.pad > 0 else ""
+    to = "all" if packet.dst_id == BROADCAST else str(packet.dst_id)
     return (
         f'<div class="packet"><span>{time}</span><span>{packet.version}</span><span>{packet.src_id} → {to}</span>'
         f"<span>{packet.seq}</span><span>{packet.hop}</span><span>{packet.qos}</span><span>{flags}</span>"
-        f'<span>{len(packet.entries)}</span><div class="bytes"><i class="head" style="flex:{HEADER_LEN}"></i>'
-        f'<i class="ids" style="flex:{ids}"></i>{chips}{pad}<i class="crc" style="flex:{CRC_LEN}"></i></div></div>'
+        f'<span>{packet.entries}</span><div class="bytes">{"".join(map(_span, packet.spans))}</div></div>'
     )
+
+
+def _span(span: SpanView) -> str:
+    fill = f";background:{colour(span.colour)}" if span.text else ""
+    return f'<i class="{span.kind}" style="flex:{span.size}{fill}">{escape(span.text)}</i>'

@@ -81,15 +81,19 @@ class SeriesView:
 
 
 @dataclass(frozen=True)
-class EntryView:
-    """One entry of a packet."""
+class SpanView:
+    """A stretch of a packet's bytes.
 
-    topic: str
-    colour: int
-    entry_id: int
-    index: int
-    total: int
+    :param kind: head, ids, entry, pad or crc
+    :param size: bytes
+    :param text: what stands there; '' where that says nothing
+    :param colour: place of an entry's topic in the palette
+    """
+
+    kind: str
     size: int
+    text: str = ""
+    colour: int = 0
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,8 @@ class PacketView:
 
     :param t: s since the start
     :param refused: why it is no packet of ours, '' where it is
+    :param entries: how many
+    :param spans: in the order of its bytes
     :param missing: packets of this source that should have come between the one shown before and this one
     """
 
@@ -112,8 +118,8 @@ class PacketView:
     dst_id: int = 0
     seq: int = 0
     hop: int = 0
-    entries: tuple[EntryView, ...] = ()
-    pad: int = 0
+    entries: int = 0
+    spans: tuple[SpanView, ...] = ()
     missing: int = 0
 
 

@@ -17,8 +17,8 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry
+from gr_ros2.wire import BROADCAST
 
-_MAX_SRC_ID = 255
 _T = TypeVar("_T")
 
 
@@ -107,7 +107,7 @@ def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry
                 "change merge_tf or domain_id"
             )
     for topic in registry:
-        for src_id in range(_MAX_SRC_ID + 1):
+        for src_id in range(BROADCAST + 1):
             name = topic.republished(config.namespace_format, src_id)
             if name in names:
                 raise ConfigError(

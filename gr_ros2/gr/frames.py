@@ -7,15 +7,13 @@ by name; of static transforms the newest of each child frame is kept, at most ``
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from typing import Any, cast
 
 from rosbags.interfaces import Nodetype
-from rosbags.serde import SerdeError
 
 from gr_ros2.middleware import Middleware, Qos
-from gr_ros2.middleware.type_definitions import known, typestore
+from gr_ros2.middleware.type_definitions import DAMAGED, known, typestore
 from gr_ros2.names import filled
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
@@ -26,8 +24,6 @@ _HEADER = "std_msgs/msg/Header"
 _CHILD = "child_frame_id"
 _LITTLE_ENDIAN = 1
 _TF_DEPTH = 100
-_DAMAGED = (SerdeError, struct.error, ValueError, IndexError, AssertionError, OverflowError, MemoryError)
-"""What decoding arbitrary bytes as a type may raise."""
 
 Plan = tuple[tuple[str, bool, Any], ...]
 """Members that hold frame names: name, whether it is a sequence or array, and the plan within (None: a frame name)."""
@@ -166,7 +162,7 @@ def _decode(type_name: str, payload: bytes) -> Any:
         return None
     try:
         return typestore().deserialize_cdr(payload, type_name)
-    except _DAMAGED:
+    except DAMAGED:
         return None
 
 

@@ -11,20 +11,17 @@ import sys
 
 from gr_ros2.errors import WireError
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, decode
-
-_QOS = ("default", "latency", "bulk", "default")
+from gr_ros2.wire import QOS_NAMES, Packet, decode
 
 
 def describe(packet: Packet, registry: Registry) -> str:
     """Header fields, then each entry as topic#entry_id[index/total] and its size."""
     entries = " ".join(
-        f"{_topic(entry.topic_id, registry)}#{entry.entry_id}[{entry.index}/{entry.total}]={len(entry.payload)}B"
-        for entry in packet.entries
+        f"{_topic(entry.topic_id, registry)}{entry.label}={len(entry.payload)}B" for entry in packet.entries
     )
     flags = ("C" if packet.compressed else "") + ("E" if packet.encrypted else "")
     return (
-        f"v{packet.version} qos={_QOS[packet.qos]} flags={flags or '-'} src={packet.src_id} dst={packet.dst_id} "
+        f"v{packet.version} qos={QOS_NAMES[packet.qos]} flags={flags or '-'} src={packet.src_id} dst={packet.dst_id} "
         f"seq={packet.seq} hop={packet.hop} entries={len(packet.entries)}: {entries}"
     )
 

@@ -24,6 +24,7 @@ from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Receiver, ReceiverEvent
 from gr_ros2.link.receiver import PUBLISH_FAILED
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
@@ -50,7 +51,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     :param registry: CSV path or Registry, the same as at the source
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
     :param observer: called with every ReceiverEvent, in order; with Delivered after it was published
-    :param packet_observer: called with the bytes of every PDU before they are read
+    :param packet_observer: called with the bytes of every PDU before they are read; when one of the two raises, neither
+        is told anything more
     :param clock: s, monotonic
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
     :raises ConfigError: naming key, value and what is allowed
@@ -74,6 +76,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self.registry = self._receiver.registry
         self._observer = observer
         self._packet_observer = packet_observer
+        self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
         self._lock = threading.Lock()
@@ -86,7 +89,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
         # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered anew. At most 256 senders (the id has 8 bits) of as many topics as the registry has, 16 at most.
+        # discovered anew. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._published: Counter[tuple[int, int]] = Counter()
@@ -169,6 +172,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
                 **{name: self._counters[name] for name in _COUNTED},
+                "observer_missed": self._guard.missed,
                 "repeats": stats.repeats,
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
@@ -238,7 +242,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
             return
         if self._packet_observer is not None:
-            self._packet_observer(data)
+            self._guard(self._packet_observer, data)
         if self.config.debug:
             self._log.debug("rx %s", describe_bytes(data, self.config.packet_len, self.registry))
         with self._lock:
@@ -253,7 +257,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             try:
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
-                    self._observer(result)
+                    self._guard(self._observer, result)
             except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
                 self._failed(error)
 

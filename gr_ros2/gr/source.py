@@ -25,6 +25,7 @@ from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, set
 from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe_bytes
+from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, Sender, SenderEvent
 from gr_ros2.link.events import LOST_ON_GRAPH
 from gr_ros2.middleware import Middleware, Qos, Subscription
@@ -51,7 +52,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     :param registry: CSV path or Registry
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
-    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back
+    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back; when it
+        raises, it is told nothing more
     :param clock: s, monotonic
     :param seed: of sequence number and entry ids; None is random
     :param settings: the fields of :class:`gr_ros2.config.SourceConfig`
@@ -75,6 +77,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._sender = Sender(rows, self.config, codec=codec, rng=random.Random(seed), observer=self._observe)
         self.registry = self._sender.registry
         self._observer = observer
+        self._guard = Guard(f"observer of ros2_source {self._sender.src_id}")
         self._clock = clock
         self._pdus = PduMaker()
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -200,6 +203,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "payload_bytes": stats.payload_bytes,
                 "repeats": stats.repeats,
                 **{name: self._counters[name] for name in _COUNTED},
+                "observer_missed": self._guard.missed,
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
@@ -301,7 +305,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         while self._running:
             try:
                 self._emit(self._compose())
-            except Exception as error:  # noqa: BLE001 - a failing observer must not end all transmission
+            except Exception as error:  # noqa: BLE001 - raised here, it would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1
                     first = self._counters["pump_failed"] == 1
@@ -342,4 +346,4 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             level = logging.INFO if event.reason == "superseded" else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
-            self._observer(event)
+            self._guard(self._observer, event)

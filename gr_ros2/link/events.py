@@ -89,13 +89,17 @@ class Missed:
 
 @dataclass(frozen=True, slots=True)
 class SentEntry:
-    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial`` (-1: a repeat)."""
+    """One entry of a packet that left: fragment ``index`` of ``total`` of message ``serial``.
+
+    ``repeat`` says that the message has been sent before, and is sent again for robots that come late.
+    """
 
     serial: int
     topic_id: int
     entry_id: int
     index: int
     total: int
+    repeat: bool = False
 
 
 @dataclass(frozen=True, slots=True)

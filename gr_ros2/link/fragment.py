@@ -10,44 +10,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gr_ros2.config import MAX_PACKET_LEN, SINGLE_ENTRY_OVERHEAD
-from gr_ros2.wire import MAX_TOTAL, Entry, equal_entry_payload, single_entry_payload
+from gr_ros2.wire import Format
 
 
-def largest_message(packet_len: int) -> int:
-    """Bytes of the largest message that 255 entries can carry."""
-    return MAX_TOTAL * single_entry_payload(packet_len)
-
-
-def smallest_packet_len(size: int) -> int | None:
-    """Smallest packet_len that carries a message of ``size`` bytes, None where none does."""
-    packet_len = max(-(-size // MAX_TOTAL), 1) + SINGLE_ENTRY_OVERHEAD
-    return packet_len if packet_len <= MAX_PACKET_LEN else None
-
-
-def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: int) -> int:
+def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: int, wire_format: Format) -> int:
     """Length of the fragments of a message of ``size`` bytes whose first entry is about to be sent.
 
-    Two or more pending topics share packets, k = max(k*(2), k_min); one alone fills them, k = packet_len - 13.
-    A message that would need more than 255 entries at that k is cut at packet_len - 13.
+    Two or more pending topics share packets, k = max(k*(2), k_min); one alone fills them. A message that would need
+    more fragments than it may have at that k is cut to fill packets.
     """
-    alone = single_entry_payload(packet_len)
+    alone = wire_format.single_entry_payload(packet_len)
     if pending_topics < 2:
         return alone
-    shared = max(equal_entry_payload(packet_len, 2), min_fragment)
-    return shared if -(-size // shared) <= MAX_TOTAL else alone
+    shared = max(wire_format.equal_entry_payload(packet_len, 2), min_fragment)
+    return shared if -(-size // shared) <= wire_format.max_fragments else alone
 
 
 @dataclass(slots=True, eq=False)
 class Outgoing:
     """A message on its way out.
 
-    :param serial: number of the submitted message; -1 for a repeat of a transient-local one
+    :param serial: number of the submitted message
     :param payload: what goes on the air: the message, coded where the link compresses
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
     :param weight: what its age counts beside that of other topics
     :param expires: time after which it is of no use, s
+    :param repeat: it was sent before, and goes again for robots that come late (transient-local topics)
     :param entry_id: its name on the air, -1 until its first fragment leaves
     :param cut: most bytes that any fragment still to come needs to take, 0 until it is cut
     :param index: next fragment to send
@@ -61,6 +50,7 @@ class Outgoing:
     submitted: float
     weight: float = 1.0
     expires: float = float("inf")
+    repeat: bool = False
     entry_id: int = -1
     cut: int = 0
     total: int = 0
@@ -84,13 +74,12 @@ class Outgoing:
         """Bytes not yet sent."""
         return len(self.payload) - self.offset
 
-    def take(self, length: int) -> Entry:
+    def take(self, length: int) -> bytes:
         """The next fragment, of that many bytes."""
         payload = self.payload[self.offset : self.offset + length]
-        entry = Entry(self.topic_id, self.entry_id, self.index, self.total, payload)
         self.index += 1
         self.offset += length
-        return entry
+        return payload
 
     @property
     def done(self) -> bool:

@@ -27,17 +27,7 @@ from gr_ros2.config import SourceConfig
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.schedule import Plan
 from gr_ros2.registry import Registry
-from gr_ros2.wire import (
-    ENTRY_HEADER_LEN,
-    MAX_ENTRIES,
-    MAX_TOTAL,
-    QOS_BULK,
-    QOS_DEFAULT,
-    QOS_LATENCY,
-    equal_entry_payload,
-    overhead,
-    single_entry_payload,
-)
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Format
 
 TURN = 4
 """Every so manieth packet belongs to the topic that has waited longest for one."""
@@ -46,8 +36,6 @@ FIRST_AGE_S = 1.0
 LARGE = 4
 """Packets from which on a message is cut with slack, to fill what others leave in packets."""
 
-_SHARE = ENTRY_HEADER_LEN + 1
-"""Bytes a second entry costs a packet beside its payload."""
 _RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
 
 Queues = Mapping[int, Sequence[Outgoing]]
@@ -56,7 +44,8 @@ Queues = Mapping[int, Sequence[Outgoing]]
 class _Packing:
     """A packet being filled. ``keep``: payload bytes of one more entry that what is added must leave room for."""
 
-    def __init__(self, packet_len: int) -> None:
+    def __init__(self, wire_format: Format, packet_len: int) -> None:
+        self._room = wire_format.room
         self._packet_len = packet_len
         self.picks: list[Outgoing] = []
         self.lengths: list[int] = []
@@ -65,10 +54,7 @@ class _Packing:
 
     def room(self) -> int:
         """Payload bytes a further entry may have; not above 0 where none fits."""
-        entries = len(self.picks) + (2 if self.keep else 1)
-        if entries > MAX_ENTRIES:
-            return 0
-        return self._packet_len - overhead(entries) - entries * ENTRY_HEADER_LEN - self._payload - self.keep
+        return self._room(self._packet_len, len(self.picks) + (self.keep > 0), self._payload + self.keep)
 
     def add(self, message: Outgoing, length: int) -> None:
         self.picks.append(message)
@@ -82,10 +68,12 @@ class FreshnessScheduler:
     :param registry: says which topics are of class latency
     """
 
-    def __init__(self, config: SourceConfig, registry: Registry) -> None:
+    def __init__(self, config: SourceConfig, registry: Registry, wire_format: Format) -> None:
         self.config = config
-        self._single = single_entry_payload(config.packet_len)
-        self._half = max(equal_entry_payload(config.packet_len, 2), 0)
+        self._format = wire_format
+        self._share = wire_format.entry_cost
+        self._single = wire_format.single_entry_payload(config.packet_len)
+        self._half = max(wire_format.equal_entry_payload(config.packet_len, 2), 0)
         self._alone = len(registry) == 1
         self._latency = {topic.topic_id for topic in registry if topic.options.qos == "latency"}
         self._urgent = min(config.min_fragment, self._half)
@@ -105,7 +93,7 @@ class FreshnessScheduler:
         self._line += [topic_id for topic_id in pending if topic_id not in self._line]
         for topic_id in self._latency.intersection(pending):
             self._urgent = max(self._urgent, min(len(queues[topic_id][0].payload), self._half))
-        packing = _Packing(self.config.packet_len)
+        packing = _Packing(self._format, self.config.packet_len)
         self._holder = -1
         if self._packets % TURN == TURN - 1:
             holder = self._holder = next(topic_id for topic_id in self._line if topic_id in pending)
@@ -135,7 +123,7 @@ class FreshnessScheduler:
         for topic_id in topic_ids:
             head = queues[topic_id][0]
             before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
-            heap.append((_RANK[head.qos], -_value(head, before), topic_id, 0))
+            heap.append((_RANK[head.qos], -self._value(head, before), topic_id, 0))
         heapify(heap)
         while heap and packing.room() > 0:
             _, _, topic_id, position = heappop(heap)
@@ -143,7 +131,7 @@ class FreshnessScheduler:
             message = queue[position]
             if self._add(packing, message) and position + 1 < len(queue):
                 following = queue[position + 1]
-                value = _value(following, message.submitted)
+                value = self._value(following, message.submitted)
                 heappush(heap, (_RANK[following.qos], -value, topic_id, position + 1))
 
     def _add(self, packing: _Packing, message: Outgoing) -> bool:
@@ -177,8 +165,9 @@ class FreshnessScheduler:
         if not chosen and 1 < packets < LARGE and -(-(size - room) // self._single) == packets:
             return False  # it would be older when it is complete, and need as many packets
         cut = self._most(message)
-        if -(-(size - room) // cut) >= MAX_TOTAL:
-            cut = -(-(size - room) // (MAX_TOTAL - 1))
+        most = self._format.max_fragments
+        if -(-(size - room) // cut) >= most:
+            cut = -(-(size - room) // (most - 1))
         message.total, message.cut = 1 + -(-(size - room) // cut), cut
         return cut <= self._single
 
@@ -186,7 +175,7 @@ class FreshnessScheduler:
         """Most bytes that a later fragment of a message should need."""
         cut = self._single
         if self._latency - {message.topic_id} and self._half:
-            cut -= self._urgent + _SHARE
+            cut -= self._urgent + self._share
         if not self._alone and len(message.payload) > (LARGE - 1) * self._single:
             cut = min(cut, 3 * self._single // 4)
         return max(cut, 1)
@@ -197,8 +186,7 @@ class FreshnessScheduler:
             return min(message.cut, message.remaining - (message.total - message.index - 1))
         return max(min(len(message.payload), self._most(message)), 1)
 
-
-def _value(message: Outgoing, before: float) -> float:
-    """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
-    younger = message.submitted - before
-    return message.weight * younger * younger / (message.remaining + _SHARE)
+    def _value(self, message: Outgoing, before: float) -> float:
+        """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
+        younger = message.submitted - before
+        return message.weight * younger * younger / (message.remaining + self._share)

@@ -9,6 +9,10 @@ paper's) repeats itself soon. What protects a message, besides its id:
   an entry whose place among the topic's recent ones does not agree with its packet's sequence number is of another
   time: held messages end and it begins a new one. While no packet has been missed this is not asked, so messages of
   a topic may interleave on a clean link.
+- *Rules broken*: between two entries with no packet missed, an orderly sender goes on with a message or begins one at
+  index 0, and uses no id for two messages. Of a sender that does otherwise nothing is held across a missed packet, and
+  a message takes its next fragment only. So messages of a topic may still interleave on a clean link; fragments in
+  another order, and two messages under one id, are refused.
 - *Reset* (see ``sequence``): a restart or outage seen in the packet numbers ends everything held of the source.
 
 Laws: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
@@ -21,7 +25,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from gr_ros2.link.sequence import Pace
-from gr_ros2.wire import Entry
+from gr_ros2.wire import unwrap
+from gr_ros2.wire.v0 import V0, Entry
 
 OVERTAKEN = 64
 _PATIENT = 192
@@ -47,11 +52,19 @@ class Partial:
     last: float
     fragments: dict[int, bytes] = field(default_factory=dict)
     size: int = 0
+    following: int = 0
+    """The index that an orderly sender sends next."""
+    doubtful: bool = False
+    """Whether the sender used its id for another message at the same time."""
 
     def contradicts(self, entry: Entry, flags: int) -> bool:
         """Whether an entry of the same id cannot be of this message."""
         held = self.fragments.get(entry.index)
         return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
+
+    def goes_on_with(self, entry: Entry) -> bool:
+        """Whether an entry is the next of this message, or one that it has already."""
+        return not self.doubtful and (entry.index == self.following or entry.index in self.fragments)
 
     def add(self, entry: Entry, now: float) -> int:
         """Hold a fragment; returns by how many bytes the memory in use grew."""
@@ -59,6 +72,7 @@ class Partial:
         if entry.index in self.fragments:
             return 0
         self.fragments[entry.index] = entry.payload
+        self.following = entry.index + 1
         cost = len(entry.payload) + _FRAGMENT_COST
         self.size += cost
         return cost
@@ -77,7 +91,8 @@ class Context:
     """What the packet of an entry says about it.
 
     :param position: unwrapped sequence number
-    :param epoch: counts the packets of this source that were missed, late or reset so far
+    :param epoch: counts the breaks in the order of this source's packets: at a gap, before and after a late one, at a
+        reset. Between two packets of one epoch none was missed
     :param steady: the packet directly follows the one before
     :param flags: C and E bits, the same for all fragments of a message
     """
@@ -101,6 +116,8 @@ class TopicReassembler:
         """(packet position, message number, index, epoch) of the last entries."""
         self._latest = self._settled = _NOWHERE
         """The furthest (message number, index) seen at all, and before the last packet that was missed."""
+        self._orderly = True
+        """Whether the sender has kept to the rules since the last reset."""
         self._epoch = 0
         self._top = -1
         """The furthest packet position that had an entry of this topic."""
@@ -113,25 +130,37 @@ class TopicReassembler:
         """
         ended: list[Partial] = []
         number = self._number(entry.entry_id)
+        clean = bool(self._history) and self._history[-1][3] == context.epoch
+        if entry.index and clean and self._orderly:
+            _, last, last_index, _ = self._history[-1]
+            self._orderly = number == last and last_index <= entry.index <= last_index + 1
+        if self.partials and not (clean or self._orderly):
+            ended += self.clear()
         if self._out_of_order(number, entry.index, context):
             ended += self.clear()
             self._history.clear()
             number += _RESTART_JUMP
             self._latest = self._settled = _NOWHERE
-        self._advance(number, entry.index, context.now)
+        self._advance(number, entry.entry_id, entry.index, context.now)
         self._history.append((context.position, number, entry.index, context.epoch))
         self._latest = max(self._latest, (number, entry.index))
         self._top = max(self._top, context.position)
+        doubtful = False
         if self.partials:
             ended += self._overtaken(context)
             held = self.partials.get(entry.entry_id)
-            if held is not None and held.contradicts(entry, context.flags):
-                ended.append(self.partials.pop(entry.entry_id))
+            if held is not None:
+                contradicts = held.contradicts(entry, context.flags)
+                self._orderly &= not (contradicts and clean)
+                if contradicts or not (self._orderly or held.goes_on_with(entry)):
+                    ended.append(self.partials.pop(entry.entry_id))
+                    doubtful = not self._orderly
         if entry.total == 1:
             return entry.payload, ended
         partial = self.partials.get(entry.entry_id)
         if partial is None:
             partial = Partial(self.topic_id, entry.entry_id, number, entry.total, context.flags, context.now)
+            partial.doubtful = doubtful
             self.partials[entry.entry_id] = partial
         return partial, ended
 
@@ -146,14 +175,15 @@ class TopicReassembler:
         self._newest = None
         self._latest = self._settled = _NOWHERE
         self._history.clear()
+        self._orderly = True
         self._pace = Pace(window=16, least=8)
         return self.clear()
 
     def _number(self, entry_id: int) -> int:
-        """An entry id unwrapped: up to 64 behind the newest it is an older message, otherwise a newer one."""
+        """An entry id unwrapped: less than 64 behind the newest it is an older message, otherwise a newer one."""
         if self._newest is None:
             return entry_id
-        return self._newest + (entry_id - self._newest + OVERTAKEN & 255) - OVERTAKEN
+        return unwrap(entry_id, self._newest - OVERTAKEN + 1, V0.id_bits)  # further back a message is overtaken
 
     def _out_of_order(self, number: int, index: int, context: Context) -> bool:
         """Whether an entry's place in its topic disagrees with its packet's, other than on a link without loss."""
@@ -169,7 +199,7 @@ class TopicReassembler:
                     return True
         return False
 
-    def _advance(self, number: int, index: int, now: float) -> None:
+    def _advance(self, number: int, entry_id: int, index: int, now: float) -> None:
         """Follow the newest message, and count those never seen."""
         if self._newest is None or number - self._newest >= _RESTART_JUMP // 2:
             self._newest = number
@@ -178,7 +208,7 @@ class TopicReassembler:
             self.missed_ids += number - self._newest - 1
             self._pace.observe(now, number - self._newest)
             self._newest = number
-        elif number < self._newest and index == 0 and self.missed_ids and number & 255 not in self.partials:
+        elif number < self._newest and index == 0 and self.missed_ids and entry_id not in self.partials:
             self.missed_ids -= 1
 
     def _overtaken(self, context: Context) -> Iterator[Partial]:

@@ -10,14 +10,15 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from gr_ros2.config import BROADCAST, SinkConfig
+from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, Rejected
 from gr_ros2.link.reassemble import Context, Partial, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, decode
+from gr_ros2.wire import BROADCAST
+from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
 """A source silent for so long gives its place to a new one when ``max_sources`` are known."""
@@ -90,7 +91,7 @@ class Receiver:
         """Take the bytes of one packet; the events it causes, in order."""
         events = self.handle_timeout(now)
         try:
-            packet = decode(data, self.config.packet_len)
+            packet = V0.decode(data, self.config.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             return self._report(events, [Rejected(error)])
@@ -194,6 +195,7 @@ class Receiver:
                 self._release(result)
                 result = result.payload()
             events += self._deliver(source, packet, entry.topic_id, entry.entry_id, result)
+        source.epoch += placed.arrival is Arrival.LATE
         events += self._bound(source, packet.src_id)
         return events
 

@@ -14,7 +14,7 @@ from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.config import SourceConfig
 from gr_ros2.link.fragment import Outgoing, fragment_len
 from gr_ros2.registry import Registry
-from gr_ros2.wire import ENTRY_HEADER_LEN, MAX_ENTRIES, overhead
+from gr_ros2.wire import Format
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Plan:
 
 
 class Scheduler(Protocol):
-    """Chooses what goes into the next packet. Made of the source's configuration and its registry."""
+    """Chooses what goes into the next packet. Made of the source's configuration, its registry and its wire format."""
 
     config: SourceConfig
 
@@ -49,8 +49,9 @@ class PaperScheduler:
     A topic that got an entry goes to the end of the line; one whose next fragment did not fit keeps its place.
     """
 
-    def __init__(self, config: SourceConfig, registry: Registry) -> None:  # noqa: ARG002 - all topics are alike
+    def __init__(self, config: SourceConfig, registry: Registry, wire_format: Format) -> None:  # noqa: ARG002 - all topics are alike
         self.config = config
+        self._format = wire_format
         self._line: list[int] = []
 
     def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
@@ -58,13 +59,13 @@ class PaperScheduler:
         if not pending:
             return None
         self._line += [topic_id for topic_id in pending if topic_id not in self._line]
-        config = self.config
+        config, wire = self.config, self._format
         picks: list[Outgoing] = []
         chosen: list[int] = []
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
-                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
+                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment, wire)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
                 chosen += lengths
@@ -72,20 +73,19 @@ class PaperScheduler:
                 whole = message.index + len(lengths) == message.total
                 if not (config.greedy and lengths and whole):
                     break
-            if len(picks) == MAX_ENTRIES:
+            if len(picks) == wire.max_entries:
                 break
-        room = config.packet_len - overhead(len(picks) + 1) - (len(picks) + 1) * ENTRY_HEADER_LEN - payload
-        return Plan(tuple(picks), tuple(chosen), len(picks) == MAX_ENTRIES or room < config.min_fragment)
+        room = wire.room(config.packet_len, len(picks), payload)
+        return Plan(tuple(picks), tuple(chosen), room < config.min_fragment)
 
     def _fitting(self, message: Outgoing, cut: int, entries: int, payload: int) -> list[int]:
         """Lengths of the next fragments of a message that fit beside ``entries`` with ``payload`` bytes."""
         lengths: list[int] = []
         length = message.plan(cut)
         index, remaining = message.index, message.remaining
-        most = MAX_ENTRIES - entries if self.config.greedy else min(1, MAX_ENTRIES - entries)
+        most = self._format.max_entries if self.config.greedy else 1
         while len(lengths) < most and index < message.total:
-            count = entries + len(lengths) + 1
-            if overhead(count) + count * ENTRY_HEADER_LEN + payload + length > self.config.packet_len:
+            if length > self._format.room(self.config.packet_len, entries + len(lengths), payload):
                 break
             lengths.append(length)
             payload += length

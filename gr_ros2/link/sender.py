@@ -20,13 +20,13 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
-from gr_ros2.link.fragment import Outgoing, largest_message, smallest_packet_len
+from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.registry import Registry, Topic
-from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Packet, encode, single_entry_payload
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
+from gr_ros2.wire.v0 import V0, Entry, Packet
 
-QOS_CODES = {"default": QOS_DEFAULT, "latency": QOS_LATENCY, "bulk": QOS_BULK}
 LIVE_SETTINGS = ("packet_rate", "flush_timeout", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that make sense to change while running."""
 
@@ -78,8 +78,8 @@ class Sender:
         self._rng = rng if rng is not None else random.Random()
         self._observer = observer
         self._codec = codec
-        self._largest = largest_message(config.packet_len)
-        self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry)
+        self._largest = V0.largest_message(config.packet_len)
+        self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry, V0)
         self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
         self._with_deadline = self._deadlines()
         self._capped = any(topic.options.max_rate for topic in self.registry)
@@ -87,15 +87,17 @@ class Sender:
         self._plan_until = -inf
         """When the plan is out of date though nothing has happened; -inf: something has."""
         self._now = -inf
-        self._next_id = [self._rng.randrange(256) for _ in self.registry]
-        self._seq = self._rng.randrange(256)
+        self._ids, self._numbers = 1 << V0.id_bits, 1 << V0.number_bits
+        self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
+        self._seq = self._rng.randrange(self._numbers)
         self._serial = 0
         self._slot = -inf
         self._credits: int | None = None
         self._busy_since = inf
         """When the last packet left, if another was waiting for a credit then."""
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
-        self._latched: dict[int, bytes] = {}
+        self._latched: dict[int, tuple[int, bytes]] = {}
+        """Serial and coded bytes of the message that late robots are to get, per topic."""
         self._repeat_at: dict[int, float] = {}
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
@@ -120,12 +122,13 @@ class Sender:
             self._refuse(serial, topic_id, "too_large", self._too_large(len(payload)))
             return
         topic = self.registry[topic_id]
-        message = Outgoing(serial, topic_id, payload, QOS_CODES[topic.options.qos], now, topic.options.weight)
+        options = topic.options
+        message = Outgoing(serial, topic_id, payload, QOS_NAMES.index(options.qos), now, options.weight)
         if dropped := self._queues[topic_id].admit(message, self.depth(topic_id)):
             self._drop(dropped)
         self._changed(now)
         if topic.latched:
-            self._latched[topic_id] = payload
+            self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.config.repeat_s
 
     def missed(self, topic_id: int, total: int) -> None:
@@ -271,7 +274,7 @@ class Sender:
         """Drop what is too late, or would be."""
         for queue in self._with_deadline:
             if queue:
-                payload = single_entry_payload(self.config.packet_len)
+                payload = V0.single_entry_payload(self.config.packet_len)
                 late = list(queue.expire(now, self.interval, LEAD_S, payload))
                 if late:
                     self._drop(late)
@@ -279,8 +282,13 @@ class Sender:
 
     def _drop(self, dropped: Iterable[Dropped]) -> None:
         for item in dropped:
-            if item.message.serial >= 0:
-                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+            message = item.message
+            if message.repeat:
+                continue
+            self._refuse(message.serial, message.topic_id, item.row, item.detail)
+            if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
+                # It is of no use any more, or there is a newer one: refused is refused, for late robots too.
+                del self._latched[message.topic_id], self._repeat_at[message.topic_id]
 
     def _spend_credit(self, now: float) -> None:
         """A packet left for a credit; where each had to wait for its own, learn how far apart they come."""
@@ -306,12 +314,14 @@ class Sender:
             if not message.started:
                 message.entry_id = self._take_id(message.topic_id)
                 self._queues[message.topic_id].started(now)
-            entry = message.take(length)
+            entry = Entry(message.topic_id, message.entry_id, message.index, message.total, message.take(length))
             entries.append(entry)
-            record.append(SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total))
+            record.append(
+                SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total, message.repeat)
+            )
             if message.done:
                 self._queues[message.topic_id].popleft()
-                self.stats.sent[message.topic_id] += message.serial >= 0
+                self.stats.sent[message.topic_id] += not message.repeat
         packet = Packet(
             self.src_id,
             config.dst_id,
@@ -321,8 +331,8 @@ class Sender:
             qos=_packet_qos(plan),
             compressed=self._codec is not None,
         )
-        data = encode(packet, config.packet_len)
-        self._seq = (self._seq + 1) & 255
+        data = V0.encode(packet, config.packet_len)
+        self._seq = (self._seq + 1) % self._numbers
         self._scheduler.sent(plan)
         self._changed(now)
         stats = self.stats
@@ -334,9 +344,9 @@ class Sender:
 
     def _take_id(self, topic_id: int) -> int:
         if self.config.entry_ids == "random":
-            return self._rng.randrange(256)
+            return self._rng.randrange(self._ids)
         entry_id = self._next_id[topic_id]
-        self._next_id[topic_id] = (entry_id + 1) & 255
+        self._next_id[topic_id] = (entry_id + 1) % self._ids
         return entry_id
 
     def _repeat(self, now: float) -> None:
@@ -348,15 +358,17 @@ class Sender:
                 self._repeat_at[topic_id] = now + self.config.repeat_s
                 if not self._queues[topic_id]:
                     weight = self.registry[topic_id].options.weight
-                    repeat = Outgoing(-1, topic_id, self._latched[topic_id], QOS_BULK, now, weight)
-                    self._queues[topic_id].append(repeat)
+                    serial, payload = self._latched[topic_id]
+                    self._queues[topic_id].append(
+                        Outgoing(serial, topic_id, payload, QOS_BULK, now, weight, repeat=True)
+                    )
                     self.stats.repeats += 1
                     self._changed(now)
 
     def _too_large(self, size: int) -> str:
-        needed = smallest_packet_len(size)
+        needed = V0.smallest_packet_len(size)
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
-        return f"{size} bytes need over 255 entries at packet_len {self.config.packet_len}; {remedy}"
+        return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
 
     def _refuse(self, serial: int, topic_id: int, reason: str, detail: str) -> None:
         self.stats.refused[topic_id, reason] += 1

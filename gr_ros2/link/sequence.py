@@ -1,6 +1,6 @@
 """Sequence numbers of one source: their order, their gaps, and the signs that a new sender counts from elsewhere.
 
-Laws: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only 8 bits;
+Laws: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only a few bits;
 after a reset positions start so far ahead that nothing earlier compares as near.
 """
 
@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from enum import Enum
 from math import inf
 
+from gr_ros2.wire import unwrap
+from gr_ros2.wire.v0 import V0
+
 RECENT_PACKETS = 64
 """How far back a packet with the same number and bytes is a duplicate."""
-_REMEMBERED = 128
-"""How far back packets are remembered: a step is read as -128..127, so further back nothing can be met again."""
+_REMEMBERED = 1 << V0.number_bits - 1
+"""How far back packets are remembered: half the numbers are read as steps back, further back nothing is met again."""
 LATEST_S = 0.5
 """How late, in seconds at the recent pace, a packet may come and still be one of this numbering."""
 EARLIEST_S = 2.0
@@ -94,8 +97,8 @@ class SequenceTracker:
         if self._newest is None:
             return self._accept(Placed(Arrival.NEXT, seq), data, now, 1)
         newest = self._newest
-        step = (seq - newest + 128 & 255) - 128
-        position = newest + step
+        position = unwrap(seq, newest - _REMEMBERED, V0.number_bits)
+        step = position - newest
         seen = self._recent.get(position)
         if seen == data and newest - position < RECENT_PACKETS:
             return Placed(Arrival.DUPLICATE, position)

@@ -16,7 +16,7 @@ from typing import Literal
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
-from gr_ros2.middleware.bag_files import BagMessage, bag_definitions, bag_topics, read_bag
+from gr_ros2.middleware.bag_files import BagContents, BagMessage, bag_contents, bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.registry import normalize_type
@@ -86,7 +86,9 @@ class BagMiddleware(Middleware):
     :param speed: times the recorded speed; 0 = as fast as the callbacks return
     :param mode: ``read`` or ``write``
     :param storage: of a bag being written: ``mcap`` or ``sqlite3``
-    :param definitions: ``.msg`` texts of types that ROS does not ship, by type name, written into the bag
+    :param definitions: ``.msg`` texts by type name, written into the bag; of other types ROS's
+    :param lossless: of a bag being written: publishing waits for a slow disk; else what it cannot take is counted as
+        ``not_recorded:/topic``
     :param domain_id: a bag has no domain: taken, so that all back-ends can be asked alike, and not used; likewise
         node_name and namespace
     :raises ConfigError: a setting is out of range
@@ -103,6 +105,7 @@ class BagMiddleware(Middleware):
         mode: Literal["read", "write"] = "read",
         storage: Literal["mcap", "sqlite3"] = "mcap",
         definitions: Mapping[str, str] | None = None,
+        lossless: bool = True,
         domain_id: int = -1,  # noqa: ARG002
         node_name: str = "gr_ros2",  # noqa: ARG002
         namespace: str = "/",  # noqa: ARG002
@@ -120,8 +123,14 @@ class BagMiddleware(Middleware):
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._subscriptions: dict[str, list[BagSubscription]] = {}
-        self._recorder = BagRecorder(self.path, storage, definitions or {}, self.count) if mode == "write" else None
-        self._topics = {info.topic: info for info in bag_topics(self.path)} if mode == "read" else {}
+        self._recorder = (
+            BagRecorder(self.path, storage, definitions or {}, self.count, lossless=lossless)
+            if mode == "write"
+            else None
+        )
+        self._contents = bag_contents(self.path) if mode == "read" else BagContents(self.path, {}, {}, ())
+        for line in self._contents.differences:
+            self.count("bag_differs", line)
 
     # Reading
 
@@ -134,16 +143,15 @@ class BagMiddleware(Middleware):
     ) -> BagSubscription:
         """See base; nothing can be subscribed after :meth:`start`.
 
-        :raises ConfigError: the bag has the topic with another type
+        :raises ConfigError: the bag has the topic with another type, or as one that cannot be carried
         """
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
         self._reading(f"subscribe {topic}")
-        info = self._topics.get(topic)
-        if info is None:
-            _log.warning("bag %s: has no topic %s; it has %s", self.path, topic, ", ".join(self._topics) or "none")
-        elif info.type_name != type_name:
-            raise ConfigError(f"bag {self.path}: {topic} is {info.type_name}, not {type_name}")
-        subscription = BagSubscription(topic, callback, info.publishers if info else ())
+        self._contents.check(topic, type_name)
+        topics = self._contents.topics
+        if topic not in topics:
+            _log.warning("bag %s: has no topic %s; it has %s", self.path, topic, ", ".join(topics) or "none")
+        subscription = BagSubscription(topic, callback, topics[topic].info.publishers if topic in topics else ())
         with self._starting:
             if self._thread is not None:
                 raise MiddlewareError(f"subscribe {topic}: bag {self.path} is playing; subscribe before start()")
@@ -151,8 +159,11 @@ class BagMiddleware(Middleware):
         return subscription
 
     def discover(self) -> list[TopicInfo]:
-        """The topics of the bag that is read, with the QoS offered when it was recorded; none of one being written."""
-        return list(self._topics.values())
+        """The topics of the bag that is read, with the QoS offered when it was recorded; none of one being written.
+
+        Those that cannot be carried are no part of it.
+        """
+        return [topic.info for topic in self._contents.topics.values()]
 
     def start(self) -> None:
         """Begin to play; the second call does nothing. A bag being written needs no start."""

@@ -1,28 +1,49 @@
 """What stands in a ROS 2 bag, MCAP or sqlite3: a folder with metadata.yaml, or a bare storage file.
 
-Law: reading changes nothing, and whatever is wrong with a file is a BagError in one line that names it.
+Laws: reading changes nothing, and whatever is wrong with a file is a BagError in one line that names it. The files say
+what is in a bag; metadata.yaml says which files, and what was expected in them. A topic is given whole, under its
+absolute name and with one type and definition, or it is left out with the reason; messages are counted, and fewer than
+the file's own index has are an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import logging
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
+    MessageDefinition,
     MessageDefinitionFormat,
     QosDurability,
     QosHistory,
     QosReliability,
     QosTime,
 )
+from rosbags.interfaces import Qos as Profile
 from rosbags.rosbag2 import Reader
+from rosbags.rosbag2.reader import DirectoryReader
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.middleware.bag_mcap import McapStorage
+from gr_ros2.middleware.bag_sqlite import SqliteStorage
 from gr_ros2.middleware.base import Qos, TopicInfo, finite
+from gr_ros2.middleware.ros_graph import check_topic
+from gr_ros2.middleware.type_definitions import same_type
+from gr_ros2.registry import normalize_type
+
+_CDR = "cdr"
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+_MESSAGE_TYPE = re.compile(r"\w+/msg/\w+")
+
+_log = logging.getLogger(__name__)
 
 
 class BagMessage(NamedTuple):
@@ -32,6 +53,62 @@ class BagMessage(NamedTuple):
     type_name: str
     stamp_ns: int
     payload: bytes
+
+
+@dataclass(frozen=True)
+class RecordedTopic:
+    """One topic of a bag, with all that a copy of it has to repeat.
+
+    :param info: absolute name, type as ``package/msg/Type``, and what its publishers offered (reliable, volatile, 10
+        where that is not recorded)
+    :param recorded_as: the name as it stands in the bag, which may be relative
+    :param definition: of the type, as it stands in the bag
+    :param digest: RIHS01 hash of the type, '' = not recorded
+    :param profiles: of all publishers, () = not recorded
+    """
+
+    info: TopicInfo
+    recorded_as: str
+    definition: MessageDefinition
+    digest: str
+    profiles: tuple[Profile, ...]
+
+
+@dataclass(frozen=True)
+class BagContents:
+    """What a bag has for a link.
+
+    :param topics: by absolute name, in its order
+    :param left_out: why a topic is none of them, by absolute name
+    :param differences: where the counts of messages in metadata.yaml and in the files are not the same, a line each
+    """
+
+    path: Path
+    topics: Mapping[str, RecordedTopic]
+    left_out: Mapping[str, str]
+    differences: tuple[str, ...]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What whoever uses this bag must not miss, one line each: often nothing."""
+        return [*(f"{topic} is left out: {why}" for topic, why in self.left_out.items()), *self.differences]
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The definitions that are ``.msg`` texts, by type name."""
+        found = {topic.info.type_name: topic.definition for topic in self.topics.values()}
+        return {name: text.data for name, text in found.items() if text.format is MessageDefinitionFormat.MSG}
+
+    def check(self, topic: str, type_name: str) -> None:
+        """Whether messages of a topic can be taken for messages of that type; one that the bag has not can.
+
+        :raises ConfigError: the topic is left out, or has another type
+        """
+        if topic in self.left_out:
+            raise ConfigError(f"bag {self.path}: {topic} cannot be carried: {self.left_out[topic]}")
+        found = self.topics.get(topic)
+        if found is not None and found.info.type_name != type_name:
+            raise ConfigError(f"bag {self.path}: {topic} is {found.info.type_name}, not {type_name}")
 
 
 @contextmanager
@@ -46,40 +123,98 @@ def explained(path: Path, doing: str) -> Iterator[None]:
         raise BagError(f"bag {path}: cannot be {doing} ({reason})") from error
 
 
+class _Folder(DirectoryReader):
+    """rosbags' reader of a folder, but for its search for topics exactly as metadata.yaml has them."""
+
+    STORAGE_PLUGINS = {"mcap": McapStorage, "sqlite3": SqliteStorage}  # noqa: RUF012
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.expected: list[Connection] = []
+        """The topics of metadata.yaml."""
+
+    def open(self) -> None:
+        super().open()
+        self.expected = self.connections
+        self.connections = [connection for storage in self.storages for connection in storage.connections]
+
+
+class _Bag(Reader):
+    """rosbags' reader, with storages that read what a file has and not what its index or metadata.yaml says."""
+
+    STORAGE_PLUGINS = {"dir": _Folder, ".mcap": McapStorage, ".db3": SqliteStorage}  # noqa: RUF012
+
+    @property
+    def files(self) -> Sequence[McapStorage | SqliteStorage]:
+        """The opened files."""
+        files = self.storage.storages if isinstance(self.storage, _Folder) else [self.storage]
+        return [file for file in files if isinstance(file, McapStorage | SqliteStorage)]
+
+    @property
+    def expected(self) -> list[Connection]:
+        """The topics of metadata.yaml, none of a bare file."""
+        return self.storage.expected if isinstance(self.storage, _Folder) else []
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Reader]:
+def _opened(path: Path) -> Iterator[_Bag]:
     with explained(path, "read"):
         if not path.exists():
             raise BagError(f"bag {path}: there is no such file or folder")
-        with Reader(path) as reader:
-            yield reader
+        if path.is_dir() and not (path / "metadata.yaml").exists():
+            files = sorted(file.name for file in path.iterdir() if file.suffix in _Bag.STORAGE_PLUGINS)
+            raise BagError(
+                f"bag {path}: has no metadata.yaml, as after a crash; name a file of it ({', '.join(files) or 'none'}) "
+                "or have it made by ros2 bag reindex"
+            )
+        with _Bag(path) as bag:
+            yield bag
 
 
 def read_bag(path: str | Path, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-    """The messages of a bag in recorded order.
+    """The messages of a bag in recorded order, of the topics that :func:`bag_contents` has.
 
     :param path: bag folder, or a bare ``.mcap`` or ``.db3`` file
     :param topics: absolute names, None = all
     :raises BagError: missing, damaged, or no bag
     """
     path = Path(path)
-    with _opened(path) as reader:
-        chosen = [c for c in reader.connections if topics is None or c.topic in topics]
-        if chosen:
-            for connection, stamp_ns, payload in reader.messages(chosen):
-                yield BagMessage(connection.topic, connection.msgtype, stamp_ns, bytes(payload))
+    with _opened(path) as bag:
+        found = _contents(path, bag).topics.values()
+        chosen = {topic.recorded_as: topic.info for topic in found if topics is None or topic.info.topic in topics}
+        connections = [connection for connection in bag.connections if connection.topic in chosen]
+        if not connections:
+            return
+        counted = _counts(connections)
+        read = Counter(dict.fromkeys(counted, 0))
+        for connection, stamp_ns, payload in bag.messages(connections):
+            read[connection.topic] += 1
+            info = chosen[connection.topic]
+            yield BagMessage(info.topic, info.type_name, stamp_ns, bytes(payload))
+        for topic, count in read.items():
+            differs = f"bag {path}: {count} messages of {topic} were read, and its index counts {counted[topic]}"
+            if count < counted[topic]:
+                raise BagError(f"{differs}: it is damaged; have its index made anew")
+            if count > counted[topic]:
+                _log.warning(differs)
 
 
-def bag_topics(path: str | Path) -> list[TopicInfo]:
-    """The topics of a bag with the QoS their publishers offered (reliable, volatile, 10 where not recorded).
+def bag_contents(path: str | Path) -> BagContents:
+    """The topics of a bag.
 
     :raises BagError: missing, damaged, or no bag
     """
-    rows: dict[tuple[str, str], list[Qos]] = {}
-    with _opened(Path(path)) as reader:
-        for connection in reader.connections:
-            rows.setdefault((connection.topic, connection.msgtype), []).extend(_offered(connection))
-    return [TopicInfo(topic, type_name, tuple(offers)) for (topic, type_name), offers in sorted(rows.items())]
+    path = Path(path)
+    with _opened(path) as bag:
+        return _contents(path, bag)
+
+
+def bag_topics(path: str | Path) -> list[TopicInfo]:
+    """The topics of a bag that a link can carry, by name, with the QoS their publishers offered.
+
+    :raises BagError: missing, damaged, or no bag
+    """
+    return [topic.info for topic in bag_contents(path).topics.values()]
 
 
 def bag_definitions(path: str | Path) -> dict[str, str]:
@@ -87,22 +222,136 @@ def bag_definitions(path: str | Path) -> dict[str, str]:
 
     :raises BagError: missing, damaged, or no bag
     """
-    with _opened(Path(path)) as reader:
-        return {c.msgtype: c.msgdef.data for c in reader.connections if c.msgdef.format is MessageDefinitionFormat.MSG}
+    return bag_contents(path).texts
 
 
-def _offered(connection: Connection) -> list[Qos]:
-    profiles = connection.ext.offered_qos_profiles if isinstance(connection.ext, ConnectionExtRosbag2) else []
-    return [
-        Qos(
-            "best_effort" if profile.reliability is QosReliability.BEST_EFFORT else "reliable",
-            "transient_local" if profile.durability is QosDurability.TRANSIENT_LOCAL else "volatile",
-            0 if profile.history is QosHistory.KEEP_ALL else profile.depth,
-            _seconds(profile.lifespan),
-            _seconds(profile.deadline),
-        )
-        for profile in profiles
-    ] or [Qos("reliable", "volatile", 10)]
+def _contents(path: Path, bag: _Bag) -> BagContents:
+    named: dict[str, list[Connection]] = {}
+    for connection in (*bag.connections, *bag.expected):
+        name = connection.topic
+        named.setdefault(name if name.startswith("/") else f"/{name}", []).append(connection)
+    definitions: dict[str, tuple[str, MessageDefinition]] = {}
+    for name in sorted(named):
+        for connection in named[name]:
+            if connection.msgdef.data:
+                definitions.setdefault(_kind(connection), (name, connection.msgdef))
+    unfit = {name: _unfit(name, named[name], definitions) for name in sorted(named)}
+    topics = {name: _recorded(name, named[name], definitions, bag) for name, why in unfit.items() if not why}
+    left_out = {name: why for name, why in unfit.items() if why}
+    return BagContents(path, topics, left_out, tuple(_differences(path, bag)))
+
+
+def _kind(connection: Connection) -> str:
+    """Type as ``package/msg/Type``; one of another kind as it stands there."""
+    try:
+        return normalize_type(connection.msgtype)
+    except ConfigError:
+        return connection.msgtype
+
+
+def _unfit(
+    name: str, connections: Sequence[Connection], definitions: Mapping[str, tuple[str, MessageDefinition]]
+) -> str:
+    """Why a link cannot carry a topic, '' where it can.
+
+    :param definitions: of each type the one that counts, and the first topic that has it
+    """
+    names = list(dict.fromkeys(c.topic for c in connections))
+    kinds = list(dict.fromkeys(_kind(c) for c in connections))
+    formats = list(dict.fromkeys(_ext(c).serialization_format for c in connections))
+    try:
+        check_topic(name)
+    except ConfigError:
+        return f"{names[0]!r} is no name of a ROS topic"
+    if len(names) > 1:
+        return f"it is recorded under the names {' and '.join(names)}"
+    if len(kinds) > 1:
+        return f"it is recorded with the types {' and '.join(kinds)}"
+    if formats != [_CDR]:
+        return f"it is serialized as {' and '.join(map(repr, formats))}, and a link carries {_CDR!r}"
+    (kind,) = kinds
+    if "/srv/" in kind or "/action/" in kind:
+        return f"{kind} is of a service or an action, and a link carries messages"
+    if not _MESSAGE_TYPE.fullmatch(kind):
+        return f"{kind!r} is no type of a ROS message"
+    where, counts = definitions.get(kind, ("", _NO_DEFINITION))
+    if not all(same_type(kind, c.msgdef.data, counts.data) for c in connections if c.msgdef.data):
+        return f"the bag has several definitions of {kind}, and the one of {where} counts"
+    return ""
+
+
+def _recorded(
+    name: str,
+    connections: Sequence[Connection],
+    definitions: Mapping[str, tuple[str, MessageDefinition]],
+    bag: _Bag,
+) -> RecordedTopic:
+    one, kind = connections[0], _kind(connections[0])
+    profiles = _united(
+        [profile for c in file.connections if c.topic == one.topic for profile in _ext(c).offered_qos_profiles]
+        for file in bag.files
+    ) or [profile for c in connections for profile in _ext(c).offered_qos_profiles]
+    offers = tuple(_offered(profile) for profile in profiles) or (Qos("reliable", "volatile", 10),)
+    return RecordedTopic(
+        TopicInfo(name, kind, offers),
+        one.topic,
+        definitions.get(kind, ("", _NO_DEFINITION))[1],
+        next((c.digest for c in connections if c.digest), ""),
+        tuple(profiles),
+    )
+
+
+def _united(files: Iterable[Sequence[Profile]]) -> list[Profile]:
+    """The profiles of the publishers of one topic: each file has those of its time, the same ones again and again."""
+    united: list[Profile] = []
+    for profiles in files:
+        had = list(united)
+        for profile in profiles:
+            if profile in had:
+                had.remove(profile)
+            else:
+                united.append(profile)
+    return united
+
+
+def _differences(path: Path, bag: _Bag) -> Iterator[str]:
+    found, expected = _counts(bag.connections), _counts(bag.expected)
+    if bag.expected:
+        for topic in sorted({*found, *expected}):
+            if found[topic] != expected[topic]:
+                yield (
+                    f"{path}: metadata.yaml counts {expected[topic]} messages of {topic}, the files have "
+                    f"{found[topic]}; the files count"
+                )
+        if found == expected and found.total() != bag.message_count:
+            yield f"{path}: metadata.yaml counts {bag.message_count} messages, the files have {found.total()}"
+    for file in bag.files:
+        of_topics, total = _counts(file.connections).total(), file.metadata.message_count
+        if of_topics != total:
+            yield f"{file.path}: of {total} messages {of_topics} are of a topic that it names"
+
+
+def _counts(connections: Iterable[Connection]) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for connection in connections:
+        counts[connection.topic] += connection.msgcount
+    return counts
+
+
+def _ext(connection: Connection) -> ConnectionExtRosbag2:
+    assert isinstance(connection.ext, ConnectionExtRosbag2)
+    return connection.ext
+
+
+def _offered(profile: Profile) -> Qos:
+    """A recorded profile in our terms; of a history that is not known the depth is the default, as on a graph."""
+    return Qos(
+        "best_effort" if profile.reliability is QosReliability.BEST_EFFORT else "reliable",
+        "transient_local" if profile.durability is QosDurability.TRANSIENT_LOCAL else "volatile",
+        0 if profile.history is QosHistory.KEEP_ALL else profile.depth or Qos().depth,
+        _seconds(profile.lifespan),
+        _seconds(profile.deadline),
+    )
 
 
 def _seconds(time: QosTime) -> float:

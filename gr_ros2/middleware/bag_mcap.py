@@ -1,7 +1,7 @@
-"""MCAP with both times of a message: when it was received, and when it was sent.
+"""MCAP as ROS 2 bags have it: written with both times of a message, read whatever its index has.
 
-Law: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags alone
-writes the first one into both.
+Laws: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags alone
+writes the first one into both. A message is read although no index leads to it; a schema in no language of ROS is none.
 """
 
 from __future__ import annotations
@@ -12,10 +12,32 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_mcap import McapReader, McapWriter, Schema
 
+_LANGUAGES = frozenset({"ros2msg", "ros2idl", "omgidl"})
 _PUBLISH_TIME_AT = 1 + 8 + 2 + 4 + 8
 """Bytes of a message record before its publish_time: opcode, length, channel, sequence, log_time."""
+
+
+class _Schemas(dict[int, Schema]):
+    """Schemas by id; rosbags takes one in an unknown language (rosbag2's own is ``unknown``) for an error."""
+
+    def __setitem__(self, number: int, schema: Schema) -> None:
+        super().__setitem__(number, schema if schema.encoding in _LANGUAGES else schema._replace(encoding="", data=""))
+
+
+class McapStorage(McapReader):
+    """rosbags' reader, also of files whose chunks have no message index; those it would pass over."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.schemas = _Schemas()
+
+    def open(self) -> None:
+        """Open and read the index."""
+        super().open()
+        if any(not chunk.message_index_offsets for chunk in self.chunks):
+            self.chunks.clear()  # without chunks rosbags reads from the beginning to the end
 
 
 class TwoTimes(McapWriter):

@@ -1,7 +1,8 @@
 """Writes one ROS 2 bag.
 
-Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk only when ``BACKLOG``
-messages are behind; after an error nothing more is written, what comes is counted, and every call tells the error.
+Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk, or leaves out a message and
+counts it, only when ``BACKLOG`` messages are behind; after an error nothing more is written, what comes is counted,
+and every call tells the error.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from rosbags.interfaces import Qos as Profile
 from rosbags.rosbag2 import StoragePlugin
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
-from gr_ros2.middleware.bag_files import explained
+from gr_ros2.middleware.bag_files import RecordedTopic, explained
 from gr_ros2.middleware.bag_mcap import BagWriter, TwoTimes
 from gr_ros2.middleware.base import Qos
-from gr_ros2.middleware.type_definitions import definition
+from gr_ros2.middleware.type_definitions import Definition, definition, recorded_definition
 
 BACKLOG = 10_000
 """Messages that may wait for the disk before publishing blocks."""
@@ -57,14 +58,21 @@ class BagRecorder:
 
     :param path: folder that does not exist yet
     :param storage: ``mcap`` or ``sqlite3``
-    :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
+    :param definitions: ``.msg`` texts by type name; of other types ROS's
     :param count: ``Middleware.count``
+    :param lossless: publishing waits while ``BACKLOG`` messages are behind; else those that come then are counted
     :raises ConfigError: no such storage
     :raises BagError: exists already, or cannot be made
     """
 
     def __init__(
-        self, path: Path, storage: str, definitions: Mapping[str, str], count: Callable[[str, str], None]
+        self,
+        path: Path,
+        storage: str,
+        definitions: Mapping[str, str],
+        count: Callable[[str, str], None],
+        *,
+        lossless: bool = True,
     ) -> None:
         if storage not in _STORAGES:
             raise ConfigError(f"storage = {storage!r}: {' or '.join(_STORAGES)}")
@@ -74,10 +82,11 @@ class BagRecorder:
         self.error: BagError | None = None
         self._definitions = dict(definitions)
         self._count = count
+        self._lossless = lossless
         self._writer = BagWriter(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
         # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
         self._writer.set_custom_data("recorded_by", "gr_ros2")
-        self._channels: dict[tuple[str, Qos], BagChannel] = {}
+        self._channels: dict[tuple[str, tuple[Profile, ...]], BagChannel] = {}
         self._closed = False
         self._lock = threading.Lock()
         self._queue: queue.Queue[_Message | _Job | None] = queue.Queue(BACKLOG)
@@ -98,19 +107,36 @@ class BagRecorder:
 
         :raises ConfigError: the topic is being written with another type
         """
-        text, digest = definition(type_name, self._definitions)
+        return self._channel(
+            topic, type_name, definition(type_name, self._definitions.get(type_name)), (_profile(qos),)
+        )
+
+    def copy(self, topic: RecordedTopic) -> BagChannel:
+        """Where messages of a topic of another bag go, which is named, defined and offered here as it is there.
+
+        :raises ConfigError: the topic is being written with another type
+        """
+        type_name = topic.info.type_name
+        text = recorded_definition(type_name, topic.definition.data, topic.digest)
+        return self._channel(topic.recorded_as, type_name, text, topic.profiles)
+
+    def _channel(self, topic: str, type_name: str, definition: Definition, profiles: tuple[Profile, ...]) -> BagChannel:
         with self._lock:
             for other in self._channels.values():
                 if other.topic == topic and other.type_name != type_name:
                     raise ConfigError(f"bag {self.path}: {topic} is {other.type_name}, not {type_name}")
-            if (topic, qos) not in self._channels:
+            if (topic, profiles) not in self._channels:
                 connection = self._ask(
                     lambda: self._writer.add_connection(
-                        topic, type_name, msgdef=text, rihs01=digest, offered_qos_profiles=[_profile(qos)]
+                        topic,
+                        type_name,
+                        msgdef=definition.text,
+                        rihs01=definition.digest,
+                        offered_qos_profiles=profiles,
                     )
                 )
-                self._channels[topic, qos] = BagChannel(topic, type_name, connection)
-            return self._channels[topic, qos]
+                self._channels[topic, profiles] = BagChannel(topic, type_name, connection)
+            return self._channels[topic, profiles]
 
     def write(self, channel: BagChannel, stamp_ns: int, payload: bytes, sent_ns: int | None = None) -> None:
         """Queue one message.
@@ -124,7 +150,10 @@ class BagRecorder:
             raise MiddlewareError(f"publish on {channel.topic}: bag {self.path} is closed")
         if self.error is not None:
             raise self.error
-        self._queue.put(_Message(channel, stamp_ns, payload, sent_ns))
+        try:
+            self._queue.put(_Message(channel, stamp_ns, payload, sent_ns), block=self._lossless)
+        except queue.Full:
+            self._count(f"not_recorded:{channel.topic}", f"the disk is {BACKLOG} messages behind")
 
     def close(self) -> None:
         """Write what is queued and the index; the second call does nothing.

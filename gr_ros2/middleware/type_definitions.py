@@ -1,19 +1,36 @@
-"""Message definitions of the types ROS ships, for those places that want more than bytes: bags and type hashes.
+"""Message definitions, for those places that want more than bytes: bags and type hashes.
 
-Law: a type that is not known is no error anywhere; it has no definition, and its bytes pass all the same.
+Laws: a type that is not known is no error anywhere; it has no definition, and its bytes pass all the same. A definition
+that came with the messages counts, also where ROS ships another one of that name: types grow from one distribution to
+the next.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import struct
 from functools import cache
+from typing import NamedTuple
 
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 UNKNOWN = "# The definition of this type was not known where it was recorded; the bytes are complete.\n"
 """Stands in a bag for a definition nobody had. It parses as a type without members."""
+_IDL = "=" * 80 + "\nIDL: "
+"""How rosbag2 begins a definition in IDL."""
+
+
+class Definition(NamedTuple):
+    """The text of a type, with those of the types it is made of, and its RIHS01 hash (REP-2011)."""
+
+    text: str
+    digest: str
+
+
+DAMAGED = (SerdeError, struct.error, ValueError, IndexError, AssertionError, OverflowError, MemoryError)
+"""What deserializing arbitrary bytes as a type may raise."""
 
 
 @cache
@@ -28,25 +45,51 @@ def known(type_name: str) -> bool:
     return type_name in typestore().fielddefs
 
 
-def definition(type_name: str, custom: Mapping[str, str] | None = None) -> tuple[str, str]:
-    """The ``.msg`` text (with what it depends on) and the RIHS01 hash of a type.
+def definition(type_name: str, text: str | None = None) -> Definition:
+    """What a bag says about a type.
 
-    :param custom: texts of further types by name
+    :param text: of the type, None = as ROS ships it; one that cannot be read is as good as none
     """
-    text = (custom or {}).get(type_name)
-    if text is None:
-        if known(type_name):
-            return typestore().generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name)
-        text = UNKNOWN
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(typestore().fielddefs)
-        store.register(get_types_from_msg(text, type_name))
-        return text, str(store.hash_rihs01(type_name))
-    except (TypesysError, KeyError):
-        return definition(type_name, {type_name: UNKNOWN})
+    if text is None and known(type_name):
+        return Definition(typestore().generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name))
+    digest = text_hash(type_name, text) if text is not None else ""
+    return Definition(text, digest) if text is not None and digest else _unknown(type_name)
+
+
+def recorded_definition(type_name: str, text: str, digest: str) -> Definition:
+    """What a copy of a bag says about a type: the same as the bag, read or not; where that has no text, what fits.
+
+    :param text: '' = the bag has none
+    :param digest: RIHS01 hash, '' = the bag has none
+    """
+    if text:
+        return Definition(text, digest or text_hash(type_name, text) or _unknown(type_name).digest)
+    if known(type_name) and digest in ("", type_hash(type_name)):
+        return definition(type_name)
+    unknown = _unknown(type_name)
+    return Definition(unknown.text, digest or unknown.digest)
+
+
+def same_type(type_name: str, text: str, other: str) -> bool:
+    """Whether two texts define the same, whatever their comments."""
+    return text == other or "" != text_hash(type_name, text) == text_hash(type_name, other)
 
 
 def type_hash(type_name: str) -> str:
-    """RIHS01 hash of a type ROS ships (REP-2011), '' for others."""
+    """RIHS01 hash of a type ROS ships, '' for others."""
     return str(typestore().hash_rihs01(type_name)) if known(type_name) else ""
+
+
+def text_hash(type_name: str, text: str) -> str:
+    """RIHS01 hash of what a text defines, '' where it cannot be read; what it does not bring along is ROS's."""
+    store = Typestore()
+    try:
+        own = get_types_from_idl(text) if text.startswith(_IDL) else get_types_from_msg(text, type_name)
+        store.fielddefs = {**typestore().fielddefs, **own}
+        return str(store.hash_rihs01(type_name))
+    except (TypesysError, KeyError, RecursionError):  # the last of a type within itself
+        return ""
+
+
+def _unknown(type_name: str) -> Definition:
+    return Definition(UNKNOWN, text_hash(type_name, UNKNOWN))

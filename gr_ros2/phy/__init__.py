@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gr_ros2.backends import Backend, BackendTable
+from gr_ros2.config import PhyConfig
 from gr_ros2.phy.base import Phy
 
 _GNURADIO = "GNU Radio 3.10 (apt install gnuradio)"
@@ -27,4 +28,18 @@ PHY = BackendTable(
     Backend,
 )
 
-__all__ = ["PHY", "Phy"]
+
+def configured(config: PhyConfig, packet_len: int, sample_rate: float) -> Phy:
+    """The PHY that a configuration asks for.
+
+    :param packet_len: bytes per packet
+    :param sample_rate: samples/s
+    :raises ConfigError: for an unknown name or setting, or a value out of range
+    :raises BackendMissingError: when what it needs is not installed
+    """
+    settings = {"kernels": config.kernels, **config.options}
+    phy: Phy = PHY.load(config.name)(packet_len, sample_rate, **settings)
+    return phy
+
+
+__all__ = ["PHY", "Phy", "configured"]

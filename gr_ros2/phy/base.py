@@ -8,14 +8,14 @@ on the message port itself. Law: one packet takes the same number of samples alw
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, get_args
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import ChannelConfig, build
+from gr_ros2.config import ChannelConfig, Kernels, build
 from gr_ros2.errors import ConfigError
 
 Samples = npt.NDArray[np.complex64]
@@ -76,9 +76,10 @@ class Phy(ABC):
 
     :param packet_len: bytes per packet, 14..4095
     :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
+    :param kernels: what works on the samples: ``auto`` = compiled kernels where there are any, or ``numpy``
     :param options: fields of ``Options``
-    :raises ConfigError: for an option that is unknown or out of range, or a sample rate that is not above 0 where one
-        is needed
+    :raises ConfigError: for an option that is unknown or out of range, a sample rate that is not above 0 where one is
+        needed, or kernels there are none of
     """
 
     name: ClassVar[str]
@@ -86,10 +87,13 @@ class Phy(ABC):
     Options: ClassVar[type[Any]] = PhyOptions
     """A frozen dataclass: the settings of this PHY, each with a default."""
 
-    def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
+    def __init__(self, packet_len: int, sample_rate: float, kernels: Kernels = "auto", **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"phy {self.name}")
         if self.has_samples and not sample_rate > 0:
             raise ConfigError(f"phy {self.name}: sample_rate = {sample_rate}: must be above 0 samples/s")
+        if kernels not in get_args(Kernels):
+            raise ConfigError(f"phy {self.name}: kernels = {kernels!r}: write {' or '.join(get_args(Kernels))}")
+        self.kernels = kernels
         self.packet_len = packet_len
         self.sample_rate = sample_rate
 
@@ -131,6 +135,14 @@ class Phy(ABC):
                 f"at most {self.sample_rate / 2:g}"
             )
 
+    def runs_on(self) -> str:
+        """What works on the samples, in a few words; '' where there are none."""
+        return ""
+
+    def leaves_tags(self) -> bool:
+        """Whether the transmitter's samples carry tags, which a receiver in the same flowgraph must not see."""
+        return False
+
     def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
         """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
 
@@ -145,7 +157,7 @@ class Phy(ABC):
     def receiver(self, aside: bool = False) -> PacketReceiver:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
-        :param aside: in a process of its own where it is made of Python, which keeps the ROS side free; it takes a
+        :param aside: in a process of its own where it works in Python, which keeps the ROS side free; it takes a
             second to start, and packets come a moment after the samples have passed
         :raises PhyError: for a PHY without samples
         """

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from math import log10
+from math import isfinite, log10
 from statistics import median
 from typing import Any
 
@@ -125,6 +126,22 @@ class Reading:
     snr: float
 
 
+@dataclass(frozen=True)
+class Constants:
+    """What a compiled kernel has to know of a modem.
+
+    :param kernel: name of the kernel
+    :param values: its parameters, by the names it has for them
+    :param soft_bits: of a reading
+    :param points: of a reading
+    """
+
+    kernel: str
+    values: Mapping[str, Any]
+    soft_bits: int
+    points: int
+
+
 class BurstModem(ABC):
     """A modulation for frames of one length.
 
@@ -174,6 +191,10 @@ class BurstModem(ABC):
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
         """The burst whose reference sample stands at ``start``, None where there is none after all."""
+
+    def constants(self) -> Constants | None:
+        """What a compiled kernel has to know to do the same; None where there is no kernel."""
+        return None
 
 
 class BurstReceiver:
@@ -229,6 +250,13 @@ class BurstReceiver:
                 self._last -= first
         return len(self._buffer) - self._end
 
+    def _finite(self) -> bool:
+        """Whether all samples that the burst can be read from are numbers."""
+        assert self._start is not None
+        first, last = self._start - self._modem.margin, self._start + self._modem.burst_samples + self._modem.margin
+        burst = self._buffer[max(0, first) : min(last, self._end)]
+        return isfinite(np.vdot(burst, burst).real)
+
     def _take(self) -> list[bytes]:
         packets: list[bytes] = []
         while True:
@@ -246,7 +274,7 @@ class BurstReceiver:
                 self._last = self._modem.end(self._buffer[: self._end], self._start)
             if self._end < self._last:
                 return packets
-            reading = self._modem.read(self._buffer[: self._end], self._start)
+            reading = self._modem.read(self._buffer[: self._end], self._start) if self._finite() else None
             packet = None if reading is None else self._modem.frame.unwrap(reading.soft)
             if reading is None or packet is None:
                 self.damaged += 1

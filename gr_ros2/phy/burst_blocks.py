@@ -10,6 +10,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections import deque
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,10 +24,13 @@ from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import Receiver, Transmitter
+from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import Held
 
+STOCK = "GNU Radio's blocks"
+"""What PHYs of blocks by others run on."""
 _log = logging.getLogger(__name__)
 
 
@@ -43,7 +47,7 @@ class BurstOptions:
 
 
 class BurstPhy(Phy):
-    """A PHY made of a burst modem: a subclass sets ``modem``.
+    """A PHY made of a burst modem: a subclass sets ``modem``, its numpy form.
 
     :ivar gap: zero samples after each burst
     """
@@ -58,6 +62,14 @@ class BurstPhy(Phy):
     def airtime_samples(self) -> int:
         return self.modem.burst_samples + self.gap
 
+    @cached_property
+    def running_modem(self) -> BurstModem:
+        """The modem as it runs here."""
+        return fastest(self.modem, self.kernels)
+
+    def runs_on(self) -> str:
+        return which(self.kernels)
+
     @property
     def receiver_taps(self) -> Any:
         """The filter the samples pass before the modem sees them; None = none."""
@@ -67,7 +79,9 @@ class BurstPhy(Phy):
         return BurstTransmitter(self)
 
     def receiver(self, aside: bool = False) -> PacketReceiver:
-        return BurstSink(self, aside and len(os.sched_getaffinity(0)) > 1)
+        # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
+        compiled = self.running_modem is not self.modem
+        return BurstSink(self, aside and not compiled and len(os.sched_getaffinity(0)) > 1)
 
 
 class BurstTransmitter(Transmitter):
@@ -124,7 +138,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
 
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(phy.packet_len, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
-        self._modem = phy.modem
+        self._modem = phy.running_modem
         self._gap = np.zeros(phy.gap, np.complex64)
         self._waiting: deque[bytes] = deque()
         self._rest = self._gap[:0]
@@ -133,15 +147,15 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self._waiting.append(packet)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
-        if not len(self._rest):
-            if not self._waiting:
-                return 0
-            self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
-        out = output_items[0]
-        count = min(len(out), len(self._rest))
-        out[:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
+        out, done = output_items[0], 0
+        while done < len(out) and (len(self._rest) or self._waiting):
+            if not len(self._rest):
+                self._rest = np.concatenate((self._modem.modulate(self._waiting.popleft()), self._gap))
+            count = min(len(out) - done, len(self._rest))
+            out[done : done + count] = self._rest[:count]
+            self._rest = self._rest[count:]
+            done += count
+        return done
 
 
 class BurstSink(Receiver):
@@ -176,7 +190,7 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
 
     def __init__(self, phy: BurstPhy, aside: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
-        self._modem = phy.modem
+        self._modem = phy.running_modem
         self._aside = aside
         self._engine: BurstReceiver | ReceiverProcess | None = None
         self._damaged = 0

@@ -40,9 +40,9 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
         self._running = True
         try:
             begin(partial(super().start, max_noutput_items))
-        except (RuntimeError, MemoryError) as error:
+        except PhyError as error:
             self.stop()
-            raise PhyError(f"{self._called}: the flowgraph does not start ({error})") from error
+            raise PhyError(f"{self._called}: {error}") from error
         except BaseException:  # Ctrl-C: nobody is there yet to stop what has begun
             self.stop()
             raise

@@ -17,7 +17,6 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.burst import Frame, Samples
 from gr_ros2.phy.burst_blocks import BurstOptions
-from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.linear import LinearModem, LinearPhy, Reals, preamble_steps, shape
 
 _PULSE_SYMBOLS = 4
@@ -75,14 +74,11 @@ class GfskModem(LinearModem):
         wave: Samples = np.exp(1j * np.cumsum(shape(signs, self._pulse, self.sps))).astype(np.complex64)
         return wave
 
-    def meant(self, soft: Soft) -> Soft:
+    @property
+    def before_payload(self) -> int | None:
         # A bit is 1 where the phase is that of the symbol before, the first one's before is the preamble's last. With a
         # code the bits were sent so that the phases themselves are the bits, since a decoder minds errors in pairs.
-        if self.frame.coded:
-            return soft
-        certain = np.float32(np.inf if self._last else -np.inf)
-        before = np.concatenate(([certain], soft[:-1]))
-        return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
+        return None if self.frame.coded else int(self._last)
 
 
 def frequency_pulse(sps: int, bt: float) -> Reals:

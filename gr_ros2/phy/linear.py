@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.soft import Points, spread_about
@@ -194,9 +194,48 @@ class LinearModem(BurstModem):
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
         return Reading(self.meant(self.constellation.soft(likely)), points / np.float32(gain), snr)
 
+    @property
+    def before_payload(self) -> int | None:
+        """The last bit before the payload where a bit of the frame says whether the phase stays; None where it is the
+        phase."""
+        return None
+
     def meant(self, soft: Soft) -> Soft:
         """Soft bits of the frame from those of the phases: the same unless the modulation has memory."""
-        return soft
+        if self.before_payload is None:
+            return soft
+        certain = np.float32(np.inf if self.before_payload else -np.inf)
+        before = np.concatenate(([certain], soft[:-1]))
+        return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
+
+    def constants(self) -> Constants:
+        bits = self.constellation.bits
+        before = self.before_payload
+        values = {
+            "sps": self.sps,
+            "order": self.order,
+            "point_bits": bits,
+            "payload": self.payload_symbols,
+            "preamble": PREAMBLE,
+            "chunk": _CHUNK,
+            "block": _BLOCK,
+            "rise": _RISE,
+            "edge": _EDGE,
+            "slack": _SLACK,
+            "unknowns": len(self._explained),
+            "differential": before is not None,
+            "last_one": bool(before),
+            "turn": self._turn,
+            "clean_energy": self._clean_energy,
+            "threshold": _THRESHOLD,
+            "alike": _ALIKE,
+            "steps": self._steps,
+            "known": self._known,
+            "explained": self._explained,
+            "points": self.constellation.points,
+            "marks": self.constellation.marks,
+        }
+        return Constants("linear", values, self.payload_symbols * bits, self.payload_symbols)
 
     def _measure(self, samples: Samples, start: int) -> tuple[float, float, float]:
         """Carrier frequency and phase from the preamble, in radians per symbol and radians, and SNR.

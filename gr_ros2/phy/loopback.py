@@ -33,8 +33,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         (:class:`CreditWindow`)
     :param paced: their credits pace the source; False offers every packet at once, as the paper does. With a PHY
         without samples there is nothing to pace by, except with pace `flow`
-    :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, and taps
-        for spectrum and constellation
+    :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, a channel
+        that can be changed, and taps for spectrum and constellation
     :raises ConfigError: for a channel that this PHY cannot have
     """
 
@@ -61,7 +61,9 @@ class LoopbackLink(PacketPath, Flowgraph):
             self._gate = AirtimeGate(phy.airtime())
             last = self._follow(last, self._gate)
         if phy.has_samples:
-            self._receive(self._transmit(last), faded=True, shown=instrumented)
+            # The channel also stops tags.
+            faded = instrumented or bool(self.channel.on_samples()) or phy.leaves_tags()
+            self._receive(self._transmit(last), faded=faded, shown=instrumented)
             last = self._receiver
             # A hier block with message ports holds itself, and 60 of the system's 4096 shared memory segments for OFDM.
             for hier_block in (self._transmitter, self._receiver):

@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
-from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frame, Reading, Samples, Search
-from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import summit
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
@@ -144,7 +144,8 @@ class LoraModem(BurstModem):
         if count < _LOOK + 1:
             return Search(0)
         powers = np.abs(np.fft.fft(samples[: count * self.chips].reshape(count, -1) * self._down)) ** 2
-        powers = powers / np.maximum(powers.mean(axis=1, keepdims=True), _TINY)
+        mean = powers.mean(axis=1, keepdims=True)
+        powers = np.where(np.isfinite(mean), powers / np.maximum(mean, _TINY), 0.0)
         # Neighbours count together: a burst that starts between two samples shares its peak between two bins. However
         # strong, one chirp counts no more than a few times the noise: data repeat a value now and then, and end.
         pairs = np.minimum(powers + np.roll(powers, 1, axis=1), _LIMIT)
@@ -189,6 +190,32 @@ class LoraModem(BurstModem):
             begin += pace - _GAIN * late
         return Reading(self._collect(soft), points, snr)
 
+    def constants(self) -> Constants:
+        values = {
+            "chips": self.chips,
+            "spreading_factor": self.spreading_factor,
+            "code_bits": self.code_bits,
+            "symbols": self.symbols,
+            "step": max(1, _CHUNK // self.chips),
+            "look": _LOOK,
+            "head": _HEAD,
+            "sync": len(_SYNC),
+            "down": _DOWN,
+            "fine": _FINE,
+            "sinc": _SINC,
+            "median_share": self._median_share,
+            "limit": _LIMIT,
+            "threshold": _THRESHOLD,
+            "gain": _GAIN,
+            "pace_gain": _PACE_GAIN,
+            "certain": _CERTAIN,
+            "down_chirp": self._down,
+            "up_chirp": self._up,
+            "tapered": self._tapered,
+            "words": self._words,
+        }
+        return Constants("lora", values, self.blocks * self.spreading_factor * 4, self.symbols)
+
     def _soft(self, heights: NDArray[np.float64]) -> Soft:
         """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
         powers = (heights**2).sum(axis=1)
@@ -220,6 +247,8 @@ class LoraModem(BurstModem):
         windows = samples[start : start + (_HEAD + 1) * self.chips]
         windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
         falls = self._powers(windows, self._up)
+        if len(falls) < 2 or not np.isfinite(falls.sum()):
+            return None
         pairs = falls[:-1] + falls[1:]
         at = int(np.argmax(pairs.max(axis=1)))
         if at < len(_SYNC) + 1:
@@ -230,7 +259,7 @@ class LoraModem(BurstModem):
         begin = start + (at + _DOWN) * self.chips + round((fall - rise) / 2)
         # Once more where the windows meet the chirps: between two chirps a fraction of a sample turns the phase.
         first = begin - (_DOWN + len(_SYNC) + _LOOK) * self.chips
-        if first < 0:
+        if first < 0 or begin > len(samples):
             return None
         windows = samples[first:begin].reshape(-1, self.chips)
         rises = self._powers(windows[:_LOOK], self._down).sum(axis=0)
@@ -402,6 +431,12 @@ class LoraPhy(BurstPhy):
         if self.modem.frame.coded:
             return coded_orthogonal_success(chips, wrong, self.modem.frame.data_bits, self.modem.symbols)
         return packet_success(lost, self.modem.blocks)
+
+    def runs_on(self) -> str:
+        return super().runs_on() if self._sdr is None else STOCK
+
+    def leaves_tags(self) -> bool:
+        return self._sdr is not None
 
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)

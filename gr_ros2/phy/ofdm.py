@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import Frame
-from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
+from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import Layout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
@@ -117,6 +117,12 @@ class OfdmPhy(BurstPhy):
         order = 1 << self.layout.bits_per_carrier
         error = psk_symbol_error(order, snr) if order <= 8 else qam_symbol_error(order, snr)
         return packet_success(error, self.frame_bits() // self.layout.bits_per_carrier)
+
+    def runs_on(self) -> str:
+        return super().runs_on() if self._stock is None else STOCK
+
+    def leaves_tags(self) -> bool:
+        return self._stock is not None
 
     def prefer_latency(self) -> None:
         if self._stock is not None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
 from gr_ros2.phy.soft import Points
 
@@ -199,8 +199,57 @@ class OfdmModem(BurstModem):
             clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
         return Reading(np.concatenate(soft), np.concatenate(looked), snr)
 
+    def constants(self) -> Constants:
+        points = -(-self.frame.bits // self.constellation.bits)
+        values = {
+            "size": self._size,
+            "prefix": self._prefix,
+            "symbols": self.symbols,
+            "repeat": self._repeat,
+            "frame_bits": self.frame.bits,
+            "degrees": self._degrees,
+            "chunk": _CHUNK,
+            "carrier_count": len(self._carriers),
+            "data_count": len(self._data),
+            "pilot_count": len(self._pilots),
+            "once_count": len(self._once),
+            "twice_count": len(self._twice),
+            "shift_count": len(_SHIFTS),
+            "point_count": len(self.constellation.points),
+            "point_bits": self.constellation.bits,
+            "level": self._level,
+            "alike": _ALIKE,
+            "energy": self._energy,
+            "power": self._power,
+            "pair_weight": self._pair_weight,
+            "word_weight_sum": float(self._word_weight.sum()),
+            "pace_gain": _PACE_GAIN,
+            "memory": _MEMORY,
+            "reach": _TURN,
+            "doubt": _DOUBT,
+            "carriers": self._carriers,
+            "data": self._data,
+            "pilots": self._pilots,
+            "once": self._once,
+            "twice": self._twice,
+            "shifts": _SHIFTS,
+            "words": self._words,
+            "known": self._known,
+            "turns": self._turns,
+            "whole": self._whole,
+            "smooth": self._smooth,
+            "smooth_words": self._smooth_words,
+            "crosswise": self._crosswise,
+            "header": self._header,
+            "points": self.constellation.points,
+            "word_weight": self._word_weight,
+            "marks": self.constellation.marks,
+        }
+        return Constants("ofdm", values, points * self.constellation.bits, points)
+
     def _place(self, samples: Samples, at: int) -> _Place:
         """Look closely at a place where the first half of a symbol is repeated."""
+        at = max(0, at)
         window = samples[at : at + self._window + self._half]
         step = self._repeat * np.vdot(window[: -self._half], window[self._half :])
         frequency = float(np.angle(step)) / self._half

@@ -36,7 +36,8 @@ class Points:
         self.bits = len(points).bit_length() - 1
         places = np.arange(self.bits) if order == "little" else np.arange(self.bits)[::-1]
         self._weights = 1 << places
-        marks = (np.arange(len(points))[:, None] >> places) & 1 == 1
+        self.marks = marks = (np.arange(len(points))[:, None] >> places) & 1 == 1
+        """Points by bits: where a bit is 1."""
         self._ones = [np.flatnonzero(mark) for mark in marks.T]
         self._zeros = [np.flatnonzero(~mark) for mark in marks.T]
 

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from gr_ros2.backends import uninterrupted
+from gr_ros2.errors import PhyError
 
 SWITCH_INTERVAL_S = 5e-5
 """Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
@@ -55,16 +56,23 @@ def begin(start: Callable[[], None]) -> None:
 
     Ctrl-C waits until it has started: who calls can stop it then.
 
-    :raises MemoryError: when it still cannot after many attempts
+    :raises PhyError: when it still cannot after many attempts, or refuses the flowgraph
     """
+    failed: Exception | None = None
     with uninterrupted():
-        for _ in range(_START_ATTEMPTS - 1):
+        for _ in range(_START_ATTEMPTS):
             try:
                 start()
                 return
-            except MemoryError:
+            except MemoryError as error:
+                failed = error
                 _log.debug("GNU Radio could not map a buffer; starting again")
-        start()
+            except RuntimeError as error:
+                raise PhyError(f"the flowgraph does not start ({error})") from error
+    raise PhyError(
+        f"GNU Radio gets no shared memory for its buffers ({failed}); `ipcs -m` shows what there is: remove with ipcrm "
+        "what programs have left, or raise kernel.shmmni"
+    ) from failed
 
 
 def finish(flowgraph: Any) -> None:

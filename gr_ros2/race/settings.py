@@ -1,7 +1,7 @@
 """What is raced over: the recording, the radio, and how the sample rate follows from the load.
 
 Laws: a load is the share of the air that the recording would need if each message were one frame, as it is, with the
-13 bytes of a version 0 packet; every contender has the same recording at the same sample rate.
+overhead of a version 0 packet; every contender has the same recording at the same sample rate.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import MAX_PACKET_LEN, SINGLE_ENTRY_OVERHEAD, PacketLen, Seconds
+from gr_ros2.config import PacketLen, Seconds
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics, read_bag
+from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.settings import SimSettings
+from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"
 SIM_TOPIC = "/robot_1/odom"
@@ -98,7 +99,7 @@ class Recording:
     @property
     def single_packet_len(self) -> int:
         """Bytes of a version 0 packet that holds any of its messages, as it is."""
-        return min(self.largest + SINGLE_ENTRY_OVERHEAD, MAX_PACKET_LEN)
+        return min(V0.packed_len([self.largest]), V0.max_packet_len)
 
 
 @plain_dataclass(frozen=True)
@@ -168,10 +169,12 @@ def read_recording(settings: RaceSettings, folder: Path) -> Recording:
         path = record_sim(folder, settings)
     else:
         path = Path(settings.source.removeprefix("bag:").strip()).expanduser()
-    found = {info.topic: info.type_name for info in bag_topics(path)}
-    topic = settings.topic or next(iter(found), "")
+    contents = bag_contents(path)
+    found = {name: topic.info.type_name for name, topic in contents.topics.items()}
+    topic = f"/{settings.topic.lstrip('/')}" if settings.topic else next(iter(found), "")
     if topic not in found or (len(found) > 1 and not settings.topic):
-        raise ConfigError(f"topic = {settings.topic!r}: name one that {path} has: {', '.join(found) or 'it has none'}")
+        has = "; ".join([", ".join(found) or "it has none", *contents.remarks])
+        raise ConfigError(f"topic = {settings.topic!r}: name one that {path} has: {has}")
     payloads: list[bytes] = []
     stamps: list[int] = []
     for message in read_bag(path, [topic]):

@@ -71,7 +71,7 @@ class FileFrontEnd(FrontEnd):
             self._replay = _Replay(samples, phy, self.options)
         if self.options.write:
             about = Recording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
-            self._recorder = SigmfRecorder(Path(self.options.write), about, phy.airtime_samples())
+            self._recorder = SigmfRecorder(Path(self.options.write), about, phy.airtime_samples(), lossless=True)
 
     @property
     def sink(self) -> Any:

@@ -13,14 +13,14 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
-from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import configured
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
@@ -31,25 +31,13 @@ from gr_ros2.radio.radio import Radio
 _log = logging.getLogger(__name__)
 
 
-class LinkObserver(Protocol):
-    """What hears a link; called from its threads, must be quick and never raise."""
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender reports."""
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Bytes the PHY handed to the sink, before the sink reads them."""
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports; of a delivery once it is published."""
-
-
 class RobotLink(Flowgraph):
     """A robot's end of a link.
 
     :param config: see :class:`LinkConfig`
     :param middleware: an open one for both blocks, closed by who opened it; None opens what the configuration says
-    :param observer: told of everything that is sent and received
+    :param observer: told of everything that is sent and received; when it raises, it is told nothing more, and the link
+        goes on
     :param clock: s, monotonic, of events and blocks
     :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
     :raises ConfigError: when the parts do not fit each other
@@ -73,15 +61,16 @@ class RobotLink(Flowgraph):
         self._started: float | None = None
         self._instrumented = instrumented
         self._stack = ExitStack()
+        self._observers = Observers[LinkObserver](() if observer is None else (observer,))
         try:
-            self._open(middleware, observer)
+            self._open(middleware, self._observers if observer is not None else None)
         except BaseException:
             self._stack.close()
             raise
 
     def _open(self, middleware: Middleware | None, observer: LinkObserver | None) -> None:
         config = self.config
-        self.phy: Phy = PHY.load(config.phy.name)(config.packet_len, config.phy.sample_rate, **config.phy.options)
+        self.phy = configured(config.phy, config.packet_len, config.phy.sample_rate)
         self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
         self._stack.callback(self.front_end.close)
         self.radio = Radio(
@@ -176,8 +165,13 @@ class RobotLink(Flowgraph):
         """Whether nothing will be received any more, as at the end of a recording that is replayed."""
         return self.front_end.finished
 
+    def incomplete(self) -> list[str]:
+        """What observers missed and what the recording lacks, with why and how much, one line each; often none."""
+        return [*self._observers.told(), *self.radio.incomplete()]
+
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, packets to and from the air, the PHY, and what the front end counts."""
+        """A snapshot: both blocks, packets to and from the air, the PHY, what the front end counts, and
+        :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
@@ -198,5 +192,6 @@ class RobotLink(Flowgraph):
                 "airtime_s": self.front_end.airtime(),
                 "snr_db": self.radio.snr_db,
             },
-            "front_end": {"name": self.front_end.name, **self.front_end.counters()},
+            "front_end": {"name": self.front_end.name, **self.front_end.counters(), **self.radio.recorded()},
+            "incomplete": self.incomplete(),
         }

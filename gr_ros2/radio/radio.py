@@ -87,8 +87,8 @@ class Radio(PacketPath, HierBlock):
             self.connect(self._transmit(self._gate), front_end.sink)
         if front_end.source is None:
             return
-        # The channel stops tags too: the transmitter's would overrule what the receiver reads in a packet's header.
-        faded = front_end.loops_back or bool(self.channel.on_samples()) or self._simulated
+        # The channel stops tags too.
+        faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
         # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
         heard = self._receive(front_end.source, faded=faded, shown=instrumented, aside=not front_end.ends)
         if record:
@@ -106,6 +106,14 @@ class Radio(PacketPath, HierBlock):
         if self._recorder is not None:
             self._recorder.close()
         self.front_end.close()
+
+    def recorded(self) -> dict[str, int]:
+        """Samples. ``unrecorded``: not in the recording, as on a full disk; nothing where none is made."""
+        return {} if self._recorder is None else {"unrecorded": self._recorder.failed}
+
+    def incomplete(self) -> list[str]:
+        """What the recording lacks and why, as one line; none where it is whole, or none is made."""
+        return [] if self._recorder is None else self._recorder.told()
 
     @property
     def refused(self) -> int:

@@ -1,16 +1,16 @@
 """SigMF recordings: samples in `NAME.sigmf-data`, what they are in `NAME.sigmf-meta` (sigmf.org, version 1.0.0).
 
 Laws: samples are cf32_le, one channel; a recording that was cut off by a kill is still one, with the metadata it began
-with; a recording is never written over another.
+with; a recording is never written over another; writing waits in a thread of its own, and an error ends the recording
+alone.
 """
 
 from __future__ import annotations
 
 import json
-import logging
-import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ from gnuradio import gr
 from numpy.typing import NDArray
 
 from gr_ros2 import __version__
+from gr_ros2.backlog import Backlog
 from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.guard import Guard, one_line
 from gr_ros2.phy.threads import KeepsThread
 
 VERSION = "1.0.0"
@@ -28,7 +30,11 @@ SAMPLE = np.dtype("<c8")
 _DATATYPE = "cf32_le"
 _MOST_ANNOTATIONS = 100_000
 """Bursts annotated; those beyond are recorded all the same."""
-_log = logging.getLogger(__name__)
+_MOST_GAPS = 10_000
+_HELD_BYTES = 1 << 26
+"""Of samples that wait for the disk: 0.4 s at 20 million samples/s."""
+_PATIENCE_S = 5.0
+"""s a recording may take to end."""
 
 
 @dataclass
@@ -39,18 +45,23 @@ class Recording:
     :param frequency: Hz, of the receiver; None where there is none
     :param description: for people
     :param annotations: (first sample, samples, label)
+    :param gaps: (sample in the recording, its number in the stream that was recorded), where some before it are missing
     """
 
     sample_rate: float
     frequency: float | None = None
     description: str = ""
     annotations: list[tuple[int, int, str]] = field(default_factory=list)
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+
+    def index_at(self, sample: int) -> int:
+        """Number in the stream that a sample behind the last gap has."""
+        start, index = self.gaps[-1] if self.gaps else (0, 0)
+        return index + sample - start
 
     def to_json(self, began: datetime) -> dict[str, Any]:
         """The content of the metadata file."""
-        capture: dict[str, Any] = {"core:sample_start": 0, "core:datetime": began.strftime("%Y-%m-%dT%H:%M:%S.%fZ")}
-        if self.frequency is not None:
-            capture["core:frequency"] = self.frequency
+        captures = [self._capture(start, index, began) for start, index in [(0, 0), *self.gaps]]
         return {
             "global": {
                 "core:datatype": _DATATYPE,
@@ -59,12 +70,22 @@ class Recording:
                 "core:description": self.description,
                 "core:recorder": f"gr-ros2 {__version__}",
             },
-            "captures": [capture],
+            "captures": captures,
             "annotations": [
                 {"core:sample_start": start, "core:sample_count": count, "core:label": label}
                 for start, count, label in self.annotations
             ],
         }
+
+    def _capture(self, start: int, index: int, began: datetime) -> dict[str, Any]:
+        """One stretch of the stream without gaps."""
+        at = began + timedelta(seconds=index / self.sample_rate)
+        found: dict[str, Any] = {"core:sample_start": start, "core:datetime": at.strftime("%Y-%m-%dT%H:%M:%S.%fZ")}
+        if index:
+            found["core:global_index"] = index
+        if self.frequency is not None:
+            found["core:frequency"] = self.frequency
+        return found
 
 
 def base_path(path: Path) -> Path:
@@ -86,7 +107,7 @@ def read_recording(path: Path) -> tuple[Recording, NDArray[np.complex64]]:
         size = data.stat().st_size
     except OSError as error:
         raise ConfigError(f"recording {error.filename}: {error.strerror}; it takes {META} and {DATA}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"recording {meta}: no SigMF metadata with datatype and sample rate ({error!r})") from error
     if datatype != _DATATYPE or about.get("core:num_channels", 1) != 1:
         raise ConfigError(f"recording {meta}: datatype {datatype!r}; only {_DATATYPE} of one channel can be replayed")
@@ -100,68 +121,105 @@ def read_recording(path: Path) -> tuple[Recording, NDArray[np.complex64]]:
 class SigmfRecorder(KeepsThread, gr.sync_block):  # type: ignore[misc]
     """Samples in, a recording out.
 
+    A disk that is full, or slower than the samples, costs the recording samples and the flowgraph nothing: ``failed``
+    counts them. Where some are missing in between, a new capture begins, whose ``core:global_index`` tells how many.
+
     :param path: of the recording, with or without suffix
     :param burst: samples of a packet, to annotate each; 0 = a continuous stream, without annotations
+    :param lossless: let the flowgraph wait for a slow disk instead
     :raises ConfigError: when there is a recording already
     :raises RadioError: when it cannot be written
     """
 
-    def __init__(self, path: Path, about: Recording, burst: int = 0) -> None:
+    def __init__(self, path: Path, about: Recording, burst: int = 0, *, lossless: bool = False) -> None:
         super().__init__("gr_ros2_sigmf_recorder", [np.complex64], None)
-        self._meta, data = (Path(f"{base_path(path)}{suffix}") for suffix in (META, DATA))
+        self._meta, self._data = (Path(f"{base_path(path)}{suffix}") for suffix in (META, DATA))
         self._about = about
         self._burst = burst
         self._began = datetime.now(timezone.utc)
-        self._lock = threading.Lock()
-        self.failed = 0
-        """Samples that could not be written, as on a full disk."""
+        self._came = self._written = 0
+        self._refused = self._unwritten = 0
+        self._guard = Guard(f"recording {self._data}")
         try:
-            self._file = data.open("xb")
+            # Unbuffered: what a full disk does not take is known at once, and not when the file is closed.
+            self._file = self._data.open("xb", buffering=0)
             self._write_meta()
         except FileExistsError as error:
-            raise ConfigError(f"recording {data}: there is one already; choose another name") from error
+            raise ConfigError(f"recording {self._data}: there is one already; choose another name") from error
         except OSError as error:
-            raise RadioError(f"recording {data}: cannot be written ({error.strerror})") from error
+            raise RadioError(f"recording {self._data}: cannot be written ({error.strerror})") from error
+        self._backlog = Backlog("gr-ros2-recording", _HELD_BYTES)
+        self._hand_over = self._backlog.put if lossless else self._backlog.offer
         self.set_output_multiple(burst or 1)
+
+    @property
+    def failed(self) -> int:
+        """Samples that could not be written, as on a full disk."""
+        return self._refused + self._unwritten
+
+    def told(self) -> list[str]:
+        """What is missing and why, as one line; none where nothing is."""
+        if self._guard.error is None and not self.failed:
+            return []
+        why = "the disk is slower than the samples" if self._guard.error is None else one_line(self._guard.error)
+        return [f"{self._guard.name}: {self.failed} samples are missing ({why})"]
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         samples = input_items[0]
-        with self._lock:
-            self._write(samples)
+        data = samples.astype(SAMPLE, copy=False).tobytes()
+        if not self._hand_over(len(data), self._write, data, self._came):
+            self._refused += len(samples)
+        self._came += len(samples)
         return len(samples)
 
     def stop(self) -> bool:
         # A flowgraph made by GRC stops, and closes nothing.
-        try:
-            with self._lock:
-                if not self._file.closed:
-                    self._file.flush()
-                    self._write_meta()
-        except OSError as error:
-            _log.warning("recording %s: cannot be finished (%s)", self._meta, error.strerror)
+        if self._backlog.settle(_PATIENCE_S) and not self._file.closed:
+            self._finish_meta()
         return super().stop()
 
     def close(self) -> None:
-        """Finish the recording. Idempotent.
+        """Finish the recording. Idempotent."""
+        if self._backlog.close(_PATIENCE_S) and not self._file.closed:
+            self._file.close()
+            self._finish_meta()
 
-        :raises OSError: when the rest of it cannot be written, as on a full disk
-        """
-        with self._lock:
-            if not self._file.closed:
-                self._file.close()
-                self._write_meta()
-
-    def _write(self, samples: NDArray[np.complex64]) -> None:
-        try:
-            at = self._file.tell() // SAMPLE.itemsize
-            self._file.write(samples.astype(SAMPLE, copy=False).tobytes())
-        except (OSError, ValueError):  # a full disk; ValueError once it is closed
-            self.failed += len(samples)
+    def _write(self, data: bytes, place: int) -> None:
+        """Write samples that came as number ``place`` and following."""
+        count, at = len(data) // SAMPLE.itemsize, self._written
+        if self._guard.error is None:
+            try:
+                left = memoryview(data)
+                while left:
+                    left = left[self._file.write(left) :]
+            except OSError as error:
+                self._guard.end(error)
+                # Of the rest nothing follows, so that what stands there is one stretch of whole samples.
+                with suppress(OSError):
+                    self._file.truncate(at * SAMPLE.itemsize)
+        if self._guard.error is not None:
+            self._unwritten += count
             return
+        self._written += count
+        if place != self._about.index_at(at) and len(self._about.gaps) < _MOST_GAPS:
+            self._about.gaps.append((at, place))
         if self._burst:
-            starts = range(at, at + len(samples), self._burst)
+            starts = range(at, at + count, self._burst)
             room = _MOST_ANNOTATIONS - len(self._about.annotations)
             self._about.annotations += [(start, self._burst, "packet") for start in starts[: max(0, room)]]
 
+    def _finish_meta(self) -> None:
+        try:
+            self._write_meta()
+        except OSError as error:
+            self._guard.end(error)
+
     def _write_meta(self) -> None:
-        self._meta.write_text(json.dumps(self._about.to_json(self._began), indent=1) + "\n", encoding="utf-8")
+        """Replace the metadata, which on a full disk stay as they are."""
+        part = self._meta.with_name(f".{self._meta.name}.part")
+        try:
+            part.write_text(json.dumps(self._about.to_json(self._began), indent=1) + "\n", encoding="utf-8")
+            part.replace(self._meta)
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise

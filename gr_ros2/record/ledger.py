@@ -1,9 +1,9 @@
 """The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
 
 Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
-a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); repeats
-count neither as sent nor as delivered; memory holds payload digests only of messages whose fate is open, and about
-33 bytes of each message besides.
+a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); a
+repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; memory holds payload
+digests only of messages whose fate is open, and about 33 bytes of each message besides.
 
 Events must come in causal order: what a packet carries is told before its reception is, and a packet's reception
 (:meth:`Ledger.packet_received`) before what the receiver makes of it. The ledger may be fed from several threads.
@@ -54,7 +54,7 @@ class TopicLedger:
 
     :param sent: messages for this link: handed to the source, or lost by its ROS graph before; repeats excluded
     :param corrupt: deliveries that match no message; 0 unless something is badly wrong
-    :param repeats_delivered: deliveries of repeats
+    :param repeats_delivered: deliveries of repeats whose message had its row already
     :param rows: ledger row -> messages
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
@@ -116,8 +116,8 @@ class _Source:
     open: _Shelf = field(default_factory=dict)
     by_entry_id: dict[tuple[int, int], _Shelf] = field(default_factory=dict)
     by_digest: dict[tuple[int, bytes], _Shelf] = field(default_factory=dict)
-    repeats: set[tuple[int, int]] = field(default_factory=set)
-    """(topic id, entry id) whose latest use was a repeat."""
+    repeats: dict[tuple[int, int], int] = field(default_factory=dict)
+    """(topic id, entry id) whose latest use was a repeat -> serial of the message repeated."""
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -282,8 +282,8 @@ class Ledger:
         source.packets_sent += 1
         for entry in event.entries:
             key = (entry.topic_id, entry.entry_id)
-            if entry.serial < 0:
-                source.repeats.add(key)
+            if entry.repeat:
+                source.repeats[key] = entry.serial
                 continue
             message = source.open.get(entry.serial)
             if message is None:  # delivered or dropped before its last fragment left
@@ -291,7 +291,7 @@ class Ledger:
             if message.entry_id < 0:
                 message.entry_id = entry.entry_id
                 message.total = entry.total
-                source.repeats.discard(key)
+                source.repeats.pop(key, None)
                 self._retire(source, key)
                 source.by_entry_id.setdefault(key, {})[entry.serial] = message
             message.sent += 1
@@ -317,9 +317,12 @@ class Ledger:
             exact = (m for m in source.by_entry_id.get(key, {}).values() if m.digest == digest)
             message = next(exact, None)
             if message is None and key in source.repeats:
-                self._topic(event.src_id, event.topic_id).repeats_delivered += 1
-                return None
-            if message is None:
+                repeated = source.open.get(source.repeats[key])
+                if repeated is None:
+                    self._topic(event.src_id, event.topic_id).repeats_delivered += 1
+                    return None
+                message = repeated if repeated.digest == digest else None
+            elif message is None:
                 message = next((m for m in same.values() if m.sent), None)
             if message is not None:
                 return self._deliver(source, message, now)
@@ -406,7 +409,7 @@ def _arrived(source: _Source, digest: bytes) -> int:
         del source.waiting[digest]
     for entry in entries:
         message = source.open.get(entry.serial)
-        if message is not None:
+        if message is not None and not entry.repeat:
             message.received += 1
     source.last_received = max(source.last_received, ordinal)
     while source.in_air and source.in_air[0][0] < source.last_received - REORDER_WINDOW:

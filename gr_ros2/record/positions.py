@@ -1,7 +1,8 @@
 """Positions out of serialized messages: which types carry one, and where.
 
 Law: only types of ROS 2 Humble whose position is one point in metres count (no latitude and longitude); a payload
-that does not deserialize has no position and is counted by who asked.
+that does not deserialize, or whose position is no finite number or beyond ``FARTHEST_M``, has no position and is
+counted by who asked.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from functools import cache
 from operator import attrgetter
 from typing import Any
 
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
+
+from gr_ros2.middleware.type_definitions import DAMAGED
 
 _POSITION_AT = {
     "geometry_msgs/msg/Point": "",
@@ -26,6 +28,10 @@ _POSITION_AT = {
     "nav_msgs/msg/Odometry": "pose.pose.position",
 }
 
+FARTHEST_M = 1e9
+"""A coordinate beyond this, twice the way to the Moon, is no position of a robot; and it would hide every other point
+in a path's figures and means."""
+
 PositionReader = Callable[[bytes], tuple[float, float] | None]
 
 
@@ -36,7 +42,8 @@ def humble_types() -> Typestore:
 
 
 def position_reader(type_name: str) -> PositionReader | None:
-    """A function from a serialized message to its (x, y) in metres, or to None where the bytes are no such message.
+    """A function from a serialized message to its (x, y) in metres, or to None where the bytes are no such message
+    or have no such position.
 
     :param type_name: ``package/msg/Type``
     :return: None where the type has no position
@@ -50,8 +57,9 @@ def position_reader(type_name: str) -> PositionReader | None:
     def read(payload: bytes) -> tuple[float, float] | None:
         try:
             point = point_of(deserialize(payload, type_name))
-        except (SerdeError, UnicodeDecodeError):
+        except DAMAGED:
             return None
-        return float(point.x), float(point.y)
+        x, y = float(point.x), float(point.y)
+        return (x, y) if abs(x) <= FARTHEST_M and abs(y) <= FARTHEST_M else None  # NaN compares as False
 
     return read

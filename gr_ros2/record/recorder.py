@@ -6,7 +6,6 @@ lock and the reading of one position; what it keeps of a message or packet are n
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from math import nan
@@ -44,7 +43,6 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
-        self.counters: Counter[str] = Counter()
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -143,11 +141,11 @@ class Recorder:
         read = self._readers.get(topic_id)
         if read is None:
             return
+        track = tracks.setdefault((src_id, topic_id), Track())
         position = read(payload)
         if position is None:
-            self.counters["unreadable_positions"] += 1
+            track.left_out += 1
             return
-        track = tracks.setdefault((src_id, topic_id), Track())
         track.t.append(t)
         track.x.append(position[0])
         track.y.append(position[1])
@@ -177,6 +175,8 @@ class Recorder:
             age_s=AgeResult(**_values(numbers.age_s)),
             path_error_m=path_error(sent.xy, received.xy),
             rms_error_m=rms_error(sent.t, sent.xy, received.t, received.xy),
+            left_out_sent=sent.left_out,
+            left_out_received=received.left_out,
             ledger=dict(sorted(book.rows.items())),
             corrupt=book.corrupt,
             repeats_delivered=book.repeats_delivered,

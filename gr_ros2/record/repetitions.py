@@ -61,7 +61,7 @@ def run_folders(path: Path) -> list[Path]:
     try:
         seeds = json.loads(listed.read_bytes())["seeds"]
         return [repetition_folder(path, k) for k in range(len(seeds))]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(
             f"{listed}: damaged or half-written, no list of repetitions; run the experiment again"
         ) from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,6 +55,8 @@ class TopicResult:
     :param rms_error_m: RMS distance at equal times, likewise
     :param sent: messages for this link: handed to the source, or lost by its ROS graph before (``lost_on_graph``)
     :param ledger: row -> messages; the rows add up to ``sent``
+    :param left_out_sent, left_out_received: messages sent, and messages received, that are in no path and in no error
+        of it: their position is not finite or beyond 1e9 m, or cannot be read
     :param corrupt: deliveries that match no message sent; 0 unless something is badly wrong
     :param repeats_delivered: deliveries of repeats, which count nowhere else
     :param latency_cdf_s: the latencies at 0 %, 1 %, … 100 %, empty where nothing was delivered
@@ -72,6 +75,8 @@ class TopicResult:
     path_error_m: _Number | None
     ledger: dict[str, _Count]
     rms_error_m: _Number | None = None
+    left_out_sent: _Count = 0
+    left_out_received: _Count = 0
     corrupt: _Count = 0
     repeats_delivered: _Count = 0
     negative_latencies: _Count = 0
@@ -91,11 +96,13 @@ class Result:
     :param duration_s: s during which messages were submitted
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
-    :param phy: name, channels (one per direction), sample_rate, airtime_s (of one packet), airtime_per_message_s and
-        airtime_per_byte_s (of all packets sent, per delivered message and byte), …
+    :param phy: name, channels (one per direction), sample_rate, runs_on (what worked on samples), airtime_s (of one
+        packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
+    :param incomplete: what was written or shown beside this result and is not whole, such as a capture on a full disk:
+        one line each, with why and how much is missing. The numbers here are whole all the same.
     """
 
     scenario: str
@@ -108,6 +115,7 @@ class Result:
     wall_s: _Number | None = None
     interrupted: bool = False
     counters: dict[str, Any] = field(default_factory=dict)
+    incomplete: tuple[str, ...] = ()
 
 
 def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:
@@ -139,6 +147,8 @@ def write_result(result: Result, path: str | Path) -> Path:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink()
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
     return path
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -77,11 +78,12 @@ SCHEMAS = {
 
 @dataclass(slots=True)
 class Track:
-    """A path: times, s on the run's clock, and positions, m."""
+    """A path: times, s on the run's clock, and positions, m; ``left_out`` counts messages without a position."""
 
     t: array[float] = field(default_factory=lambda: array("d"))
     x: array[float] = field(default_factory=lambda: array("d"))
     y: array[float] = field(default_factory=lambda: array("d"))
+    left_out: int = 0
 
     @property
     def xy(self) -> Floats:
@@ -102,7 +104,7 @@ class PacketLog:
     def sent(self, event: SentPacket) -> None:
         """A packet left the sender."""
         for entry in event.entries:
-            self._serial.append(entry.serial)
+            self._serial.append(-1 if entry.repeat else entry.serial)
             self._topic_id.append(entry.topic_id)
             self._entry_id.append(entry.entry_id)
             self._index.append(entry.index)
@@ -322,12 +324,26 @@ def write_whole(path: Path, table: Any, write: Callable[[Any, Path], object]) ->
     :raises ConfigError: when it cannot be written
     """
     part = path.with_name(f".{path.name}.part")
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write(table, part)
         part.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink()
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
+    return path
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, made if missing.
+
+    :raises ConfigError: when it cannot be made
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
     return path
 
 

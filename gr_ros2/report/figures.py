@@ -175,6 +175,7 @@ def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
     try:
         Path(directory).mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_figure(paths[0], dpi=150)
+        figure.set_layout_engine("none")  # the layout stays, and half of the time is not spent on it again
         FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
     except OSError as error:
         raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error

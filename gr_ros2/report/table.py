@@ -116,6 +116,13 @@ def notes(result: Result) -> list[str]:
     """What a reader of the tables must not miss, one line each: often nothing."""
     lines = [f"{topic.topic}: {topic.corrupt} messages arrived altered" for topic in result.topics if topic.corrupt]
     lines += [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
+    lines += [
+        f"{topic.topic}: {topic.left_out_sent} messages sent and {topic.left_out_received} received have no position "
+        "(not finite, beyond 1e9 m, or unreadable) and are left out of the path"
+        for topic in result.topics
+        if topic.left_out_sent or topic.left_out_received
+    ]
+    lines += result.incomplete
     if result.interrupted:
         lines.append(f"stopped after {result.duration_s:.1f} s")
     return lines

@@ -170,7 +170,9 @@ def main(args: Sequence[str] | None = None) -> None:
         _join(sys.argv if args is None else args)
         node = LinkNode()
         node.link.start()
-        node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {node.link.phy.name}")
+        phy = node.link.phy
+        runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
+        node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {phy.name}{runs_on}")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         while not (asked or node.link.finished):

@@ -17,9 +17,10 @@ from typing import Literal
 
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.link.events import Delivered
-from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.middleware.bag_files import RecordedTopic, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import Qos
+from gr_ros2.record.trace import make_folder
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 
@@ -30,8 +31,9 @@ class DeliveredBag:
     :param path: folder that does not exist yet
     :param origin_ns: the run's time 0, ns since 1970
     :param storage: ``sqlite3`` keeps the time of arrival alone
-    :param definitions: ``.msg`` texts of types that ROS does not ship, by type name
+    :param definitions: ``.msg`` texts by type name; of other types ROS's
     :raises BagError: when it exists already or cannot be made
+    :raises ConfigError: when the folder around it cannot be made
     """
 
     def __init__(
@@ -46,25 +48,23 @@ class DeliveredBag:
         self.not_recorded: Counter[str] = Counter()
         """Messages the disk did not take, by reason; :meth:`close` raises it."""
         self._origin_ns = origin_ns
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         self._recorder = BagRecorder(path, storage, definitions or {}, self._count)
         self._channels: dict[tuple[int, int], BagChannel] = {}
 
-    def add_source(
-        self,
-        src_id: int,
-        registry: Registry,
-        names: Mapping[int, str],
-        qos: Mapping[int, Qos] | None = None,
-    ) -> None:
-        """The topics that come from one sender.
+    def add_source(self, src_id: int, registry: Registry, names: Mapping[int, str]) -> None:
+        """The topics that come from one sender, offered with the default QoS.
 
         :param names: what they are called in the bag, by topic id
-        :param qos: offered, by topic id; a missing one is the default
         """
         for topic_id, name in names.items():
-            offered = (qos or {}).get(topic_id, Qos("reliable", "volatile", 10))
-            self._channels[src_id, topic_id] = self._recorder.channel(name, registry[topic_id].type_name, offered)
+            qos = Qos("reliable", "volatile", 10)
+            self._channels[src_id, topic_id] = self._recorder.channel(name, registry[topic_id].type_name, qos)
+
+    def copy_source(self, src_id: int, topics: Mapping[int, RecordedTopic]) -> None:
+        """The topics that come from one sender, each as it stands in the bag that was sent, by topic id."""
+        for topic_id, topic in topics.items():
+            self._channels[src_id, topic_id] = self._recorder.copy(topic)
 
     def take(self, event: Delivered, now: float, submitted: float | None) -> None:
         """One delivery; times are s since the origin.

@@ -13,18 +13,16 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_topics
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import source_names
+from gr_ros2.run.load import recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.watch import EventSink
 
 _QUIET_S = 0.3
 """A PHY that has given no packet for so long, with nothing waiting, is empty."""
@@ -59,7 +57,7 @@ class Direction:
         registry: Registry,
         phy: Phy,
         *,
-        ears: EventSink,
+        ears: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:
@@ -129,7 +127,5 @@ class Direction:
         path = self.scenario.bag_path
         if path is None:
             return open_graph(self.scenario, self.scenario.ros_source, "source")
-        found = [info.topic for info in bag_topics(path)]
-        if not set(found) & set(self.topics):
-            raise ConfigError(f"{path}: has none of {', '.join(self.topics)}; it has {', '.join(found) or 'no topics'}")
+        recorded_names(self.scenario, self.registry)  # refuses a recording with nothing for this link
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.fragment import largest_message
-from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
+from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet
-from gr_ros2.wire import single_entry_payload
+from gr_ros2.wire import Format
 
 _SAMPLE_S = 2.0
 """Simulated seconds that are generated to learn message sizes; sizes hardly vary."""
@@ -27,12 +27,11 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
 
     :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
     """
-    cls = PHY.load(scenario.phy.name)
     rate = scenario.phy.sample_rate
-    if not rate and cls.has_samples:
-        at_1_hz: Phy = cls(scenario.packet_len, 1.0, **scenario.phy.options)
+    if not rate and PHY.load(scenario.phy.name).has_samples:
+        at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
         rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
-    phy: Phy = cls(scenario.packet_len, rate, **scenario.phy.options)
+    phy = configured(scenario.phy, scenario.packet_len, rate)
     phy.check_channel(scenario.channel)
     return phy
 
@@ -65,6 +64,31 @@ def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     return {topic.on_graph(scenario.ros_source.namespace): topic.topic_id for topic in chosen}
 
 
+def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
+    """Those of :func:`source_names` that the scenario's recording has.
+
+    :raises ConfigError: it has none of them, or one with another type or as one that cannot be carried
+    :raises BagError: it cannot be read
+    """
+    names = source_names(scenario, registry)
+    contents = recording(scenario)
+    for name, topic_id in names.items():
+        contents.check(name, registry[topic_id].type_name)
+    found = {name: topic_id for name, topic_id in names.items() if name in contents.topics}
+    if not found:
+        has = "; ".join([", ".join(contents.topics) or "no topics", *contents.remarks])
+        raise ConfigError(f"{contents.path}: has none of {', '.join(names)}; it has {has}")
+    return found
+
+
+def recording(scenario: Scenario) -> BagContents:
+    """What the scenario's recording has, nothing where the simulator is the source.
+
+    :raises BagError: it cannot be read
+    """
+    return BagContents(Path(), {}, {}, ()) if scenario.bag_path is None else bag_contents(scenario.bag_path)
+
+
 def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     names = source_names(scenario, registry)
     duration = min(_SAMPLE_S, scenario.duration_s)
@@ -77,15 +101,16 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     packets = 0.0
     for topic, size in sizes.items():
         rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
-        packets += _packets_alone(size, scenario.packet_len) * (rate or 1 / scenario.duration_s)
+        alone = _packets_alone(size, scenario.packet_len, scenario.ros_source.wire_format)
+        packets += alone * (rate or 1 / scenario.duration_s)
     return packets, 1.0
 
 
 def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
     packets, first, last = 0, 0, 0
-    for message in read_bag(scenario.bag_path, source_names(scenario, registry)):
-        packets += _packets_alone(len(message.payload), scenario.packet_len)
+    for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
+        packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
         first = first or message.stamp_ns
         last = message.stamp_ns
         if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
@@ -94,6 +119,6 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     return packets, seconds or 1.0
 
 
-def _packets_alone(size: int, packet_len: int) -> int:
+def _packets_alone(size: int, packet_len: int, wire: Format) -> int:
     """Packets that a message of this size needs alone; one too large for the link needs none."""
-    return max(-(-size // single_entry_payload(packet_len)), 1) if size <= largest_message(packet_len) else 0
+    return max(-(-size // wire.single_entry_payload(packet_len)), 1) if size <= wire.largest_message(packet_len) else 0

@@ -247,7 +247,7 @@ def _read(path: Path, table: LossTable) -> None:
             table.points.update(points)
     except FileNotFoundError:
         return
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         _log.warning("%s: no table of losses (%s); measuring again", path, error)
 
 

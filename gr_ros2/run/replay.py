@@ -1,8 +1,8 @@
 """A recording through a link and a channel into a recording: what it would have looked like at the other end.
 
 Laws: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types, type
-definitions, offered QoS and payloads (with them header stamps) are those of the original; the file appears whole or
-not at all.
+definitions, the QoS of every publisher and payloads (with them header stamps) are those of the original; a topic that
+a link cannot carry is left out and said; the file appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from typing import Literal
 
 from gr_ros2.config import TopicOptions, replaced
 from gr_ros2.errors import BagError, ConfigError
-from gr_ros2.middleware.bag_files import bag_definitions, bag_topics
-from gr_ros2.middleware.base import TopicInfo
+from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
 from gr_ros2.registry import MAX_TOPICS, Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
@@ -33,12 +32,14 @@ _STORAGES: dict[str, Literal["mcap", "sqlite3"]] = {".mcap": "mcap", ".db3": "sq
 class Replayed:
     """What a replay did.
 
-    :param carried, left_out: topics of the original
+    :param carried, left_out: topics of the original, by absolute name
+    :param remarks: why a topic could not be carried, and where the original's counts differ, one line each
     """
 
     outcome: Outcome
     carried: tuple[str, ...]
     left_out: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
 
 
 def replay(
@@ -58,45 +59,48 @@ def replay(
     :param scenario: its own source plays no part; ``time`` real becomes samples
     :param topics: absolute names; () = as the registry says
     :raises BagError: when ``source`` cannot be read, or ``target`` exists or cannot be written
-    :raises ConfigError: for a topic the recording has not, for too many of them, or a wrong scenario
+    :raises ConfigError: for a topic the recording has not or a link cannot carry, for too many of them, or a wrong
+        scenario
     """
     if target.exists():
         raise BagError(f"{target}: exists already; choose another name or remove it")
-    recorded = {info.topic: info for info in bag_topics(source)}
+    contents = bag_contents(source)
+    recorded = contents.topics
     scenario = replace(
         scenario, source=f"bag:{source}", bag_speed=1.0, time="samples" if scenario.time == "real" else scenario.time
     )
     registry = scenario.load_registry()
     names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in recorded}
     if topics or not names:
-        scenario, registry = _made_for(scenario, registry, recorded, topics, source)
+        scenario, registry = _made_for(scenario, registry, contents, topics)
         names = source_names(scenario, registry)
     else:
         carried = tuple(registry[topic_id].name for topic_id in names.values())
         scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
     _check_types(names, registry, recorded, source)
     src_id = scenario.ros_source.src_id()
-    with _bag_at(target, bag_origin_ns(scenario, names), bag_definitions(source)) as bag:
-        bag.add_source(
-            src_id,
-            registry,
-            {topic_id: name for name, topic_id in names.items()},
-            {topic_id: recorded[name].publishers[0] for name, topic_id in names.items()},
-        )
+    with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
+        bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
         outcome = run_simulated(scenario, None, on_progress, registry=registry, bag=bag)
-    return Replayed(outcome, tuple(names), tuple(name for name in recorded if name not in names))
+    left_out = sorted({*recorded, *contents.left_out} - set(names))
+    return Replayed(outcome, tuple(names), tuple(left_out), tuple(contents.remarks))
 
 
 def _made_for(
-    scenario: Scenario, registry: Registry, recorded: Mapping[str, TopicInfo], topics: Sequence[str], source: Path
+    scenario: Scenario, registry: Registry, contents: BagContents, topics: Sequence[str]
 ) -> tuple[Scenario, Registry]:
     """The scenario with a registry made of the recording; options of topics that both have are kept."""
-    unknown = [name for name in topics if name not in recorded]
-    if unknown:
-        raise ConfigError(f"topics = {unknown[0]!r}: {source} has {', '.join(recorded) or 'no topics'}")
-    rows = {name: recorded[name].type_name for name in topics or recorded}
+    source, recorded = contents.path, contents.topics
+    for name in topics:
+        if name in contents.left_out:
+            raise ConfigError(
+                f"topics = {name!r}: {source} has it, and it cannot be carried: {contents.left_out[name]}"
+            )
+        if name not in recorded:
+            raise ConfigError(f"topics = {name!r}: {source} has {', '.join(recorded) or 'no topics'}")
+    rows = {name: recorded[name].info.type_name for name in topics or recorded}
     if not rows:
-        raise ConfigError(f"{source}: has no topics")
+        raise ConfigError("; ".join([f"{source}: has no topics that a link can carry", *contents.remarks]))
     if len(rows) > MAX_TOPICS:
         raise ConfigError(
             f"{source}: has {len(rows)} topics, and a link carries {MAX_TOPICS}; choose with --topics from "
@@ -117,23 +121,25 @@ def _made_for(
     return scenario, Registry.from_rows(rows)
 
 
-def _check_types(names: Mapping[str, int], registry: Registry, recorded: Mapping[str, TopicInfo], source: Path) -> None:
+def _check_types(
+    names: Mapping[str, int], registry: Registry, recorded: Mapping[str, RecordedTopic], source: Path
+) -> None:
     for name, topic_id in names.items():
-        if recorded[name].type_name != registry[topic_id].type_name:
+        if (type_name := recorded[name].info.type_name) != registry[topic_id].type_name:
             raise ConfigError(
-                f"{source}: {name} is {recorded[name].type_name}, in the registry {registry[topic_id].type_name}; "
+                f"{source}: {name} is {type_name}, in the registry {registry[topic_id].type_name}; "
                 "choose with --topics, which takes the recording's"
             )
 
 
 @contextmanager
-def _bag_at(target: Path, origin_ns: int, definitions: Mapping[str, str]) -> Iterator[DeliveredBag]:
+def _bag_at(target: Path, origin_ns: int) -> Iterator[DeliveredBag]:
     """A bag that is at ``target`` when the block ends well, and nowhere otherwise."""
     storage = _STORAGES.get(target.suffix)
     folder = target if storage is None else target.with_name(f".{target.name}.part")
     if folder != target:
         shutil.rmtree(folder, ignore_errors=True)
-    with DeliveredBag(folder, origin_ns, storage or "mcap", definitions) as bag:
+    with DeliveredBag(folder, origin_ns, storage or "mcap") as bag:
         yield bag
     if storage is not None:
         next(folder.glob(f"*{target.suffix}")).replace(target)

@@ -16,19 +16,21 @@ from shutil import copyfile
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
+from gr_ros2.guard import Guard, one_line
+from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, Result, write_result
-from gr_ros2.record.trace import write_trace, write_whole
+from gr_ros2.record.trace import make_folder, write_trace, write_whole
 from gr_ros2.run.direction import Direction, open_graph
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulated import run_simulated
-from gr_ros2.run.watch import Fanout, LiveRun, Watcher
+from gr_ros2.run.watch import LiveRun, Onlookers, Watcher
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -45,11 +47,17 @@ class Listener:
     """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
 
     :param graphs: name and type of the topics to hear, by graph
+    :param definitions: ``.msg`` texts of types by name; ROS's where missing
     """
 
-    def __init__(self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path) -> None:
+    def __init__(
+        self, graphs: Mapping[Middleware, Mapping[str, str]], bag: Path, definitions: Mapping[str, str]
+    ) -> None:
         self.received: Counter[str] = Counter()
-        self._bag = BagMiddleware(path=bag, mode="write")
+        self._closed = False
+        self._guard = Guard("bag of delivered messages")
+        # A reader that waits for the disk would make DDS hold up the link's own publisher.
+        self._bag = BagMiddleware(path=bag, mode="write", definitions=definitions, lossless=False)
         self._publishers = {
             name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
         }
@@ -60,8 +68,8 @@ class Listener:
         }
 
     def _take(self, name: str, payload: bytes) -> None:
-        self._publishers[name].publish(payload)
         self.received[name] += 1
+        self._guard(self._publishers[name].publish, payload)
 
     def matched(self) -> bool:
         """Whether every topic has found its publisher."""
@@ -72,10 +80,19 @@ class Listener:
         return {name: subscription.lost for name, subscription in self._subscriptions.items() if subscription.lost}
 
     def close(self) -> None:
-        """Stop listening and finish the bag."""
-        for subscription in self._subscriptions.values():
-            subscription.close()
-        self._bag.close()
+        """Stop listening and finish the bag. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            for subscription in self._subscriptions.values():
+                subscription.close()
+            self._guard.last(self._bag.close)
+
+    def told(self) -> list[str]:
+        """What is missing in the bag, as one line; none where nothing is. To be asked when it is closed."""
+        missed = sum(self._bag.counters.values())
+        if self._guard.error is not None:  # a storage writes in chunks: what it took before may not be there either
+            return [f"{one_line(self._guard.error)}; any of its {self.received.total()} messages may be missing"]
+        return [f"bag {self._bag.path}: slower than the link; {missed} messages are missing"] if missed else []
 
 
 def run_scenario(
@@ -96,16 +113,16 @@ def run_scenario(
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
+    onlookers = Onlookers(watchers, apart=scenario.time == "real")
     outcome: Outcome | None = None
     try:
         if scenario.time == "real":
             with ExitStack() as stack:
-                outcome = _Run(scenario, out, stack, watchers).execute(on_progress)
+                outcome = _Run(scenario, out, stack, onlookers).execute(on_progress)
         else:
-            outcome = run_simulated(scenario, out, on_progress, watchers)
+            outcome = run_simulated(scenario, out, on_progress, onlookers)
     finally:
-        for watcher in watchers:
-            watcher.run_ended(None if outcome is None else outcome.result)
+        onlookers.run_ended(None if outcome is None else outcome.result)
     if out is not None:
         write_trace(outcome.trace, out)
         write_whole(out / REGISTRY_FILE, scenario.registry, copyfile)
@@ -142,9 +159,7 @@ def run_repetitions(
 
 
 class _Run:
-    def __init__(
-        self, scenario: Scenario, out: Path | None, stack: ExitStack, watchers: Sequence[Watcher] = ()
-    ) -> None:
+    def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, onlookers: Onlookers) -> None:
         self.scenario = scenario
         self.registry = scenario.load_registry()
         ways = scenario.directions()
@@ -153,21 +168,22 @@ class _Run:
         namespaces = {way.ros_source.src_id(): way.ros_source.namespace for way in ways}
         topics = {way.ros_source.src_id(): source_names(way, self.registry).values() for way in ways}
         self.recorder = Recorder(self.registry, namespaces, topics)
+        self.onlookers = onlookers
+        self.progress_guard = Guard("progress")
         self.interrupted = False
         self.listener: Listener | None = None
         self.sim: SimPublisher | None = None
         try:
-            ears = Fanout([self.recorder, *watchers])
-            instrumented = any(watcher.instruments for watcher in watchers)
+            ears = Observers[LinkObserver]()
+            self.recording = ears.add(self.recorder, needed=True)
+            ears.add(onlookers)
             self.directions = [
-                Direction(way, self.registry, phy, ears=ears, stack=stack, instrumented=instrumented)
+                Direction(way, self.registry, phy, ears=ears, stack=stack, instrumented=onlookers.instruments)
                 for way, phy in zip(ways, phys, strict=True)
             ]
             if out is not None:
-                out.mkdir(parents=True, exist_ok=True)
-                self.listener = self._listen(out, stack)
-            for watcher in watchers:
-                watcher.run_started(self._live())
+                self.listener = self._listen(make_folder(out), stack)
+            onlookers.run_started(self._live())
             if scenario.bag_path is None:
                 self.sim = SimPublisher(Fleet(scenario.sim), self._robots(stack), scenario.duration_s)
                 stack.callback(self.sim.close)
@@ -201,7 +217,7 @@ class _Run:
             stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
             for way in self.directions
         }
-        listener = Listener(graphs, out / DELIVERED_BAG)
+        listener = Listener(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
 
@@ -231,6 +247,8 @@ class _Run:
         drained = not self.interrupted and self._empty()
         for way in self.directions:
             way.link.stop()
+        self.onlookers.settle()
+        self.recording.check()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
@@ -246,6 +264,7 @@ class _Run:
             wall_s=time.monotonic() - wall,
             interrupted=self.interrupted,
             counters=self._counters(),
+            incomplete=tuple(self._incomplete()),
         )
         names = {
             name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
@@ -296,9 +315,18 @@ class _Run:
         return all(way.empty(bool(self.recorder.ledger.unresolved())) for way in self.directions)
 
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
+        self.recording.check()
         if on_progress is not None:
             sent, delivered = self.recorder.progress()
-            on_progress(Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered))
+            now = Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered)
+            self.progress_guard(on_progress, now)
+
+    def _incomplete(self) -> list[str]:
+        """What onlookers and the bag of delivered messages missed; the bag is closed for that."""
+        if self.listener is None:
+            return self.onlookers.told()
+        self.listener.close()
+        return [*self.onlookers.told(), *self.listener.told()]
 
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)

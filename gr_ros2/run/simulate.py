@@ -16,24 +16,27 @@ from functools import lru_cache
 from math import inf
 from typing import Any
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Receiver, Sender, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.losses import PduLosses
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.receiver import ReceiverStats
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
-from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.watch import EventSink
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.settings import SimSettings
 
+_LONGEST_GAP_S = 30 * 86400.0
+"""s between two neighbouring messages of a recording. A longer one is a stamp that was never set, and the link would be
+computed over all of it: 30 years where the first stamp is 0."""
 _REMEMBERED_S = 60.0
 """Of two robots with all their topics that is 5 MB."""
 
@@ -82,20 +85,29 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
     """What the scenario's source gives to the link, in time order.
 
     :raises ConfigError: for a recording played as fast as the link takes it, which has no times
+    :raises BagError: for one whose times leap by more than 30 days
     """
-    names = source_names(scenario, registry)
     if scenario.bag_path is None:
+        names = source_names(scenario, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
     if not scenario.bag_speed:
         raise ConfigError("bag_speed = 0: a recording as fast as the link takes it cannot be simulated; set it above 0")
-    first = None
+    names = recorded_names(scenario, registry)
+    first = last = None
     for message in read_bag(scenario.bag_path, names):
         first = message.stamp_ns if first is None else first
         t = (message.stamp_ns - first) * 1e-9 / scenario.bag_speed
         if scenario.duration_s and t >= scenario.duration_s:
             return
+        gap = 0.0 if last is None else (message.stamp_ns - last) * 1e-9
+        if gap > _LONGEST_GAP_S:
+            raise BagError(
+                f"bag {scenario.bag_path}: a message on {message.topic} was recorded {gap / 86400:.0f} days after the "
+                "one before it; cut the recording there, or set duration_s to end before it"
+            )
+        last = message.stamp_ns
         yield Offered(t, names[message.topic], message.payload)
 
 
@@ -255,7 +267,7 @@ class Reception:
         self,
         scenario: Scenario,
         registry: Registry,
-        ears: EventSink,
+        ears: LinkObserver,
         codec: MessageCodec | None = None,
         overhead_s: float = 0.0,
     ) -> None:

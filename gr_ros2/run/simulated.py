@@ -9,6 +9,7 @@ samples, as in a run in real time, so neither noise nor fading moves on in it.
 from __future__ import annotations
 
 import heapq
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,28 +17,32 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from gr_ros2.guard import Guard
 from gr_ros2.link import Missed, Refused
 from gr_ros2.link.losses import PduLosses
+from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import Landed, Reception, Step, Transmission, drop_packets, offered
-from gr_ros2.run.watch import EventSink, Fanout, LiveRun, Watcher
+from gr_ros2.run.watch import LiveRun, Onlookers
 
 _REPORT_S = 0.05
+
+_log = logging.getLogger(__name__)
 
 
 def run_simulated(
     scenario: Scenario,
     out: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-    watchers: Sequence[Watcher] = (),
+    onlookers: Onlookers | None = None,
     *,
     registry: Registry | None = None,
     bag: DeliveredBag | None = None,
@@ -46,7 +51,7 @@ def run_simulated(
 
     :param out: folder for the bag of delivered messages, made if missing; None writes none
     :param on_progress: called about 20 times a second
-    :param watchers: onlookers; there is no flowgraph for them to act on
+    :param onlookers: hear everything; there is no flowgraph for them to act on
     :param registry: None takes the scenario's
     :param bag: where delivered messages go instead
     :raises ConfigError: when the scenario cannot be set up
@@ -59,7 +64,10 @@ def run_simulated(
     with ExitStack() as stack:
         if bag is None and out is not None:
             origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
-            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns))
+            source = recording(scenario)
+            for line in source.differences:
+                _log.warning(line)
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
@@ -69,21 +77,24 @@ def run_simulated(
             {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
             on_delivery=None if bag is None else bag.take,
         )
-        ears = Fanout([recorder, *watchers])
+        onlookers = onlookers or Onlookers(apart=False)
+        ears = Observers[LinkObserver]()
+        recorded = ears.add(recorder, needed=True)
+        ears.add(onlookers)
         directions = [_Direction(way, registry, phy, ears) for way, phy in zip(ways, phys, strict=True)]
         clock = _Clock()
-        live = _live_run(scenario, registry, recorder, clock)
-        for watcher in watchers:
-            watcher.run_started(live)
-        reported = 0.0
+        onlookers.run_started(_live_run(scenario, registry, recorder, clock))
+        reported, progress = 0.0, Guard("progress")
         for now, number, step in heapq.merge(*(one.timed(place) for place, one in enumerate(directions)), key=_when):
             clock.now = now
             directions[number].reception.take(step)
+            recorded.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
-                on_progress(Progress(now, scenario.duration_s, *recorder.progress()))
+                progress(on_progress, Progress(now, scenario.duration_s, *recorder.progress()))
         for direction in directions:
             direction.reception.wait_until(direction.transmission.end)
+        recorded.check()
     played = max(direction.transmission.duration_s for direction in directions)
     topics = recorder.finish(played, played, all(direction.transmission.empty for direction in directions))
     there, *back = (direction.counters() for direction in directions)
@@ -96,6 +107,7 @@ def run_simulated(
         packets=recorder.ledger.packets(),
         phy=phy_numbers(phys[0], len(ways), recorder),
         wall_s=time.monotonic() - began,
+        incomplete=tuple(onlookers.told()),
         counters={**there, **({"back": back[0]} if back else {}), "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
@@ -114,7 +126,7 @@ class _Clock:
 class _Direction:
     """Sender, air and receiver of one direction."""
 
-    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ears: EventSink) -> None:
+    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ears: LinkObserver) -> None:
         self.transmission = Transmission(scenario, registry, phy.airtime())
         self.reception = Reception(scenario, registry, ears)
         self._scenario, self._registry = scenario, registry

@@ -1,25 +1,37 @@
 """What a run shows to whoever looks on, such as a dashboard: the events of both ends, and the parts while they run.
 
-Law: the run never depends on an onlooker; without one nothing of this costs anything.
+Law: the run never depends on an onlooker, whether that raises, hangs or is slow; without one nothing of this costs
+anything.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
+from gr_ros2.backlog import Backlog
 from gr_ros2.config import ChannelConfig
+from gr_ros2.errors import RunError
 from gr_ros2.gr import RosSource
-from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.guard import Guard
+from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
 from gr_ros2.phy.path import LinkCounts
 from gr_ros2.phy.tap import Samples
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
+
+_HELD_BYTES = 1 << 25
+"""Of events that an onlooker in a thread of its own has not heard yet."""
+_EVENT_BYTES = 256
+"""What an event holds beside packet and payload."""
+_PATIENCE_S = 5.0
+"""s an onlooker may take to come to the end of what it was told."""
 
 
 class LiveLink(Protocol):
@@ -66,21 +78,8 @@ class LiveRun:
     clock: Callable[[], float] = time.monotonic
 
 
-class EventSink(Protocol):
-    """What hears both ends. It is called from the run's threads, in causal order, and must be quick and never raise."""
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender with this source id reports."""
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        """Bytes the PHY handed to the sink, before the sink reads them."""
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports; of a delivery once it is republished."""
-
-
-class Watcher(EventSink, Protocol):
-    """An onlooker.
+class Watcher(LinkObserver, Protocol):
+    """An onlooker. Its ``name``, where it has one, stands in what is said about it.
 
     :param instruments: whether the link is to be built so that its channel can be changed and its signal seen
     """
@@ -95,29 +94,7 @@ class Watcher(EventSink, Protocol):
         """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
 
 
-_Sink = TypeVar("_Sink", bound=EventSink)
-
-
-class Fanout(Generic[_Sink]):
-    """Hands every event to several, in their order."""
-
-    def __init__(self, sinks: Sequence[_Sink]) -> None:
-        self._sinks = tuple(sinks)
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        for sink in self._sinks:
-            sink.sender_event(src_id, event)
-
-    def packet_received(self, data: bytes, now: float) -> None:
-        for sink in self._sinks:
-            sink.packet_received(data, now)
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        for sink in self._sinks:
-            sink.receiver_event(event, now)
-
-
-class Audience(Fanout[Watcher]):
+class Audience(Observers[Watcher]):
     """A watcher that passes everything on to whoever looks on at the moment: they may come while the run goes on.
 
     Who comes late is told of the run, and from then on of every event.
@@ -125,27 +102,105 @@ class Audience(Fanout[Watcher]):
     :param instruments: see :class:`Watcher`; for everybody who may come
     """
 
+    name = "audience"
+
     def __init__(self, instruments: bool = True) -> None:
-        super().__init__(())
+        super().__init__()
         self.instruments = instruments
         self._lock = threading.Lock()
         self._run: LiveRun | None = None
 
-    def add(self, watcher: Watcher) -> None:
+    def invite(self, watcher: Watcher) -> None:
         """Let one more look on, from now."""
         with self._lock:
+            guard = Guard(name_of(watcher))
             if self._run is not None:
-                watcher.run_started(self._run)
-            self._sinks += (watcher,)
+                guard(watcher.run_started, self._run)
+            self._guarded += ((watcher, guard),)
 
     def run_started(self, run: LiveRun) -> None:
         with self._lock:
             self._run = run
-            for watcher in self._sinks:
-                watcher.run_started(run)
+            for watcher, guard in self._guarded:
+                guard(watcher.run_started, run)
 
     def run_ended(self, result: Result | None) -> None:
         with self._lock:
             self._run = None
-            for watcher in self._sinks:
-                watcher.run_ended(result)
+            for watcher, guard in self._guarded:
+                guard.last(watcher.run_ended, result)
+
+
+class Onlookers(Observers[Watcher]):
+    """The watchers of one run or link, which can neither stop it nor hold it up.
+
+    :param apart: give each a thread of its own and a bounded memory of what it has not heard yet; what does not fit is
+        left out and counted. Otherwise they hear everything at once, as is right where time waits: in simulated time.
+    """
+
+    def __init__(self, watchers: Iterable[Watcher] = (), *, apart: bool) -> None:
+        self._apart = [Apart(watcher) for watcher in watchers] if apart else []
+        super().__init__(self._apart if apart else watchers)
+        self.instruments = any(watcher.instruments for watcher, _ in self._guarded)
+
+    def run_started(self, run: LiveRun) -> None:
+        """See :class:`Watcher`."""
+        for watcher, guard in self._guarded:
+            guard(watcher.run_started, run)
+
+    def settle(self) -> None:
+        """Wait until all have heard everything so far; the link has stopped. Who takes too long has missed the rest."""
+        for watcher in self._apart:
+            watcher.settle()
+
+    def run_ended(self, result: Result | None) -> None:
+        """See :class:`Watcher`; nothing follows."""
+        for watcher, guard in self._guarded:
+            guard.last(watcher.run_ended, result)
+
+
+class Apart(Observers[Watcher]):
+    """A watcher with a thread of its own."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        super().__init__((watcher,))
+        self.name = name_of(watcher)
+        self.instruments = watcher.instruments
+        self._watcher, self._guard = self._guarded[0]
+        self._backlog = Backlog(f"gr-ros2-{self.name}"[:40], _HELD_BYTES)
+        self._over = False
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        size = len(event.data) if isinstance(event, SentPacket) else len(getattr(event, "payload", b""))
+        self._pass_on(size, self._watcher.sender_event, src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        self._pass_on(len(data), self._watcher.packet_received, data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        self._pass_on(len(getattr(event, "payload", b"")), self._watcher.receiver_event, event, now)
+
+    def run_started(self, run: LiveRun) -> None:
+        self._backlog.offer(0, self._guard, self._watcher.run_started, run)
+
+    def settle(self) -> None:
+        if not self._backlog.settle(_PATIENCE_S):
+            self._give_up()
+
+    def run_ended(self, result: Result | None) -> None:
+        self._over = True
+        self._backlog.offer(0, self._guard.last, self._watcher.run_ended, result)
+        if not self._backlog.close(_PATIENCE_S if self._guard.error is None else 0):
+            self._give_up()
+
+    def _pass_on(self, size: int, call: Callable[..., object], *arguments: object) -> None:
+        if self._over:
+            return
+        if self._guard.error is not None or not self._backlog.offer(_EVENT_BYTES + size, self._guard, call, *arguments):
+            self._guard.miss()
+
+    def _give_up(self) -> None:
+        """It hangs: what waits will not be heard."""
+        if self._guard.error is None:
+            self._guard.end(RunError(f"it has not come back for {_PATIENCE_S:g} s"))
+            self._guard.miss(self._backlog.pending)

@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gr_ros2.config import MAX_PACKET_LEN, SINGLE_ENTRY_OVERHEAD, replaced
+from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.fragment import largest_message
 from gr_ros2.link.freshness import TURN
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import offered, simulate
-from gr_ros2.wire import ENTRY_HEADER_LEN, decode, pad_len
+from gr_ros2.wire import decode
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -172,6 +171,7 @@ class Planner:
     def _packet_lens(self) -> list[int]:
         """Packet lengths into which the messages of some topic fit whole, or in a few equal parts."""
         source = self.scenario.ros_source
+        wire = source.wire_format
         sizes: dict[int, list[int]] = {}
         for message in self._messages:
             sizes.setdefault(message.topic_id, []).append(self._size(message.topic_id, message.payload))
@@ -179,11 +179,11 @@ class Planner:
         lens = set()
         for values in sizes.values():
             most = sorted(values)[int(0.99 * (len(values) - 1))]
-            lens |= {-(-most // parts) + SINGLE_ENTRY_OVERHEAD for parts in _PARTS}
+            lens |= {wire.packed_len([-(-most // parts)]) for parts in _PARTS}
         lens.discard(self.scenario.packet_len)
-        usable = range(source.min_fragment + SINGLE_ENTRY_OVERHEAD, MAX_PACKET_LEN + 1)
+        usable = range(wire.packed_len([source.min_fragment]), wire.max_packet_len + 1)
         return sorted(
-            packet_len for packet_len in lens if packet_len in usable and largest <= largest_message(packet_len)
+            packet_len for packet_len in lens if packet_len in usable and largest <= wire.largest_message(packet_len)
         )
 
     def _codec(self, compression: bool) -> _Remembering | None:
@@ -201,7 +201,7 @@ class Planner:
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
-        phy: Phy = PHY.load(scenario.phy.name)(scenario.packet_len, self.phy.sample_rate, **scenario.phy.options)
+        phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
         codec = self._codec(scenario.ros_source.compression)
         duration = scenario.duration_s or self._messages[-1].t
@@ -210,15 +210,17 @@ class Planner:
         padded = 0
         cut = False
 
-        def share(packet: SentPacket) -> None:
+        wire = scenario.ros_source.wire_format
+
+        def share(sent: SentPacket) -> None:
             nonlocal padded, cut
-            entries = decode(packet.data, scenario.packet_len).entries
-            cut = cut or any(entry.total > 1 for entry in entries)
-            lengths = [len(entry.payload) for entry in entries]
-            padded += pad_len(scenario.packet_len, lengths)
-            whole = sum(lengths) + ENTRY_HEADER_LEN * len(entries)
-            for entry, length in zip(entries, lengths, strict=True):
-                shares[entry.topic_id] += airtime * (length + ENTRY_HEADER_LEN) / whole  # type: ignore[assignment]
+            cut = cut or any(entry.total > 1 for entry in sent.entries)
+            layout = wire.layout(decode(sent.data, scenario.packet_len), scenario.packet_len)
+            padded += sum(span.size for span in layout if span.kind == "pad")
+            whole = sum(span.size for span in layout if span.entry is not None)
+            for span in layout:
+                if span.entry is not None:
+                    shares[span.entry.topic_id] += airtime * span.size / whole  # type: ignore[assignment]
 
         run = simulate(scenario, phy=phy, messages=iter(messages), codec=codec, on_packet=share, overhead_s=OVERHEAD_S)
         names = source_names(scenario, self.registry)

@@ -1,6 +1,12 @@
-"""The wire format: packets of version 0 (the paper, section 5) to bytes and back. No IO, no state."""
+"""The wire format: packets to bytes and back, one module per version. No IO, no state.
+
+Nothing outside of here knows where a byte stands or how wide a field is: what depends on it is asked of a
+:class:`Format`. ``v0`` is the paper's (section 5).
+"""
 
 from __future__ import annotations
+
+from collections.abc import Collection, Mapping
 
 from gr_ros2.errors import (
     CrcError,
@@ -14,51 +20,69 @@ from gr_ros2.errors import (
     VersionError,
     WireError,
 )
-from gr_ros2.wire.codec import VERSION, crc16, decode, encode
-from gr_ros2.wire.packet import (
-    CRC_LEN,
-    ENTRY_HEADER_LEN,
-    HEADER_LEN,
-    MAX_ENTRIES,
-    MAX_TOTAL,
+from gr_ros2.wire.format import (
+    BROADCAST,
     QOS_BULK,
     QOS_DEFAULT,
     QOS_LATENCY,
+    QOS_NAMES,
     Entry,
+    Format,
     Packet,
-    equal_entry_payload,
-    overhead,
-    pad_len,
-    single_entry_payload,
+    Span,
 )
+from gr_ros2.wire.numbers import unwrap
+from gr_ros2.wire.v0 import V0
 
 __all__ = [
-    "CRC_LEN",
-    "ENTRY_HEADER_LEN",
-    "HEADER_LEN",
-    "MAX_ENTRIES",
-    "MAX_TOTAL",
+    "BROADCAST",
+    "FORMATS",
     "QOS_BULK",
     "QOS_DEFAULT",
     "QOS_LATENCY",
-    "VERSION",
+    "QOS_NAMES",
     "CrcError",
     "EncodeError",
     "Entry",
     "EntryBoundsError",
+    "Format",
     "IndexRangeError",
     "LengthError",
     "NoEntriesError",
     "Packet",
     "PadError",
+    "Span",
     "TotalError",
     "VersionError",
     "WireError",
-    "crc16",
     "decode",
-    "encode",
-    "equal_entry_payload",
-    "overhead",
-    "pad_len",
-    "single_entry_payload",
+    "format_of",
+    "unwrap",
 ]
+
+FORMATS: Mapping[int, Format] = {V0.version: V0}
+"""By version."""
+
+
+def format_of(version: int) -> Format:
+    """The format of a version.
+
+    :raises VersionError: for one that is not known here
+    """
+    if version not in FORMATS:
+        raise VersionError(f"version {version}; known are {', '.join(map(str, FORMATS))}")
+    return FORMATS[version]
+
+
+def decode(data: bytes, packet_len: int, accept: Collection[int] = FORMATS.keys()) -> Packet:
+    """The packet in these bytes, read by the version that its first four bits say.
+
+    What says another version is refused as the lowest accepted one refuses it: damaged by its CRC (a damaged version
+    is damage like any other), intact by its version.
+
+    :param packet_len: of the link
+    :param accept: versions to take, at least one
+    :raises WireError: see the ``decode`` of each version
+    """
+    version = data[0] >> 4 if data else -1
+    return FORMATS[version if version in accept else min(accept)].decode(data, packet_len)

@@ -43,6 +43,7 @@ def completions(words: list[str], tmp_path: Path) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is missing")
 def test_bash_completes_commands_scenarios_and_options(tmp_path: Path) -> None:
     assert completions(["gr-ros2", "re"], tmp_path) == [name for name in COMMANDS if name.startswith("re")]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,9 @@ import pytest
 
 from gr_ros2.cli.doorbell import Doorbell, folder, neighbours, ring
 from gr_ros2.errors import ConfigError, RunError
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
+
+PATIENCE_S = 60.0
 
 
 @pytest.fixture(autouse=True)
@@ -62,3 +67,112 @@ def test_one_that_was_killed_is_cleared_away() -> None:
         victim.wait()
     wait_for(lambda: neighbours() == {}, "the dead one to be forgotten")
     assert list(folder().iterdir()) == []
+
+
+def visit() -> socket.socket:
+    """Somebody at our own door who has said nothing yet."""
+    visitor = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    visitor.settimeout(PATIENCE_S)
+    visitor.connect(str(folder() / f"{os.getpid()}.sock"))
+    return visitor
+
+
+def serve(asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    if asked.get("port") == "broken":
+        raise RuntimeError("no page today")
+    return {"url": f"{asked['address']}:{int(asked['port'])}"}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"[" * 4000, b'{"a":' * 900, b'{"port": Infinity, "address": 1}', b'{"port": ' + b"9" * 4000, b'"\xff'),
+        *(b"[1]", b"7", b"null", b"\0", b'{"port": 1}', b'{"port": [], "address": {}}'),
+    ],
+)
+def test_whatever_is_said_the_next_is_answered(line: bytes) -> None:
+    with Doorbell("demo", serve):
+        with visit() as visitor:
+            visitor.sendall(line + b"\n")
+            assert b"error" in visitor.makefile("rb").readline()
+        assert ring(os.getpid(), {"address": "x", "port": 3})["url"] == "x:3"
+
+
+def test_an_answer_that_fails_is_told_and_the_next_is_answered() -> None:
+    with Doorbell("demo", serve):
+        with pytest.raises(RunError, match="RuntimeError: no page today"):
+            ring(os.getpid(), {"port": "broken"})
+        assert ring(os.getpid(), {"address": "x", "port": 3})["url"] == "x:3"
+
+
+@pytest.mark.parametrize("said", [b"", b'{"port":'])
+@pytest.mark.parametrize("count", [5, 100])
+def test_nobody_waits_for_those_who_do_not_speak(said: bytes, count: int) -> None:
+    with ExitStack() as visitors:
+        with Doorbell("demo", serve):
+            silent = [visitors.enter_context(visit()) for _ in range(count)]
+            for visitor in silent:
+                with suppress(BrokenPipeError):  # sent away, since more came than there is room for
+                    visitor.sendall(said)
+            assert ring(os.getpid(), {"address": "x", "port": 3})["url"] == "x:3"
+            silent[-1].setblocking(False)
+            with pytest.raises(BlockingIOError):  # nobody sent it away for that
+                silent[-1].recv(1)
+        silent[-1].settimeout(PATIENCE_S)
+        assert silent[-1].recv(1) == b""
+
+
+def test_those_who_do_not_speak_are_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.cli.doorbell._SPEAK_S", 0.01)
+    with Doorbell("demo", serve), visit() as visitor:
+        assert visitor.recv(1) == b""
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_line_may_come_in_pieces(ended: bool) -> None:
+    with Doorbell("demo", serve), visit() as visitor:
+        for piece in (b'{"address": "x",', b' "port"', b": 3}" + b"\n" * ended):
+            visitor.sendall(piece)
+        if not ended:
+            visitor.shutdown(socket.SHUT_WR)
+        assert json.loads(visitor.makefile("rb").readline())["url"] == "x:3"
+
+
+@pytest.mark.parametrize("answer", [b"[" * 4000 + b"\n", b"[]\n", b"7\n", b"\xff\n", b"", b"x" * 100_000])
+def test_an_answer_that_is_none(answer: bytes) -> None:
+    """Another program's socket with a name like ours."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        other.bind(str(folder() / "1.sock"))
+        other.listen()
+
+        def speak() -> None:
+            for _ in range(2):
+                with other.accept()[0] as visitor, suppress(OSError):
+                    visitor.sendall(answer)
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        assert neighbours() == {}
+        with pytest.raises(RunError, match="process 1: does not answer"):
+            ring(1, {"x": 1})
+        thread.join()
+
+
+def test_an_answer_that_never_ends_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.cli.doorbell._WAIT_S", 0.3)
+    left = threading.Event()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        other.bind(str(folder() / "1.sock"))
+        other.listen()
+
+        def speak() -> None:
+            with other.accept()[0] as visitor, suppress(OSError):
+                while not left.wait(0.05):  # often enough that no single wait is long
+                    visitor.sendall(b" ")
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        with pytest.raises(RunError, match="timed out"):
+            ring(1, {"x": 1})
+        left.set()
+        thread.join()

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from gr_ros2.cli.ending import INTERRUPTED
-from tests.e2e.support import free_domains
+from tests.domains import free_domains
 
 PLAN = ("plan", "demo")
 GRAPH = ("registry", "from-graph", "--wait", "60")

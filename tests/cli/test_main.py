@@ -40,7 +40,8 @@ def test_help_imports_nothing_heavy() -> None:
         "heavy = {'gnuradio', 'cyclonedds', 'rclpy', 'numpy', 'matplotlib', 'pydantic', 'rosbags'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

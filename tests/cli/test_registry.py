@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,8 @@ from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import Qos, TopicInfo
 from gr_ros2.registry import Registry
+from tests.domains import domain
+from tests.waiting import wait_for
 
 LATCHED = Qos("reliable", "transient_local")
 FOUND = [
@@ -89,13 +90,16 @@ def test_from_the_dds_graph(
     dds = pytest.importorskip("gr_ros2.middleware.dds")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     out = tmp_path / "r.csv"
-    arguments = ["registry", "from-graph", "--namespace", "robot_1", "--domain-id", "93", "--wait", "0.5"]
-    with dds.DdsMiddleware(domain_id=93) as robot:
+    arguments = ["registry", "from-graph", "--namespace", "robot_1", "--domain-id", str(domain()), "--wait", "0.5"]
+    with dds.DdsMiddleware(domain_id=domain()) as robot:
         robot.advertise("/robot_1/odom", "nav_msgs/msg/Odometry", Qos())
-        deadline = time.monotonic() + 30
-        while run([*arguments, "--out", str(out)]) != 0:
-            assert "is the robot running" in capsys.readouterr().err
-            assert time.monotonic() < deadline, "the topic was never discovered"
+
+        def written() -> bool:
+            status = run([*arguments, "--out", str(out)])
+            assert status == 0 or "is the robot running" in capsys.readouterr().err
+            return status == 0
+
+        wait_for(written, "the topic to be discovered")
     assert out.read_text() == "topic,type\nodom,nav_msgs/msg/Odometry\n"
     assert capsys.readouterr().out == f"{out}: 1 topics, digest {Registry.from_csv(out).digest}\n"
 

@@ -20,6 +20,7 @@ def test_one_folder_gets_its_own_report(tmp_path: Path, capsys: pytest.CaptureFi
     assert f"Written: {tmp_path / 'report.html'}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_several_folders_leave_theirs_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,6 +93,7 @@ def test_a_missing_folder_is_one_line_and_status_2(
     assert "nowhere: no such folder; give the folder of a run" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_repetitions_are_reported_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k in range(2):
         make_run(tmp_path / f"rep-{k}", "one")
@@ -116,4 +118,5 @@ def test_reports_need_no_radio_and_no_ros(tmp_path: Path) -> None:
         "heavy = {'gnuradio', 'cyclonedds', 'rclpy', 'matplotlib.pyplot', 'pandas'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -16,8 +16,8 @@ pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[swee
 from gr_ros2.cli.main import BAD_INPUT, FAILED, INTERRUPTED, run
 from gr_ros2.study.sweep.definition import builtin_sweeps
 from tests.e2e.support import COMMAND
-from tests.middleware.support import wait_for
 from tests.study.sweeps import write_sweep_file
+from tests.waiting import wait_for
 
 
 def test_without_a_name_it_lists_the_built_in_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,6 +35,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_sweep_from_end_to_end_on_two_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,6 +78,7 @@ def test_failed_runs_are_told_and_are_an_error(
     assert captured.err == "gr-ros2: lost: 6 of 6 runs failed; the same command tries them again\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_sweep_that_is_stopped_ends_and_can_be_continued(tmp_path: Path, number: signal.Signals) -> None:
     path, out = write_sweep_file(tmp_path, repetitions=60), tmp_path / "out"

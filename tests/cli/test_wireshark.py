@@ -19,7 +19,7 @@ from gr_ros2.errors import ConfigError, WireError
 from gr_ros2.link.events import SentPacket
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import load_scenario
-from gr_ros2.wire import decode
+from gr_ros2.wire.v0 import V0
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 FIELDS = ("src_id", "dst_id", "seq", "hop", "qos", "compressed", "encrypted", "entries", "crc")
@@ -101,7 +101,7 @@ def test_what_a_receiver_refuses_is_marked_by_the_same_name(tmp_path: Path) -> N
         data = bytes.fromhex(vector["hex"])
         # A dissector does not know packet_len: a packet cut short shows as a wrong CRC.
         with pytest.raises(WireError) as refusal:
-            decode(data, len(data))
+            V0.decode(data, len(data))
         path = capture(tmp_path / f"{number}.pcapng", [data])
         assert tshark(path, "-Y", f"gr_ros2.refused.{refusal.value.kind}").count("\n") == 2, vector["name"]
 

@@ -8,7 +8,7 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.config import SinkConfig
 from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.compression.support import simulated
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
@@ -21,7 +21,7 @@ def received(coded: bytes, *, codec: LinkCodec | None, compressed: bool = True) 
     events: list[ReceiverEvent] = []
     for n, piece in enumerate(pieces):
         packet = Packet(1, 255, n, 1, (Entry(0, 7, n, len(pieces), piece),), compressed=compressed)
-        events += receiver.receive(encode(packet, PACKET_LEN), 0.0)
+        events += receiver.receive(V0.encode(packet, PACKET_LEN), 0.0)
     lost = [key for key, count in receiver.stats.lost.items() if count == 1]
     assert lost == [(event.src_id, event.topic_id, event.reason) for event in events if isinstance(event, Lost)]
     return events

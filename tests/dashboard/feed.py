@@ -44,6 +44,10 @@ class Feed:
         self.sender = Sender(
             REGISTRY, SourceConfig(robot_id=SRC, **settings), rng=random.Random(1), observer=self._sender_event
         )
+        self.forget()
+
+    def forget(self) -> None:
+        """The receiver starts anew."""
         self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=self.sender.config.packet_len))
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:

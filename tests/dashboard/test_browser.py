@@ -24,14 +24,13 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.keys import Keys
 
 from gr_ros2.record.result import Result, read_result
-from tests.gr.probe import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(
     not (CHROMIUM and DRIVER), reason="no chromium or chromedriver; Debian: apt-get install chromium chromium-driver"
 )
 
-PATIENCE_S = 90.0
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--window-size=1500,1600"),
@@ -90,7 +89,7 @@ class Viewer:
         return float(self.run(f"{FIND} return found", ".noUi-handle")[number].get_attribute("aria-valuenow"))
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        wait_for(condition, what, PATIENCE_S)
+        wait_for(condition, what)
 
 
 SNR, OFFSET, LOSS = range(3)
@@ -108,7 +107,7 @@ def viewer(tmp_path: Path) -> Iterator[Viewer]:
 def program(out: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A long run over OFDM with a dashboard, and where that is."""
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
-    settings += ["phy.sample_rate=1e6", "channel.snr_db=30"]
+    settings += ["phy.sample_rate=5e5", "channel.snr_db=30"]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -130,6 +129,7 @@ def stop(process: subprocess.Popen[str], out: Path) -> Result:
     return read_result(out)
 
 
+@pytest.mark.slow
 def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path: Path) -> None:
     with program(tmp_path / "out") as (process, url):
         viewer.driver.get(url)
@@ -176,6 +176,7 @@ def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path:
     assert (tiles["sent"], tiles["delivered"], tiles["pdr"]) == (topic.sent, topic.delivered, topic.pdr)
 
 
+@pytest.mark.slow
 def test_the_page_returns_with_the_next_run(viewer: Viewer, tmp_path: Path) -> None:
     with program(tmp_path / "one") as (process, url):
         viewer.driver.get(url)

@@ -13,7 +13,7 @@ from gr_ros2.dashboard.desk import Desk
 from gr_ros2.errors import RunError
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
 
 ENDS = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
 OFDM = ("phy.name=ofdm", "phy.sample_rate=2e6", "packet_len=220", "channel.snr_db=30")
@@ -27,6 +27,7 @@ def run(desk: Desk, *overrides: str, duration_s: float) -> tuple[threading.Threa
     return thread, outcomes
 
 
+@pytest.mark.slow
 def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     desk = Desk()
     assert desk.tick().phase == "waiting"

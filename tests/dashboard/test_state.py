@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import resource
 from pathlib import Path
 
@@ -142,7 +143,7 @@ def test_now_means_the_last_seconds() -> None:
 
 
 @pytest.mark.parametrize("with_ledger", [True, False])
-def test_repeats_count_nowhere(with_ledger: bool) -> None:
+def test_a_repeat_counts_only_where_it_delivers_the_message_it_repeats(with_ledger: bool) -> None:
     recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
     state = make(recorder if with_ledger else None)
     latched = {"raw": TopicOptions(durability="transient_local")}
@@ -152,7 +153,13 @@ def test_repeats_count_nowhere(with_ledger: bool) -> None:
     feed.fly(12.5)
     assert feed.packets == 2
     topic = state.tick(13.0).topics[1]
-    assert (topic.sent, topic.delivered, sum(topic.ledger.values())) == (1, 0, 1)
+    assert (topic.sent, topic.delivered, topic.ledger) == (1, 1, {"delivered": 1})
+    assert topic.latency_s is not None
+    assert topic.latency_s.max == pytest.approx(2.55)
+    feed.forget()  # the other robot starts anew, and gets the map once more
+    feed.fly(15.0)
+    topic = state.tick(16.0).topics[1]
+    assert (feed.packets, topic.sent, topic.delivered, topic.ledger) == (3, 1, 1, {"delivered": 1})
 
 
 def test_packets_field_by_field() -> None:
@@ -165,10 +172,12 @@ def test_packets_field_by_field() -> None:
     assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
     first = packets[0]
     assert (first.version, first.src_id, first.dst_id, first.hop, first.qos) == (0, SRC, 255, 5, "default")
-    (entry,) = first.entries
-    assert (entry.topic, entry.colour, entry.index, entry.total, entry.size) == ("raw", 1, 0, 6, 51)
-    assert first.pad == 0
-    assert packets[-1].pad == 64 - 13 - packets[-1].entries[0].size
+    assert first.entries == 1
+    *_, entry, crc = first.spans
+    assert (entry.kind, entry.colour, entry.size, crc.kind) == ("entry", 1, 56, "crc")
+    assert re.fullmatch(r"raw #\d+\[0/6\] 51 B", entry.text)
+    assert [span.kind for span in packets[-1].spans] == ["head", "ids", "entry", "pad", "crc"]
+    assert all(sum(span.size for span in packet.spans) == 64 for packet in packets)
     assert refused.refused.startswith("length:")
     assert refused.t == pytest.approx(1.0)
 
@@ -198,6 +207,7 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory from")
 def test_an_hour_at_35_hz_takes_no_more_memory_than_ten_minutes() -> None:
     state = make(packet_len=220)

@@ -17,8 +17,9 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
-from tests.e2e.support import free_domains
-from tests.middleware.support import STRING, message, wait_for
+from tests.domains import free_domains
+from tests.middleware.support import STRING, message
+from tests.waiting import wait_for
 
 MESSAGES, WARM_UP, BATCH = 200_000, 50_000, 1_000
 LEAST = 0.999

@@ -1,9 +1,7 @@
-"""What the whole-path tests share: DDS domains nobody uses, scenarios that use them, and the bag of a run."""
+"""What the whole-path tests share: scenarios on DDS domains nobody uses, and the bag of a run."""
 
 from __future__ import annotations
 
-import os
-import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import DELIVERED_BAG
 from gr_ros2.run.scenario import Scenario, load_scenario
+from tests.domains import free_domains
 from tests.middleware.support import same
 
 DDS_PADDING = 3
@@ -21,26 +20,6 @@ DDS_PADDING = 3
 COMMAND = (sys.executable, "-m", "gr_ros2.cli")
 HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
 needs_husky = pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording: {HUSKY} is missing")
-
-_DOMAINS = (*range(1, 100), *range(215, 231))
-"""Their ports lie below and above those the system hands out (32768 to 60999)."""
-
-
-def free_domains(count: int = 2) -> list[int]:
-    """DDS domains no process uses, other ones in each test process."""
-    start = os.getpid() * 37 % len(_DOMAINS)
-    found = (domain for domain in (*_DOMAINS[start:], *_DOMAINS[:start]) if _unused(domain))
-    return [next(found) for _ in range(count)]
-
-
-def _unused(domain: int) -> bool:
-    """Whether the unicast port of a domain's first participant is free."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", 7400 + 250 * domain + 10))
-        except OSError:
-            return False
-    return True
 
 
 def on_free_domains() -> list[str]:

@@ -17,9 +17,11 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.registry import Registry
 from gr_ros2.run.runner import run_scenario
-from tests.e2e.support import check_books, free_domains, on_free_domains, scenario, set_options
+from tests.domains import free_domains
+from tests.e2e.support import check_books, on_free_domains, scenario, set_options
 from tests.gr.probe import Probe, pdu
-from tests.middleware.support import RELIABLE, STRING, message, same, wait_for
+from tests.middleware.support import RELIABLE, STRING, message, same
+from tests.waiting import wait_for
 
 PACKET_LEN = 64
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 
+import pytest
 from gnuradio import gr
 
 from gr_ros2.config import SourceConfig
@@ -18,14 +19,16 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.registry import Registry
-from tests.e2e.support import free_domains
+from tests.domains import free_domains
 from tests.gr.probe import Probe
-from tests.middleware.support import STRING, wait_for
+from tests.middleware.support import STRING
+from tests.waiting import wait_for
 
 GROWTH_BYTES = 3_000_000
 """Less than 20 bytes a message: anything kept of each would show."""
 
 
+@pytest.mark.slow
 def test_memory_is_flat_over_200_000_messages() -> None:
     done = subprocess.run([sys.executable, "-m", "tests.e2e.endurance"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -100,6 +103,7 @@ def test_engine_and_block_agree_on_the_order_of_packets() -> None:
 def test_a_flowgraph_starts_while_other_threads_map_memory() -> None:
     # GNU Radio's buffers lose that race now and then; without a second attempt a run would die at random.
     over = threading.Event()
+    started = 0
 
     def churn() -> None:
         while not over.is_set():
@@ -113,8 +117,9 @@ def test_a_flowgraph_starts_while_other_threads_map_memory() -> None:
     try:
         for _ in range(5):
             with LoopbackLink(OfdmPhy(64, 1e6), Probe(), Probe()):
-                pass
+                started += 1
     finally:
         over.set()
         for thread in threads:
             thread.join()
+    assert started == 5

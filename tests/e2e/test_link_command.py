@@ -12,8 +12,10 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from tests.e2e.support import COMMAND, free_domains, set_options
-from tests.middleware.support import CUSTOM, message, wait_for
+from tests.domains import free_domains
+from tests.e2e.support import COMMAND, set_options
+from tests.middleware.support import CUSTOM, message
+from tests.waiting import wait_for
 
 
 @pytest.fixture

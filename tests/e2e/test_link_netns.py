@@ -19,15 +19,13 @@ from gr_ros2.errors import RunError
 from gr_ros2.race.namespaces import Namespace, check_means, inside
 from tests.e2e import link_peer
 from tests.e2e.support import COMMAND
-from tests.gr.probe import wait_for
 from tests.middleware.support import CUSTOM
+from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 CABLE = "air"
 SOME = 10
 """Messages that show that a direction works, or would have come if it did."""
-PATIENCE_S = 120.0
-"""s for two links to start, or for the robots' programs to say something, on a machine that is busy."""
 
 
 class Process:
@@ -138,11 +136,12 @@ def both_hear_news(robots: Sequence[Robot], after: str) -> None:
         return min(news) >= SOME
 
     try:
-        wait_for(heard, f"both to hear each other after {after}", PATIENCE_S)
+        wait_for(heard, f"both to hear each other after {after}")
     except AssertionError as error:
         raise AssertionError(f"{error}: {[(robot.link.output, robot.programs.output) for robot in robots]}") from error
 
 
+@pytest.mark.slow
 def test_both_ways_at_once_through_kills_and_a_pulled_plug(robots: list[Robot]) -> None:
     both_hear_news(robots, "the start")
 
@@ -157,7 +156,6 @@ def test_both_ways_at_once_through_kills_and_a_pulled_plug(robots: list[Robot]) 
     wait_for(
         lambda: one.newest("sent") - before[0] >= 5 * SOME <= two.newest("sent") - before[1],
         "the robots' programs to go on",
-        PATIENCE_S,
     )
     assert two.newest("got") <= before[0] + SOME
     assert one.newest("got") <= before[1] + SOME

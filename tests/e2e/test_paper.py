@@ -12,8 +12,10 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.record.result import read_result
 from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
 from gr_ros2.run.scenario import load_scenario
-from tests.e2e.support import check_books, check_complete, check_identical, delivered_bag, free_domains, scenario
-from tests.middleware.support import RELIABLE, wait_for
+from tests.domains import free_domains
+from tests.e2e.support import check_books, check_complete, check_identical, delivered_bag, scenario
+from tests.middleware.support import RELIABLE
+from tests.waiting import wait_for
 
 ODOM_TYPE = "nav_msgs/msg/Odometry"
 ODOM_BYTES = 724
@@ -36,8 +38,8 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
     ("name", "overrides"),
     [
         ("paper-direct", []),
-        ("paper-ofdm", ["phy.sample_rate=0", "paced=true", "drain_s=5"]),
-        ("paper-ofdm", ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "paced=true", "drain_s=5"]),
+        ("paper-ofdm", ["phy.sample_rate=0", "paced=true", "drain_s=60"]),
+        ("paper-ofdm", ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "paced=true", "drain_s=60"]),
     ],
 )
 def test_every_message_arrives_unaltered(tmp_path: Path, name: str, overrides: list[str]) -> None:

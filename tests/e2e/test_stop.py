@@ -14,7 +14,7 @@ import pytest
 
 from gr_ros2.record.result import read_result
 from tests.e2e.support import COMMAND, check_books, delivered_bag, on_free_domains, set_options
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 class Run:
@@ -53,6 +53,7 @@ class Run:
         return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["paper-direct", "paper-ofdm"])
 def test_a_run_that_is_stopped_writes_its_result(tmp_path: Path, name: str, number: signal.Signals) -> None:

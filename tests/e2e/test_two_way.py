@@ -12,6 +12,7 @@ from gr_ros2.run.runner import run_scenario
 from tests.e2e.support import check_books, check_complete, delivered_bag, scenario
 
 
+@pytest.mark.slow
 def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -> None:
     clean = [
         "ros_source.topic_options={}",
@@ -33,6 +34,7 @@ def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -
     assert "packets/s on its 2 channels" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path) -> None:
     lossy = [
         "ros_source.topic_options={}",
@@ -58,6 +60,7 @@ def test_a_sink_that_would_feed_the_source_beside_it_is_refused(tmp_path: Path) 
         run_scenario(loop, tmp_path)
 
 
+@pytest.mark.slow
 def test_nothing_passes_while_the_link_is_unplugged(tmp_path: Path) -> None:
     begin, end, slack = 0.5, 1.2, 0.1
     unplugged = scenario("paper-direct", f"channel.outages=[[{begin}, {end}]]", duration_s=2.0)

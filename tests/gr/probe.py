@@ -1,23 +1,12 @@
-"""What tests of flowgraphs share: a block that posts and collects PDUs, and waiting for a condition."""
+"""What tests of flowgraphs share: a block that posts and collects PDUs."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pmt
 from gnuradio import gr
-
-PATIENCE_S = 30.0
-
-
-def wait_for(condition: Callable[[], Any], what: str = "condition", patience: float = PATIENCE_S) -> None:
-    """Return once a condition holds; fail after a time that only a hang takes."""
-    deadline = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {patience} s for {what}"
-        time.sleep(0.002)
 
 
 def pdu(data: bytes) -> Any:

@@ -25,8 +25,8 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.registry import Registry
-from tests.e2e.support import free_domains
-from tests.gr.probe import wait_for
+from tests.domains import free_domains
+from tests.waiting import wait_for
 
 STORE = typestore()
 PREFIX = "robot_{src_id}/"

@@ -33,7 +33,8 @@ from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 DESCRIPTIONS = sorted(grc_path().glob("*.block.yml"))
 EXAMPLES = sorted(example("topics.csv").parent.glob("*.grc"))
@@ -248,13 +249,15 @@ def compiled(path: Path, folder: Path) -> ModuleType:
 
 
 def in_memory(path: Path, folder: Path) -> Any:
-    """An example's flowgraph on the graph of tests, which needs no discovery time."""
+    """An example's flowgraph on the graph of tests, which needs no discovery time, and at addresses of its own."""
     copy = folder / path.name
-    copy.write_text(path.read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    text = path.read_text().replace("'\"dds\"'", "'\"memory\"'")
+    copy.write_text(text.replace("tcp://127.0.0.1:", f"ipc://{folder}/"))
     assert "memory" in copy.read_text()
     return getattr(compiled(copy, folder), path.stem)()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_THE_AIR)
 def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: Path) -> None:
     copy = tmp_path / f"{name}.grc"
@@ -265,6 +268,7 @@ def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: 
     assert f"RadioError: front_end {name.removesuffix('_radio')}: args = " in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path: Path) -> None:
     top = in_memory(example("sim_radio.grc"), tmp_path)
     heard: list[bytes] = []
@@ -324,6 +328,7 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
         radio.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", CARRYING, ids=lambda path: path.stem)
 def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) -> None:
     top = in_memory(path, tmp_path)

@@ -10,14 +10,14 @@ import pytest
 
 from gr_ros2.gr.readable import debug_logger, describe_bytes
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
 
 
 def test_header_and_entries() -> None:
     packet = Packet(1, 255, 7, 1, (Entry(0, 9, 2, 5, b"abc"), Entry(3, 1, 0, 1, b"x")), qos=1)
-    line = describe_bytes(encode(packet, 64), 64, REGISTRY)
+    line = describe_bytes(V0.encode(packet, 64), 64, REGISTRY)
     assert line == "v0 qos=latency flags=- src=1 dst=255 seq=7 hop=1 entries=2: 0:odom#9[2/5]=3B 3:?#1[0/1]=1B"
 
 

@@ -22,9 +22,10 @@ from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.registry import Registry
-from gr_ros2.wire import decode
-from tests.e2e.support import free_domains
-from tests.gr.probe import Probe, wait_for
+from gr_ros2.wire.v0 import V0
+from tests.domains import free_domains
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61
@@ -77,7 +78,7 @@ def test_a_message_leaves_as_packets_with_metadata(rig: Rig) -> None:
     rig.start()
     rig.publish(b"\0\1\0\0" + bytes(720))
     wait_for(lambda: rig.probe.handled == 15)
-    packets = [decode(data, 64) for data in rig.probe.packets]
+    packets = [V0.decode(data, 64) for data in rig.probe.packets]
     assert {(packet.src_id, packet.dst_id, packet.hop) for packet in packets} == {(1, 9, 3)}
     metadata = [pmt.to_python(pmt.car(message)) for message in rig.probe.messages]
     assert [item["seq"] for item in metadata] == [packet.seq for packet in packets]
@@ -258,7 +259,7 @@ def test_settings_change_while_running(rig: Rig) -> None:
     source.set_debug(False)
     rig.publish(bytes(40))
     wait_for(lambda: rig.probe.handled == 1)
-    packet = decode(rig.probe.packets[0], 64)
+    packet = V0.decode(rig.probe.packets[0], 64)
     assert (packet.dst_id, packet.hop) == (4, 2)
     assert source.config.packet_rate == 1000.0
     with pytest.raises(ConfigError, match="dst_id = 300"):
@@ -274,9 +275,11 @@ def test_a_failing_observer_does_not_end_transmission(rig: Rig) -> None:
     source = rig.make(packet_len=64, observer=fail)
     rig.start()
     rig.publish(bytes(40))
-    wait_for(lambda: source.stats()["pump_failed"] == 1)
+    wait_for(lambda: source.stats()["observer_missed"] == 1)
     rig.publish(bytes(40))
-    wait_for(lambda: rig.probe.handled >= 1)
+    wait_for(lambda: rig.probe.handled == 2)
+    assert source.stats()["observer_missed"] == 3  # nor the second message, nor its packet
+    assert source.stats()["pump_failed"] == 0
 
 
 def test_debug_lines(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:

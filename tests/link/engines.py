@@ -8,7 +8,7 @@ from typing import Any
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.link import Delivered, Receiver, ReceiverEvent, Sender
 from gr_ros2.registry import Registry
-from gr_ros2.wire import Packet, decode
+from gr_ros2.wire.v0 import V0, Packet
 
 
 def registry(topics: int = 3) -> Registry:
@@ -39,7 +39,7 @@ def trace(packets: list[bytes]) -> list[list[tuple[int, int, int]]]:
 
 
 def read(data: bytes) -> Packet:
-    return decode(data, len(data))
+    return V0.decode(data, len(data))
 
 
 def delivered(events: list[ReceiverEvent]) -> list[bytes]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.link import Sender
 from gr_ros2.link.freshness import TURN
-from gr_ros2.wire import equal_entry_payload, pad_len, single_entry_payload
+from gr_ros2.wire.v0 import V0
 from tests.link.engines import delivered, drain, read, receiver, sender, trace
 
 
@@ -60,7 +60,7 @@ def test_bulk_fills_what_is_left() -> None:
     source.submit(0, bytes(80), 0.0)
     first = read(drain(source)[0])
     assert [entry.topic_id for entry in first.entries] == [0, 1]
-    assert pad_len(220, [len(entry.payload) for entry in first.entries]) <= 1
+    assert 220 - V0.packed_len([len(entry.payload) for entry in first.entries]) <= 1
 
 
 def test_a_message_of_two_packets_does_not_start_in_the_rest_of_another() -> None:
@@ -141,7 +141,7 @@ def test_nothing_starves(sizes: list[int], classes: list[str], weights: list[flo
         f"t{n}": {"qos": classes[n], "weight": weights[n], "queue": "latest"} for n in range(topics)
     }
     source = engine(topics, packet_len, **options)
-    single, half = single_entry_payload(packet_len), equal_entry_payload(packet_len, 2)
+    single, half = V0.single_entry_payload(packet_len), V0.equal_entry_payload(packet_len, 2)
     cut = min(single - half - 6, 3 * single // 4)
     bounds = [TURN * topics * (1 + -(-size // cut)) for size in sizes]
     last = [0] * topics
@@ -206,7 +206,7 @@ def test_packets_are_filled(sizes: dict[str, int]) -> None:
                 due[name] += 1 / rate
         data = source.next_packet(now)
         assert data is not None
-        pad += pad_len(220, [len(entry.payload) for entry in read(data).entries])
+        pad += 220 - V0.packed_len([len(entry.payload) for entry in read(data).entries])
         packets += 1
     assert pad / (packets * 220) < 0.10
     assert all(source.stats.sent[topic] for topic in range(len(names)))

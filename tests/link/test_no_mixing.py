@@ -113,6 +113,7 @@ class Link:
         return len(self.got & self.complete) / len(self.complete)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.01, 0.05, 0.1, 0.3])
 def test_200_000_messages_with_outages_and_restarts(loss: float) -> None:
     link = Link(loss, seed=1, timeout=10.0, outages=0.001, restarts=0.001).run(MESSAGES)
@@ -169,6 +170,7 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
         assert not any(isinstance(event, Delivered) for event in events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.05, 0.1])
 def test_random_ids_of_the_papers_sender_are_mixed_far_less_than_by_the_papers_rules(loss: float) -> None:
     """FACTS: 12 % corrupt at 5 % packet loss, 23 % at 10 %, with 15 fragments a message and a 2 s timeout."""

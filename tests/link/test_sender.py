@@ -223,6 +223,29 @@ def test_transient_local_topics_are_repeated_as_bulk_with_a_fresh_id() -> None:
     assert engine.stats.repeats == 1
 
 
+def test_a_repeat_says_which_message_it_repeats() -> None:
+    events: list[SenderEvent] = []
+    options = {"t1": TopicOptions(durability="transient_local")}
+    config = SourceConfig(robot_id=1, packet_len=64, repeat_s=10, topic_options=options)
+    engine = Sender(registry(), config, observer=events.append)
+    for number in range(3):
+        engine.submit(number % 2, b"message %d" % number, 0.0)
+    drain(engine, 0.0)
+    drain(engine, 10.0)
+    (repeat,) = events[-1].entries if isinstance(events[-1], SentPacket) else ()
+    assert (repeat.serial, repeat.topic_id, repeat.repeat) == (1, 1, True)
+
+
+def test_a_latched_message_that_was_dropped_is_not_repeated() -> None:
+    options = TopicOptions(durability="transient_local", queue="deadline", deadline_ms=100)
+    engine = sender(packet_len=64, repeat_s=10, topic_options={"t1": options})
+    engine.submit(1, b"latched", 0.0)
+    assert drain(engine, 0.2) == []
+    assert engine.stats.refused == Counter({(1, "stale"): 1})
+    assert drain(engine, 20.0) == []
+    assert engine.next_timeout() is None
+
+
 def test_live_settings_change_and_others_do_not() -> None:
     engine = sender(packet_len=64)
     engine.reconfigure(dst_id=7, hop=3)

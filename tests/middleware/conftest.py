@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator
 
 import pytest
 
 
 @pytest.fixture(scope="session")
-def router() -> Iterator[str]:
-    """Its endpoint."""
+def router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Its endpoint: a Unix socket, since a port found free may be taken by another before it is used."""
     import zenoh
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"unixsock-stream/{tmp_path_factory.mktemp('zenoh')}/router"
     config = zenoh.Config()
     for key, value in {
         "mode": '"router"',

@@ -1,4 +1,4 @@
-"""What the middleware tests share: waiting for conditions, domains of their own, and peers in other processes."""
+"""What the middleware tests share: QoS, numbered messages, and peers in other processes."""
 
 from __future__ import annotations
 
@@ -6,33 +6,15 @@ import json
 import os
 import subprocess
 import threading
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from gr_ros2.middleware import Qos
-
-DEADLINE_S = 20.0
-"""s after which a condition that tests wait for counts as failed; generous, since the machine may be busy."""
 
 STRING, CUSTOM = "std_msgs/msg/String", "robot_msgs/msg/WheelState"
 RELIABLE = Qos("reliable", "volatile", 0)
 BEST_EFFORT = Qos("best_effort", "volatile", 100)
 LATCHED = Qos("reliable", "transient_local", 10)
 ADAPT = Qos(depth=100)
-
-
-def domain(offset: int = 0) -> int:
-    """A DDS domain 10..99: never the default 0, differing between test processes, ports below the ephemeral range."""
-    return 10 + (os.getpid() + 7 * offset) % 90
-
-
-def wait_for(condition: Callable[[], object], what: str = "condition") -> None:
-    """Return once it holds; fail the test when it does not in time."""
-    end = time.monotonic() + DEADLINE_S
-    while not condition():
-        if time.monotonic() > end:
-            raise AssertionError(f"not within {DEADLINE_S:g} s: {what}")
-        time.sleep(0.005)
 
 
 def message(number: int, size: int = 16) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Literal
 
@@ -13,9 +14,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
-from gr_ros2.middleware import Qos, TopicInfo
+from gr_ros2.middleware import Qos, TopicInfo, bag_recorder
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
-from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, wait_for
+from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 HUSKY = Path(__file__).parents[3] / "shared" / "data" / "husky_outdoor"
 Storage = Literal["mcap", "sqlite3"]
@@ -266,3 +268,19 @@ def test_the_recorded_drive() -> None:
         store.deserialize_cdr(odom.payload, odom.type_name)
         stamps.append(odom.stamp_ns)
     assert stamps == sorted(stamps) and len(stamps) > 1000
+
+
+def test_one_that_may_lose_messages_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_recorder, "BACKLOG", 3)
+    bag = BagMiddleware(path=tmp_path / "out", mode="write", lossless=False)
+    chat = bag.advertise("/chat", STRING, Qos())
+    gate = threading.Event()
+    assert bag._recorder is not None
+    bag._recorder._queue.put(bag_recorder._Job(gate.wait, Future()))  # the disk
+    for number in range(10):
+        chat.publish(string(str(number)))
+    gate.set()
+    bag.close()
+    missing = bag.counters["not_recorded:/chat"]
+    assert missing >= 6
+    assert len(list(read_bag(tmp_path / "out"))) == 10 - missing

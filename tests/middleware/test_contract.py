@@ -17,18 +17,9 @@ import pytest
 
 from gr_ros2.errors import BackendMissingError, ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos
-from tests.middleware.support import (
-    ADAPT,
-    BEST_EFFORT,
-    CUSTOM,
-    LATCHED,
-    RELIABLE,
-    STRING,
-    domain,
-    message,
-    same,
-    wait_for,
-)
+from tests.domains import domain
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, same
+from tests.waiting import wait_for
 
 
 class World(ABC):

@@ -20,19 +20,9 @@ from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_domains import POOL
-from tests.middleware.support import (
-    ADAPT,
-    BEST_EFFORT,
-    CUSTOM,
-    LATCHED,
-    RELIABLE,
-    STRING,
-    Peer,
-    domain,
-    message,
-    same,
-    wait_for,
-)
+from tests.domains import domain
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, Peer, message, same
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).parents[2]
 PEER = [sys.executable, "-m", "tests.middleware.dds_peer"]

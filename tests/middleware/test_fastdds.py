@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,7 +12,10 @@ import pytest
 
 from gr_ros2.middleware import Qos, ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
-from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, domain, message, same, wait_for
+from tests.compiled import compiled
+from tests.domains import domain
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, message, same
+from tests.waiting import wait_for
 
 SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
@@ -32,32 +33,13 @@ def installed() -> tuple[int, ...]:
 
 
 @pytest.fixture(scope="session")
-def program() -> Path:
-    """The peer, compiled once per version of its source."""
+def program(pytestconfig: pytest.Config) -> Path:
+    """The peer."""
     if not HEADER.exists() or not shutil.which("g++"):
         pytest.skip("needs g++ and Fast DDS's headers: apt install g++ libfastrtps-dev")
     if installed() < OLDEST:
         pytest.skip(f"Fast DDS is {installed()}: from {OLDEST} on it hears Cyclone DDS 11")
-    name = f"gr-ros2-fastdds-peer-{hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]}"
-    built = Path(tempfile.gettempdir()) / name
-    if not built.exists():
-        with tempfile.TemporaryDirectory() as folder:
-            fresh = Path(folder) / name
-            command = [
-                "g++",
-                "-std=c++14",
-                "-O1",
-                "-o",
-                str(fresh),
-                str(SOURCE),
-                "-lfastrtps",
-                "-lfastcdr",
-                "-lpthread",
-            ]
-            result = subprocess.run(command, capture_output=True, text=True)
-            assert result.returncode == 0, result.stderr
-            shutil.move(fresh, built)
-    return built
+    return compiled(pytestconfig, SOURCE, "peer", ("-std=c++14", "-lfastrtps", "-lfastcdr", "-lpthread"))
 
 
 @pytest.fixture

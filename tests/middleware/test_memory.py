@@ -10,7 +10,8 @@ import pytest
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, wait_for
+from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 
 @pytest.fixture

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace
@@ -26,9 +24,11 @@ from std_msgs.msg import Header, String
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.rclpy import RclpyMiddleware, message_class
+from tests.domains import domain
+from tests.waiting import wait_for
 
 STRING = "std_msgs/msg/String"
-DOMAIN = 101 + os.getpid() % 60
+DOMAIN, ELSEWHERE = domain(4), domain(5)
 RELIABLE = Qos("reliable", "volatile")
 BEST_EFFORT = Qos("best_effort", "volatile")
 LATCHED = Qos("reliable", "transient_local")
@@ -42,13 +42,6 @@ def text(message: str) -> bytes:
 
 def unpadded(payload: bytes) -> bytes:
     return payload.rstrip(b"\0")
-
-
-def wait_for(condition: Callable[[], Any], what: str = "") -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain {what}"
-        time.sleep(0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -280,7 +273,7 @@ def test_host_application_keeps_its_signals_and_context(start: Start) -> None:
 
 def test_node_is_listed_on_its_domain_only(start: Start, host: rclpy.node.Node) -> None:
     start(node_name="here", namespace="/robot_1")
-    start(node_name="elsewhere", domain_id=DOMAIN + 1)
+    start(node_name="elsewhere", domain_id=ELSEWHERE)
     wait_for(lambda: ("here", "/robot_1") in host.get_node_names_and_namespaces())
     assert "elsewhere" not in host.get_node_names()
 

@@ -89,4 +89,4 @@ def test_definitions() -> None:
     assert type_hash("nav_msgs/msg/Odometry") == digest
     assert type_hash("robot_msgs/msg/WheelState") == ""
     assert definition("robot_msgs/msg/WheelState")[0] == UNKNOWN
-    assert definition("robot_msgs/msg/WheelState", {"robot_msgs/msg/WheelState": "float32 speed\n"})[0] != UNKNOWN
+    assert definition("robot_msgs/msg/WheelState", "float32 speed\n").text != UNKNOWN

@@ -22,7 +22,9 @@ from gr_ros2.middleware.zenoh_graph import (
     tokens_of,
     topic_key,
 )
-from tests.middleware.support import ADAPT, CUSTOM, LATCHED, RELIABLE, STRING, domain, message, wait_for
+from tests.domains import domain
+from tests.middleware.support import ADAPT, CUSTOM, LATCHED, RELIABLE, STRING, message
+from tests.waiting import wait_for
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TALKER = (

@@ -12,7 +12,8 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from gr_ros2.phy import PHY, aside
 from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.burst import BurstReceiver, Samples
 from gr_ros2.phy.burst_blocks import BurstPhy
-from tests.gr.probe import wait_for
+from tests.waiting import wait_for
 
 PACKETS = [bytes([number]) * 64 for number in range(20)]
 

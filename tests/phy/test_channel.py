@@ -15,7 +15,8 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.channel import Channel, PacketLoss, noise_voltage
 from gr_ros2.phy.ofdm import OfdmPhy
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 SAMPLES, RATE = 200_000, 1e6
 

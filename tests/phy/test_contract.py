@@ -18,7 +18,8 @@ from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, pdr, record
 from gr_ros2.phy.tap import SYMBOLS_SHOWN
 from gr_ros2.phy.theory import half_point
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 WITH_SAMPLES = [name for name in PHY if PHY.load(name).has_samples]
 SETTINGS: list[tuple[str, dict[str, Any]]] = [

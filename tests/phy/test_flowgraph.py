@@ -16,7 +16,7 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.measure import deliver, record
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 def test_what_gnu_radio_refuses_is_named() -> None:
@@ -46,6 +46,7 @@ def segments() -> int:
     return sum("SYSV" in line for line in Path("/proc/self/maps").read_text().splitlines())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), [("psk", {}), ("ofdm", {"detection_threshold": "stock"})])
 def test_flowgraphs_that_are_over_hold_no_shared_memory(name: str, options: dict[str, str]) -> None:
     phy = PHY.load(name)(64, 1e6, **options)

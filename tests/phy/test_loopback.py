@@ -15,7 +15,8 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError, PhyError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 RATE = 5e6
 
@@ -73,7 +74,7 @@ def test_a_channel_that_ofdm_is_made_for_loses_nothing(frequency_offset: float) 
 
 def test_noise_while_running() -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make("ofdm"), source, sink) as link:
+    with LoopbackLink(make("ofdm"), source, sink, instrumented=True) as link:
         link.set_snr_db(-20.0)
         for packet in packets(20):
             source.post(packet)

@@ -24,7 +24,8 @@ from gr_ros2.phy.lora_sdr import SdrFrame, whitening
 from gr_ros2.phy.measure import Recording, deliver, record
 from gr_ros2.phy.pdus import pdu_of
 from gr_ros2.phy.threads import begin
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 try:
     from gnuradio import lora_sdr

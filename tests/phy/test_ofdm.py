@@ -20,7 +20,8 @@ from gr_ros2.phy.burst import BurstReceiver
 from gr_ros2.phy.measure import deliver, record
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.phy.ofdm_stock import SPINNING_NICE
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 STOCK = {"detection_threshold": "stock"}
 

@@ -16,8 +16,9 @@ from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.burst import BurstReceiver
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.theory import half_point
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
 from tests.phy.test_burst import NAMES, bursts, delayed, noise
+from tests.waiting import wait_for
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("ofdm", {}),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from gnuradio import gr, pdu
 
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.phy.threads import keep_messages
+from tests.waiting import wait_for
 
 OVER_GNU_RADIOS_LIMIT = 8192 + 2500  # of which 1024 find room behind the port
 LIMIT_S = 60.0
@@ -45,9 +45,7 @@ def test_a_port_without_a_handler_keeps_all_it_is_given(monkeypatch: pytest.Monk
         for _ in range(OVER_GNU_RADIOS_LIMIT):
             to_stream.to_basic_block()._post(pmt.intern("pdus"), message)
         sink.go.set()
-        deadline = time.monotonic() + LIMIT_S
-        while sink.taken < OVER_GNU_RADIOS_LIMIT * length and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_for(lambda: sink.taken >= OVER_GNU_RADIOS_LIMIT * length, "every message")
         assert sink.taken == OVER_GNU_RADIOS_LIMIT * length
     finally:
         sink.go.set()

@@ -10,7 +10,8 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.window import CreditWindow
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 
 def test_a_window_of_packets_is_under_way_and_credits_come_in_groups() -> None:

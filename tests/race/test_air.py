@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
@@ -12,6 +12,7 @@ from gr_ros2.race.contenders import ADDRESSES, MTU
 from gr_ros2.race.namespaces import Namespace, inside
 from gr_ros2.race.tun import INTERFACE, QUEUE_BYTES
 from tests.race.support import needs_namespaces
+from tests.waiting import wait_for
 
 pytestmark = needs_namespaces
 
@@ -19,13 +20,6 @@ HEADERS = 28
 """Bytes of IP and UDP."""
 PORT = 5000
 RADIO = Radio("ofdm", {"gap": 112, "detection_threshold": "stock"}, 2e5, 0.0, 0)
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    limit = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < limit, what
-        time.sleep(0.01)
 
 
 def udp(namespace: Namespace, address: str) -> socket.socket:

@@ -5,23 +5,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 from gr_ros2.race.contenders import CONTENDERS
 from tests.race.support import needs_namespaces
+from tests.waiting import wait_for
 
 pytestmark = needs_namespaces
 
 COMMAND = (sys.executable, "-m", "gr_ros2.cli", "race", "--short")
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    limit = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < limit, what
-        time.sleep(0.05)
 
 
 def descendants(pid: int) -> set[int]:
@@ -43,6 +37,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     peers = ("gr-ros2", "cyclone-best-effort", "zenoh-tcp")
     options = ("--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "2", "--out", str(tmp_path))
@@ -64,6 +59,7 @@ def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     assert cells["cyclone-best-effort"]["air_bytes_per_message"] > 700
 
 
+@pytest.mark.slow
 def test_ctrl_c_and_sudden_death_leave_no_process(tmp_path: Path) -> None:
     for how in (signal.SIGINT, signal.SIGKILL):
         with subprocess.Popen(

@@ -13,7 +13,9 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.radio.link import LinkObserver, RobotLink
-from tests.middleware.support import CUSTOM, domain, message, wait_for
+from tests.domains import domain
+from tests.middleware.support import CUSTOM, message
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPICS = Path(__file__).with_name("topics.csv")

@@ -22,6 +22,7 @@ from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.soapy import SoapyFrontEnd
+from tests.compiled import compiled
 from tests.radio.robots import RATE, ROOT, config, link_command
 
 SOURCE = ROOT / "tests" / "peers" / "soapy_loopback.cpp"
@@ -31,7 +32,7 @@ SLOW = 2.5e5
 """samples/s that a receiver keeps up with on a busy machine; this device gives them by the clock, come what may."""
 TALK = """
 import json, sys
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 from tests.radio.robots import Robot
 
 front_end, values, count, wanted, unsent = map(json.loads, sys.argv[1:])
@@ -47,15 +48,11 @@ with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, **values) as ro
 
 
 @pytest.fixture(scope="module")
-def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def driver(pytestconfig: pytest.Config) -> Path:
     """The folder of the driver `loopback`."""
     if not HEADER.exists() or not shutil.which("g++"):
         pytest.skip("needs g++ and SoapySDR's headers: apt install g++ libsoapysdr-dev")
-    folder = tmp_path_factory.mktemp("soapy")
-    command = ["g++", "-std=c++17", "-O1", "-shared", "-fPIC", "-o", str(folder / "libloopback.so"), str(SOURCE)]
-    built = subprocess.run([*command, "-lSoapySDR"], capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    return folder
+    return compiled(pytestconfig, SOURCE, "libloopback.so", ("-std=c++17", "-shared", "-fPIC", "-lSoapySDR")).parent
 
 
 def with_driver(driver: Path) -> dict[str, str]:
@@ -141,6 +138,7 @@ def test_what_a_device_does_not_take_is_dropped_and_counted(driver: Path) -> Non
     assert 0 < result["unsent"] <= (result["packets"]["out"] - 3) * result["layout"]
 
 
+@pytest.mark.slow
 def test_a_half_duplex_robot_hardly_hears_itself(driver: Path) -> None:
     front_end = {
         "name": "soapy",
@@ -201,6 +199,7 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
     assert log.read_text().splitlines()[-1] == "tx closed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "said"),
     [

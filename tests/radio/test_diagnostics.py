@@ -22,8 +22,8 @@ from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.diagnostics import DIAGNOSTICS_TYPE, STATISTICS_TYPE, Diagnostics
 from gr_ros2.radio.link import RobotLink
-from tests.e2e.support import free_domains
-from tests.middleware.support import domain, wait_for
+from tests.domains import domain, free_domains
+from tests.waiting import wait_for
 
 
 def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ from gnuradio import gr, uhd
 from gr_ros2.errors import RadioError
 from gr_ros2.radio.bursts import LENGTH_TAG
 from gr_ros2.radio.link import RobotLink
-from tests.middleware.support import wait_for
 from tests.radio.robots import RATE, Robot, config
+from tests.waiting import wait_for
 
 FRONT_END = {"name": "uhd", "frequency": 433e6, "antenna_tx": "TX/RX", "bandwidth": 1e6}
 TROUBLES = ("underflow", "underflow_in_packet", "seq_error", "seq_error_in_burst", "time_error")
@@ -204,6 +204,7 @@ def test_a_transmitter_that_has_nothing_to_send_is_well() -> None:
     with Robot(1, FRONT_END) as robot:
         for now in (100.0, 200.0, 300.0):
             look(robot, now)
+        assert counters(robot)["bursts_out"] == 0
 
 
 @pytest.mark.usefixtures("stand_ins")

@@ -14,8 +14,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
-from tests.middleware.support import wait_for
 from tests.radio.robots import RATE, Robot, config
+from tests.waiting import wait_for
 
 
 def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]:
@@ -84,7 +84,7 @@ def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
 def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
     recorder = SigmfRecorder(tmp_path / "cut", Recording(RATE, 433e6), 4)
     recorder.work([np.arange(8, dtype=np.complex64)], [])
-    recorder._file.flush()
+    recorder.stop()
     with Path(tmp_path / "cut.sigmf-data").open("ab") as data:
         data.write(b"torn")
     about, samples = read_recording(tmp_path / "cut")

@@ -15,8 +15,9 @@ from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY
 from gr_ros2.radio.link import RobotLink
-from tests.middleware.support import domain, wait_for
+from tests.domains import domain
 from tests.radio.robots import RATE, Robot, config
+from tests.waiting import wait_for
 
 SIM = {"name": "sim"}
 

@@ -28,7 +28,7 @@ SLOW = 6e5
 MESSAGES = 10
 TALK = """
 import json, sys
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 from tests.radio.robots import Robot
 
 front_end, phy = map(json.loads, sys.argv[1:])
@@ -53,6 +53,7 @@ def link(path: Path, *options: str, **front_end: Any) -> subprocess.CompletedPro
     return link_command(path, {"name": "pluto", "frequency": 433e6, **front_end}, SLOW, *options)
 
 
+@pytest.mark.slow
 def test_every_packet_is_one_buffer_and_comes_back(pluto: Pluto) -> None:
     front_end = {
         "name": "pluto",
@@ -112,6 +113,7 @@ def test_another_sample_rate_is_refused(pluto: Pluto, tmp_path: Path) -> None:
     assert "the device runs at 700,000 samples/s, not at 600,000; set phy.sample_rate" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_link_that_ends_at_once_ends(pluto: Pluto, tmp_path: Path) -> None:
     done = link(tmp_path / "robot.yaml", "--duration", "0.1", args=pluto.uri)
     assert done.returncode == 0, done.stderr

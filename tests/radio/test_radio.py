@@ -16,7 +16,8 @@ from gr_ros2.phy.psk import PskPhy
 from gr_ros2.radio.radio import Radio, make_radio
 from gr_ros2.radio.sigmf import read_recording
 from gr_ros2.radio.sim import SimFrontEnd
-from tests.gr.probe import Probe, wait_for
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
 
 PACKETS = [bytes([number]) * 64 for number in range(20)]
 

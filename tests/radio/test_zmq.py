@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy import PHY
 from gr_ros2.radio.link import RobotLink
 from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd
-from tests.middleware.support import wait_for
 from tests.radio.robots import RATE, Robot, config
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -33,10 +34,10 @@ def ends(tmp_path: Path) -> list[dict[str, Any]]:
 @pytest.fixture
 def stranger(tmp_path: Path) -> Iterator[Any]:
     """A socket at the address of robot 2."""
-    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
-        socket.linger = 0
-        socket.bind(f"ipc://{tmp_path}/2")
-        yield socket
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        publisher.linger = 0
+        publisher.bind(f"ipc://{tmp_path}/2")
+        yield publisher
 
 
 def counters(robot: Robot) -> dict[str, int]:
@@ -69,6 +70,7 @@ def test_both_ways_at_once_and_nobody_takes_its_own(ends: list[dict[str, Any]]) 
             assert counters(robot)["bursts_out"] == robot.link.stats()["packets"]["out"]
 
 
+@pytest.mark.slow
 def test_a_robot_that_comes_again_is_heard_again(ends: list[dict[str, Any]]) -> None:
     with Robot(1, ends[0], hears=(2,)) as one:
         for times in range(3):
@@ -145,11 +147,10 @@ def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str
         port = address.rpartition(":")[2]
         with pytest.raises(ConfigError, match=rf"front_end zmq: {key}.* = '.*': port {port}: must be 1 to 65535"):
             RobotLink(config(1, {**ends[0], key: address if key == "bind" else [address]}))
-    with (
-        Robot(1, {**ends[0], "bind": "tcp://127.0.0.1:45671"}),
-        pytest.raises(RadioError, match="Address already in use"),
-    ):
-        RobotLink(config(2, {**ends[0], "bind": "tcp://127.0.0.1:45671"}))
+    with socket.create_server(("127.0.0.1", 0)) as held:
+        taken = f"tcp://127.0.0.1:{held.getsockname()[1]}"
+        with pytest.raises(RadioError, match="Address already in use"):
+            RobotLink(config(2, {**ends[0], "bind": taken}))
 
 
 def test_it_needs_samples_and_addresses(ends: list[dict[str, Any]]) -> None:

@@ -13,7 +13,7 @@ from gr_ros2.record.result import Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.registry import Registry
 from gr_ros2.report.page import Run
-from gr_ros2.wire import Entry, Packet, encode
+from gr_ros2.wire.v0 import V0, Entry, Packet
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu"})
 T0 = 100.0
@@ -66,7 +66,7 @@ def recorded() -> Recorder:
             entries = tuple(
                 Entry(e.topic_id, e.entry_id, e.index, e.total, bytes([step, e.topic_id, e.index])) for e in record
             )
-            data = encode(Packet(1, 255, number & 255, 1, entries), 64)
+            data = V0.encode(Packet(1, 255, number & 255, 1, entries), 64)
             number += 1
             left = now + (index + 1) * 0.02 - 0.02
             recorder.sender_event(1, SentPacket(data, tuple(record), left))

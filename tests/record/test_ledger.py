@@ -31,6 +31,10 @@ def entry(serial: int, entry_id: int, index: int = 0, total: int = 1, topic_id: 
     return SentEntry(serial, topic_id, entry_id, index, total)
 
 
+def repeated(serial: int, entry_id: int, topic_id: int = 0) -> SentEntry:
+    return SentEntry(serial, topic_id, entry_id, 0, 1, repeat=True)
+
+
 def feed(*events: SenderEvent) -> Ledger:
     ledger = Ledger()
     for event in events:
@@ -136,17 +140,41 @@ def test_a_second_delivery_of_one_message_is_no_delivery() -> None:
 
 
 def test_repeats_count_neither_as_sent_nor_as_delivered() -> None:
-    ledger = feed(accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, entry(-1, 5)))
+    ledger = feed(accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)))
+    ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 4), 2.0)
     ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 5), 20.0)
     ledger.receiver_event(Lost(SRC, 0, "expired", 5), 20.0)
     book = only(ledger.finish(drained=True))
-    assert (book.sent, book.rows, book.repeats_delivered, book.corrupt) == (1, {"lost_fragments": 1}, 1, 0)
+    assert (book.sent, book.rows, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
+    assert list(book.t_delivered) == [2.0]
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["given up", "never heard"])
+def test_a_message_that_only_a_repeat_carries_across_is_delivered(told: bool) -> None:
+    """A latched message that was lost: its repeat is the same message, and on the graph of the other robot."""
+    ledger = feed(accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)), packet(2, repeated(0, 6)))
+    if told:
+        ledger.receiver_event(Lost(SRC, 0, "expired", 4), 1.0)
+    assert ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 5), 20.0) == 0.0
+    assert ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 6), 30.0) is None
+    book = only(ledger.finish(drained=True))
+    assert (book.sent, book.rows, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
+    assert list(book.t_delivered) == [20.0]
+
+
+def test_a_repeat_that_comes_out_altered_is_corrupt() -> None:
+    ledger = feed(accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)))
+    ledger.receiver_event(Delivered(SRC, 0, b"mop", 0, 5), 20.0)
+    book = only(ledger.finish(drained=True))
+    assert (book.rows, book.repeats_delivered, book.corrupt) == ({"lost_fragments": 1}, 0, 1)
 
 
 def test_a_message_that_takes_a_repeats_id_is_itself_again() -> None:
-    ledger = feed(packet(0, entry(-1, 5)), accepted(0, b"map"), packet(1, entry(0, 5)))
-    ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 5), 20.0)
-    assert only(ledger.finish()).rows == {"delivered": 1}
+    ledger = feed(
+        accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)), accepted(1), packet(2, entry(1, 5))
+    )
+    ledger.receiver_event(Delivered(SRC, 0, b"message 1", 0, 5), 20.0)
+    assert only(ledger.finish(drained=True)).rows == {"lost_fragments": 1, "delivered": 1}
 
 
 def test_a_delivery_told_before_its_packet_is_matched_in_the_end() -> None:
@@ -206,6 +234,7 @@ def test_memory_of_open_messages_is_bounded(total: int) -> None:
 
 
 _NONE: st.SearchStrategy[list[int]] = st.just([])
+_SERIALS = st.lists(st.integers(0, 20), max_size=3)
 _EVENTS = st.lists(
     st.one_of(
         st.tuples(
@@ -213,7 +242,7 @@ _EVENTS = st.lists(
         ),
         st.tuples(st.just("miss"), st.integers(0, 2), st.integers(1, 3), _NONE),
         st.tuples(st.sampled_from(["drop", "arrive", "noise"]), st.integers(0, 20), st.just(0), _NONE),
-        st.tuples(st.just("send"), st.just(0), st.integers(0, 3), st.lists(st.integers(-1, 20), max_size=3)),
+        st.tuples(st.sampled_from(["send", "repeat"]), st.just(0), st.integers(0, 3), _SERIALS),
     ),
     max_size=60,
 )
@@ -245,10 +274,10 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
             gone.add(first)
             refused.add(first)
             ledger.sender_event(SRC, Refused(first, topics[first], "queue_bound"))
-        elif kind == "send":
+        elif kind in ("send", "repeat"):
             serials = [serial for serial in many if serial < len(topics) and serial not in refused]
             gone.update(serials)
-            entries = tuple(entry(s, second, 0, 2, topics[s] if s >= 0 else 0) for s in serials)
+            entries = tuple(SentEntry(s, topics[s], second, 0, 2, repeat=kind == "repeat") for s in serials)
             packets.append(b"packet %d" % (len(packets) % 5))
             ledger.sender_event(SRC, SentPacket(packets[-1], entries, now))
         elif kind == "arrive" and packets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any, cast
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
-from gr_ros2.record.positions import _POSITION_AT, humble_types, position_reader
+from gr_ros2.record.positions import _POSITION_AT, FARTHEST_M, humble_types, position_reader
 
 
 def _make(type_name: str, point: Any) -> Any:
@@ -62,3 +63,12 @@ def test_a_frame_id_of_foreign_bytes(frame_id: bytes) -> None:
     payload = b"\0\1\0\0" + bytes(8) + len(text).to_bytes(4, "little") + text + bytes(4) + b"\1\0\0\0\0" + bytes(720)
     found = read(payload)
     assert found is None or len(found) == 2
+
+
+@pytest.mark.parametrize("odd", [float("nan"), float("inf"), -float("inf"), 1e200, -1.1 * FARTHEST_M])
+def test_what_is_no_place_for_a_robot_is_no_position(odd: float) -> None:
+    read = position_reader("geometry_msgs/msg/Point")
+    assert read is not None
+    for x, y in ((odd, 0.0), (0.0, odd), (odd, odd)):
+        assert read(b"\0\1\0\0" + struct.pack("<3d", x, y, 0.0)) is None
+    assert read(b"\0\1\0\0" + struct.pack("<3d", FARTHEST_M, -FARTHEST_M, odd)) == (FARTHEST_M, -FARTHEST_M)

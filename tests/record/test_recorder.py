@@ -85,5 +85,6 @@ def test_what_does_not_deserialize_has_no_position_and_is_counted() -> None:
     recorder = Recorder(REGISTRY, {1: ""})
     sender = Sender(REGISTRY, SourceConfig(robot_id=1), observer=lambda event: recorder.sender_event(1, event))
     sender.submit(0, b"no odometry", 0.0)
-    assert recorder.counters == {"unreadable_positions": 1}
-    assert recorder.finish(1, 1)[0].path_error_m is None
+    odom = recorder.finish(1, 1)[0]
+    assert odom.path_error_m is None
+    assert (odom.sent, odom.left_out_sent, odom.left_out_received) == (1, 1, 0)

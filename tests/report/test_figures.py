@@ -72,7 +72,8 @@ def test_ledger_bars_fill_the_width() -> None:
 
 
 def test_no_ledger_can_be_drawn(tmp_path: Path) -> None:
-    save_figure(ledger_figure({"a": {}}), tmp_path, "ledger")
+    written = save_figure(ledger_figure({"a": {}}), tmp_path, "ledger")
+    assert all(path.stat().st_size for path in written)
 
 
 def test_a_row_keeps_its_place_and_colour() -> None:

@@ -72,6 +72,7 @@ def _goodput(directory: Path) -> str:
     return f"{read_runs([directory])[0].result.topics[0].goodput_Bps:.1f}"
 
 
+@pytest.mark.slow
 def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     before = write_report([run], tmp_path / "a")
@@ -81,6 +82,7 @@ def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
             assert one.read_bytes() == other.read_bytes(), one.name
 
 
+@pytest.mark.slow
 def test_several_runs_share_a_report(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "paper-ofdm")
     make_run(tmp_path / "b", "paper-direct", paced=False)
@@ -96,6 +98,7 @@ def test_several_runs_share_a_report(tmp_path: Path) -> None:
     assert pa_csv.read_csv(tmp_path / "out" / "summary.csv").column_names == table.column_names
 
 
+@pytest.mark.slow
 def test_runs_of_one_scenario_are_called_after_their_folders(tmp_path: Path) -> None:
     paths = [tmp_path / "x" / "one", tmp_path / "x" / "two", tmp_path / "y" / "one"]
     for path in paths:

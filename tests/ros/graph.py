@@ -11,7 +11,7 @@ import rclpy.executors
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from tests.middleware.support import wait_for
+from tests.waiting import wait_for
 
 
 class Graph:

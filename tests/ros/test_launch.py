@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -24,9 +23,9 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
 
-from tests.e2e.support import free_domains
-from tests.middleware.support import wait_for
+from tests.domains import free_domains
 from tests.ros.graph import Graph
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 ROS2 = shutil.which("ros2")
@@ -62,11 +61,7 @@ def domains(tmp_path: Path) -> list[int]:
     """Those of robot_1.yaml and robot_2.yaml."""
     (tmp_path / "topics.csv").write_text("chat,std_msgs/String\n")
     domains = free_domains(2)
-    with ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket()) for _ in domains]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        addresses = [f"tcp://127.0.0.1:{probe.getsockname()[1]}" for probe in probes]
+    addresses = [f"ipc://{tmp_path}/samples_{number}" for number in (1, 2)]
     for number, domain in enumerate(domains, start=1):
         (tmp_path / f"robot_{number}.yaml").write_text(
             f"""

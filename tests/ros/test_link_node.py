@@ -20,9 +20,9 @@ from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header, String
 
-from tests.e2e.support import free_domains
-from tests.middleware.support import wait_for
+from tests.domains import free_domains
 from tests.ros.graph import Graph
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, str(ROOT / "resource" / "link"), "--ros-args"]

@@ -40,6 +40,7 @@ def test_a_carrier_beyond_the_search_range_is_not_found() -> None:
     assert pdr("channel-cfo", "channel.frequency_offset=0.1") == 0
 
 
+@pytest.mark.slow
 def test_a_wrong_sample_clock_takes_long_packets() -> None:
     assert pdr("channel-clock-offset") < 0.9
     for remedy in ("phy.options.scramble=true", "packet_len=220"):

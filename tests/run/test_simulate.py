@@ -113,6 +113,7 @@ def test_a_third_of_the_rate_is_evenly_spaced_and_fresh(codec: Sized | None) -> 
     assert longest_silence(done, "odom") < 3 * done.airtime_s + 1 / 35
 
 
+@pytest.mark.slow
 def test_six_topics_share_a_link_that_carries_a_third_of_them() -> None:
     done = run("six-topics-paced", duration=38.0)
     topics = books(done)

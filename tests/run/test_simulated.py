@@ -52,6 +52,7 @@ def numbers(result: Result) -> Any:
     return json.loads(TypeAdapter(Result).dump_json(replace(result, wall_s=None)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", BOTH)
 def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     time: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -76,6 +77,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     assert numbers(run("paper-ofdm-paced", time, *NOISY, seed=1).result)["topics"] != first["topics"]
 
 
+@pytest.mark.slow
 def test_without_noise_real_time_samples_and_packets_agree() -> None:
     patient = "ros_source.queue_depth=100"  # a busy computer may hold up real time, which must not lose messages
     real = run_scenario(scenario("paper-ofdm-paced", patient, duration_s=3.0)).result
@@ -91,6 +93,7 @@ def test_without_noise_real_time_samples_and_packets_agree() -> None:
     assert simulated.p50 < there.p50 < simulated.p50 + 1
 
 
+@pytest.mark.slow
 def test_in_noise_packets_lose_what_samples_lose(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(losstable, "PACKETS", 2000)
     monkeypatch.setattr(losstable, "BUILTIN_DIR", Path("none"))

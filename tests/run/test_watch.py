@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from gr_ros2.link.events import Accepted, ReceiverEvent, SenderEvent
+from gr_ros2.link.observe import Observers
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
-from gr_ros2.run.watch import Audience, Fanout, LiveRun
+from gr_ros2.run.watch import Audience, LiveRun
 
 
 class Onlooker:
@@ -58,7 +59,7 @@ def test_an_onlooker_hears_what_the_result_counts() -> None:
 
 def test_everyone_hears_in_turn() -> None:
     one, other = Onlooker(), Onlooker()
-    fanout = Fanout([one, other])
+    fanout = Observers([one, other])
     fanout.sender_event(1, Accepted(0, 0, b"", 0.0))
     fanout.packet_received(b"", 0.0)
     assert one.heard == other.heard == ["Accepted", "received"]
@@ -75,14 +76,14 @@ def test_the_rows_of_an_open_ledger_add_up() -> None:
 
 def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
     audience, early, late = Audience(), Onlooker(), Onlooker()
-    audience.add(early)
+    audience.invite(early)
 
     class Invites(Onlooker):
         """Lets the late one in when the first message is delivered."""
 
         def receiver_event(self, event: ReceiverEvent, now: float) -> None:
             if not self.heard:
-                audience.add(late)
+                audience.invite(late)
             super().receiver_event(event, now)
 
         def sender_event(self, src_id: int, event: SenderEvent) -> None:

@@ -91,7 +91,8 @@ def test_noise_fills_the_whole_mantissa(messages: list[SimMessage]) -> None:
     assert len(values) == 30 * DURATION
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
 def test_robots_drive_and_touch_nothing(seed: int) -> None:
     fleet = Fleet(SimSettings(seed=seed))
     times = np.arange(0, 120, 0.08)
@@ -113,6 +114,7 @@ def test_robots_drive_and_touch_nothing(seed: int) -> None:
         assert max(abs(s.turn_acceleration) for s in states[robot]) <= TURN_ACCELERATION + 1e-9
 
 
+@pytest.mark.slow
 def test_a_crowd_touches_nothing() -> None:
     fleet = Fleet(SimSettings(seed=1, robots=8, size_m=15, obstacles=6, max_speed=2.0))
     for t in np.arange(0, 60, 0.05):

@@ -26,8 +26,8 @@ from gr_ros2.study.sweep import store
 from gr_ros2.study.sweep.cluster import alone_on_this_machine, local_cluster
 from gr_ros2.study.sweep.run import SweepOutcome, SweepProgress, run_sweep
 from gr_ros2.study.sweep.store import Store, run_key
-from tests.middleware.support import wait_for
 from tests.study.sweeps import plan
+from tests.waiting import wait_for
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,7 @@ class Assassin:
             os.kill(self.pids[self.victim], signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_sweep_survives_the_loss_of_a_worker(tmp_path: Path, cluster: Any) -> None:
     made = plan(tmp_path, repetitions=5)
     assassin = Assassin(cluster)
@@ -75,6 +76,7 @@ def test_a_sweep_survives_the_loss_of_a_worker(tmp_path: Path, cluster: Any) -> 
     assert outcome.results[place].topics == run_scenario(robbed).result.topics
 
 
+@pytest.mark.slow
 def test_a_worker_that_has_run_many_flowgraphs_makes_room_for_another(tmp_path: Path, cluster: Any) -> None:
     def patience(runs: int) -> int:
         from gr_ros2.study.sweep import cluster as there
@@ -92,6 +94,7 @@ def test_a_worker_that_has_run_many_flowgraphs_makes_room_for_another(tmp_path: 
         assert set(client.run(os.getpid).values()) != before
 
 
+@pytest.mark.slow
 def test_a_run_that_takes_its_process_down_fails_alone_and_is_tried_again(tmp_path: Path) -> None:
     made = plan(tmp_path, repetitions=3)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}), local_cluster(2) as cluster:
@@ -134,6 +137,7 @@ def test_a_stopped_sweep_goes_on_with_what_is_left(tmp_path: Path, cluster: Any)
     assert outcome_numbers(fresh) == outcome_numbers(outcome)
 
 
+@pytest.mark.slow
 def test_processes_of_this_machine_give_what_a_run_gives_and_none_when_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

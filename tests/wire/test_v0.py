@@ -15,24 +15,16 @@ from gr_ros2.errors import GrRos2Error
 from gr_ros2.wire import (
     CrcError,
     EncodeError,
-    Entry,
     EntryBoundsError,
     IndexRangeError,
     LengthError,
     NoEntriesError,
-    Packet,
     PadError,
     TotalError,
     VersionError,
     WireError,
-    crc16,
-    decode,
-    encode,
-    equal_entry_payload,
-    overhead,
-    pad_len,
-    single_entry_payload,
 )
+from gr_ros2.wire.v0 import V0, Entry, Packet, crc16, overhead, with_crc
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 ERRORS = {
@@ -50,10 +42,6 @@ ERRORS = {
 def packet_of(values: dict[str, Any]) -> Packet:
     entries = tuple(Entry(**{**entry, "payload": bytes.fromhex(entry["payload"])}) for entry in values["entries"])
     return Packet(**{**values, "entries": entries})
-
-
-def with_crc(body: bytes) -> bytes:
-    return body + crc16(body).to_bytes(2, "big")
 
 
 @st.composite
@@ -75,21 +63,21 @@ def packets(draw: st.DrawFn) -> tuple[Packet, int]:
         compressed=draw(st.booleans()),
         encrypted=draw(st.booleans()),
     )
-    needed = -pad_len(0, [len(entry.payload) for entry in entries])
+    needed = V0.packed_len([len(entry.payload) for entry in entries])
     return packet, needed + draw(st.integers(0, 80))
 
 
 @pytest.mark.parametrize("case", VECTORS["valid"], ids=lambda case: str(case["name"]))
 def test_valid_vector_reads_and_writes(case: dict[str, Any]) -> None:
     data, packet = bytes.fromhex(case["hex"]), packet_of(case["packet"])
-    assert decode(data, case["packet_len"]) == packet
-    assert encode(packet, case["packet_len"]) == data
+    assert V0.decode(data, case["packet_len"]) == packet
+    assert V0.encode(packet, case["packet_len"]) == data
 
 
 @pytest.mark.parametrize("case", VECTORS["invalid"], ids=lambda case: str(case["name"]))
 def test_invalid_vector_is_refused_by_name(case: dict[str, Any]) -> None:
     with pytest.raises(ERRORS[case["error"]]):
-        decode(bytes.fromhex(case["hex"]), case["packet_len"])
+        V0.decode(bytes.fromhex(case["hex"]), case["packet_len"])
 
 
 def test_vectors_are_those_shared_with_other_implementations() -> None:
@@ -102,9 +90,9 @@ def test_vectors_are_those_shared_with_other_implementations() -> None:
 @given(packets())
 def test_round_trip(case: tuple[Packet, int]) -> None:
     packet, packet_len = case
-    data = encode(packet, packet_len)
+    data = V0.encode(packet, packet_len)
     assert len(data) == packet_len
-    assert decode(data, packet_len) == packet
+    assert V0.decode(data, packet_len) == packet
 
 
 def test_every_one_and_two_bit_flip_of_a_packet_is_refused() -> None:
@@ -116,7 +104,7 @@ def test_every_one_and_two_bit_flip_of_a_packet_is_refused() -> None:
         for bit in flips:
             damaged ^= 1 << bit
         with pytest.raises(WireError):
-            decode(damaged.to_bytes(len(good), "big"), len(good))
+            V0.decode(damaged.to_bytes(len(good), "big"), len(good))
 
 
 def test_two_bit_flips_are_caught_up_to_the_largest_packet() -> None:
@@ -136,7 +124,7 @@ def test_two_bit_flips_are_caught_up_to_the_largest_packet() -> None:
 @given(st.binary(max_size=300), st.integers(0, 300))
 def test_arbitrary_bytes_raise_nothing_but_wire_errors(data: bytes, packet_len: int) -> None:
     try:
-        decode(data, packet_len)
+        V0.decode(data, packet_len)
     except WireError as error:
         assert isinstance(error, GrRos2Error)
         assert error.kind != "wire"
@@ -146,30 +134,30 @@ def test_arbitrary_bytes_raise_nothing_but_wire_errors(data: bytes, packet_len: 
 def test_arbitrary_bodies_with_a_right_crc_decode_or_are_refused_by_name(body: bytes) -> None:
     data = with_crc(bytes([body[0] & 15]) + body[1:])
     try:
-        packet = decode(data, len(data))
+        packet = V0.decode(data, len(data))
     except WireError:
         return
     if packet.src_id < 255:
-        again = decode(encode(packet, len(data)), len(data))
+        again = V0.decode(V0.encode(packet, len(data)), len(data))
         assert again == packet
 
 
 def test_reserved_qos_reads_as_default_and_spare_nibble_is_ignored() -> None:
-    data = bytearray(encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),), qos=2), 20)[:-2])
+    data = bytearray(V0.encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),), qos=2), 20)[:-2])
     data[0] |= 3 << 2
     data[5] |= 0xF
-    packet = decode(with_crc(bytes(data)), 20)
+    packet = V0.decode(with_crc(bytes(data)), 20)
     assert packet.qos == 0
     assert packet.entries[0].topic_id == 3
 
 
 def test_source_255_is_read_but_not_written() -> None:
-    data = bytearray(encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),)), 20)[:-2])
+    data = bytearray(V0.encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),)), 20)[:-2])
     data[1] = 255
-    packet = decode(with_crc(bytes(data)), 20)
+    packet = V0.decode(with_crc(bytes(data)), 20)
     assert packet.src_id == 255
     with pytest.raises(EncodeError):
-        encode(packet, 20)
+        V0.encode(packet, 20)
 
 
 @pytest.mark.parametrize(
@@ -201,12 +189,12 @@ def test_what_the_wire_cannot_say_is_refused(changes: dict[str, Any], packet_len
         **changes,
     }
     with pytest.raises(EncodeError):
-        encode(Packet(**values), packet_len)
+        V0.encode(Packet(**values), packet_len)
 
 
 def test_sizes_are_those_of_the_paper() -> None:
     assert [overhead(count) for count in (1, 2, 3, 15)] == [8, 8, 9, 15]
-    assert single_entry_payload(64) == 51
-    assert equal_entry_payload(220, 2) == 101
-    assert pad_len(220, [101, 101]) == 0
-    assert -(-724 // single_entry_payload(64)) == 15
+    assert V0.single_entry_payload(64) == 51
+    assert V0.equal_entry_payload(220, 2) == 101
+    assert V0.packed_len([101, 101]) == 220
+    assert -(-724 // V0.single_entry_payload(64)) == 15

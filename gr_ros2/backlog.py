@@ -1,0 +1,116 @@
+"""Work that may be done later: a bounded queue and one thread that works it off.
+
+Laws: :meth:`Backlog.offer` never waits, and refuses what does not fit; work is done in the order in which it came, in
+one thread; a work that never returns holds up nobody but those behind it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+_GATHER_S = 0.01
+"""s the thread gathers work after it was woken: waking it for every piece would cost the giver more than the piece."""
+
+Work = tuple[Callable[..., object], tuple[object, ...]]
+
+
+class Backlog:
+    """Does work in a thread of its own.
+
+    :param name: of the thread
+    :param most: bytes that may wait, or be under way
+    """
+
+    def __init__(self, name: str, most: int) -> None:
+        self._most = most
+        self._changed = threading.Condition()
+        self._waiting: list[Work] = []
+        self._waiting_size = self._held = 0
+        self._taken = self._done = 0
+        self._idle = self._closed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def pending(self) -> int:
+        """Pieces of work taken and not done."""
+        return self._taken - self._done
+
+    def offer(self, size: int, work: Callable[..., object], *arguments: object) -> bool:
+        """Hand over work, which must not raise.
+
+        :param size: bytes it holds; with 0 it always fits
+        :return: whether it was taken: there was room, and this is not closed
+        """
+        with self._changed:
+            if self._closed or (size and self._held and self._held + size > self._most):
+                return False
+            self._take(size, (work, arguments))
+        return True
+
+    def put(self, size: int, work: Callable[..., object], *arguments: object) -> bool:
+        """The same, but wait for room.
+
+        :return: whether it was taken: this is not closed
+        """
+        with self._changed:
+            while self._held and self._held + size > self._most and not self._closed:
+                self._changed.wait()
+            if self._closed:
+                return False
+            self._take(size, (work, arguments))
+        return True
+
+    def settle(self, timeout_s: float) -> bool:
+        """Wait until all that was taken is done.
+
+        :return: whether it is, by then
+        """
+        with self._changed:
+            return self._changed.wait_for(lambda: not self.pending, timeout_s)
+
+    def close(self, timeout_s: float | None = None) -> bool:
+        """Take no more, and wait until all that was taken is done. Idempotent.
+
+        :param timeout_s: None waits for ever
+        :return: whether it is, by then
+        """
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _take(self, size: int, work: Work) -> None:
+        self._waiting.append(work)
+        self._waiting_size += size
+        self._held += size
+        self._taken += 1
+        if self._idle:
+            self._idle = False
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._waiting:
+                    if self._closed:
+                        return
+                    self._idle = True
+                    self._changed.wait()
+                self._idle = False
+                hurry = self._closed
+            if not hurry:
+                time.sleep(_GATHER_S)
+            with self._changed:
+                batch, self._waiting = self._waiting, []
+                size, self._waiting_size = self._waiting_size, 0
+            for work, arguments in batch:
+                work(*arguments)
+                self._done += 1
+            with self._changed:
+                self._held -= size
+                self._changed.notify_all()

@@ -1,0 +1,71 @@
+"""Who observes a link, and cannot harm it.
+
+Laws: an observer hears every event in order until its first exception, which ends it alone
+(:class:`gr_ros2.guard.Guard`): the link and the other observers go on. It is called in the thread of the event: one
+that may be slow gets its events through a bounded queue from who attaches it
+(``gr_ros2.run.watch.Onlookers``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Generic, Protocol, TypeVar
+
+from gr_ros2.guard import Guard
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+
+
+class LinkObserver(Protocol):
+    """What hears both ends of a link. It is called from the link's threads, in causal order, and must be quick."""
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """What the sender with this source id reports."""
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        """Bytes the PHY handed to the sink, before the sink reads them."""
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """What the receiver reports; of a delivery once it is republished."""
+
+
+_Observer = TypeVar("_Observer", bound=LinkObserver)
+
+
+class Observers(Generic[_Observer]):
+    """Hands every event to several observers in their order, each under a guard of its own."""
+
+    def __init__(self, observers: Iterable[_Observer] = ()) -> None:
+        self._guarded: tuple[tuple[_Observer, Guard], ...] = ()
+        for observer in observers:
+            self.add(observer)
+
+    def add(self, observer: _Observer, *, needed: bool = False) -> Guard:
+        """Let one more observe, from now.
+
+        :param needed: see :class:`Guard`
+        """
+        guard = Guard(name_of(observer), needed=needed)
+        self._guarded += ((observer, guard),)
+        return guard
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        for observer, guard in self._guarded:
+            guard(observer.sender_event, src_id, event)
+
+    def packet_received(self, data: bytes, now: float) -> None:
+        for observer, guard in self._guarded:
+            guard(observer.packet_received, data, now)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        for observer, guard in self._guarded:
+            guard(observer.receiver_event, event, now)
+
+    def told(self) -> list[str]:
+        """What observers missed and why, one line each; often none."""
+        lines = [line for _, guard in self._guarded for line in guard.told()]
+        return lines + [line for one, _ in self._guarded if isinstance(one, Observers) for line in one.told()]
+
+
+def name_of(observer: object) -> str:
+    """What an observer is called: its ``name``, or its class."""
+    return str(getattr(observer, "name", type(observer).__name__))

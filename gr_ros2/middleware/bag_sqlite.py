@@ -1,0 +1,102 @@
+"""The sqlite3 files of ROS 2 bags, of all versions of their schema, and as a crash leaves them.
+
+Laws: reading changes nothing, neither the file nor its folder; what SQLite keeps beside the file (the write-ahead log
+of a writer that never closed) is part of it, and where it cannot be taken into account the file is refused.
+Sources: https://www.sqlite.org/wal.html, sections 5 and 8 (read-only databases, heap memory instead of a -shm file);
+https://www.sqlite.org/lockingv3.html, section 4.2 (hot journals).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import apsw
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2.metadata import parse_qos
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from gr_ros2.errors import BagError
+
+_FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+"""By rosbag2's name; what is not here, such as its ``unknown``, is no definition."""
+
+
+class SqliteStorage(Sqlite3Reader):
+    """rosbags' reader of messages, on a database opened together with its write-ahead log."""
+
+    def open(self) -> None:
+        """Open and read which topics there are.
+
+        :raises BagError: for a write that was broken off, or no bag
+        """
+        path = Path(str(self.path))
+        self.dbconn = _connect(path)
+        try:
+            self._describe(self.dbconn)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, apsw.ReadOnlyError):
+                raise BagError(
+                    f"bag {path}: a write was broken off, and {path.name}-journal is needed to undo it, which changes "
+                    "the file; open a copy of both once with sqlite3"
+                ) from error
+            raise
+
+    def _describe(self, database: apsw.Connection) -> None:
+        tables = {name for (name,) in _rows(database, "SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"messages", "topics"} <= tables:
+            raise BagError(f"bag {self.path}: is no ROS 2 bag: it has no tables messages and topics")
+        columns = {row[1] for row in _rows(database, "PRAGMA table_info(topics)")}
+        qos, digest = (name if name in columns else "''" for name in ("offered_qos_profiles", "type_description_hash"))
+        texts = (
+            "SELECT topic_type, encoding, encoded_message_definition, type_description_hash FROM message_definitions"
+        )
+        definitions = _rows(database, texts) if "message_definitions" in tables else []
+        counts = dict(_rows(database, "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        topics = f"SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics ORDER BY id"
+        self.connections = [
+            Connection(
+                number,
+                name,
+                type_name,
+                _definition(definitions, type_name, type_hash),
+                type_hash,
+                counts.get(number, 0),
+                ConnectionExtRosbag2(serialization, parse_qos(profiles)),
+                self,
+            )
+            for number, name, type_name, serialization, profiles, type_hash in _rows(database, topics)
+        ]
+        self.metadata = self.metadata._replace(message_count=sum(counts.values()))
+
+
+def _definition(rows: list[tuple[Any, ...]], type_name: str, type_hash: str) -> MessageDefinition:
+    """The text of a type; where the file has several, as of bags that were joined, the hash tells which."""
+    for name, encoding, text, digest in rows:
+        if name == type_name and encoding in _FORMATS and (digest == type_hash or not (digest and type_hash)):
+            return MessageDefinition(_FORMATS[encoding], text)
+    return MessageDefinition(MessageDefinitionFormat.NONE, "")
+
+
+def _rows(database: apsw.Connection, query: str) -> list[tuple[Any, ...]]:
+    return database.execute(query).fetchall()
+
+
+def _connect(path: Path) -> apsw.Connection:
+    flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+    place = f"file:{quote(str(path))}"
+    # Of an empty database SQLite would remove what is beside it.
+    if not (path.stat().st_size and any(_has_bytes(path, suffix) for suffix in ("-wal", "-journal"))):
+        return apsw.Connection(f"{place}?immutable=1", flags=flags)
+    # Without locks, and with the index of the log in memory, SQLite makes no file beside it.
+    database = apsw.Connection(f"{place}?mode=ro&vfs=unix-none", flags=flags)
+    database.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
+    database.execute("PRAGMA locking_mode = EXCLUSIVE")
+    return database
+
+
+def _has_bytes(path: Path, suffix: str) -> bool:
+    beside = path.with_name(path.name + suffix)
+    return beside.exists() and beside.stat().st_size > 0

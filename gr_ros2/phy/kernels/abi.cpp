@@ -1,0 +1,105 @@
+// The C interface of the kernels, for ctypes.
+//
+// Laws: no exception leaves; arrays are the caller's; a call takes no lock and keeps nothing of what it was given.
+
+#include <cstddef>
+#include <exception>
+
+#include "modem.h"
+
+#define GR_ROS2_API extern "C" __attribute__((visibility("default")))
+
+using namespace gr_ros2;
+
+namespace {
+
+enum Kind { kOfdm, kLinear, kLora };
+
+// A call that could not get memory says so by this.
+constexpr int64_t kNoMemory = std::numeric_limits<int64_t>::max();
+
+template <typename Parameters>
+Modem* made(std::unique_ptr<Modem> (*make)(const Parameters&), const void* given, int64_t size) {
+    if (size != static_cast<int64_t>(sizeof(Parameters))) return nullptr;
+    return make(*static_cast<const Parameters*>(given)).release();
+}
+
+Samples view(const void* samples, int64_t count) { return {static_cast<const Sample*>(samples), count}; }
+
+}  // namespace
+
+// What it was compiled for.
+GR_ROS2_API const char* kernels_target() {
+#if defined(__AVX2__) && defined(__FMA__)
+    return "AVX2";
+#elif defined(__ARM_NEON)
+    return "NEON";
+#elif defined(__SSE2__)
+    return "SSE2";
+#else
+    return "plain";
+#endif
+}
+
+// Whether this processor runs what was compiled for AVX2. Asked of the library that runs everywhere.
+GR_ROS2_API int kernels_has_avx2() {
+#if defined(__x86_64__) || defined(__i386__)
+    __builtin_cpu_init();
+    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#else
+    return 0;
+#endif
+}
+
+// A modem from its parameters (`size` bytes of them); null where they are not those of this library, or without memory.
+GR_ROS2_API void* modem_new(int kind, const void* parameters, int64_t size) {
+    try {
+        switch (kind) {
+            case kOfdm: return made(make_ofdm, parameters, size);
+            case kLinear: return made(make_linear, parameters, size);
+            case kLora: return made(make_lora, parameters, size);
+        }
+    } catch (const std::exception&) {
+    }
+    return nullptr;
+}
+
+GR_ROS2_API void modem_free(void* modem) { delete static_cast<Modem*>(modem); }
+
+// Samples searched; `start` becomes that of a burst, or the lowest number there is.
+GR_ROS2_API int64_t modem_find(const void* modem, const void* samples, int64_t count, int64_t* start) {
+    try {
+        const Search found = static_cast<const Modem*>(modem)->find(view(samples, count));
+        *start = found.start;
+        return found.searched;
+    } catch (const std::exception&) {
+        return kNoMemory;
+    }
+}
+
+GR_ROS2_API int64_t modem_end(const void* modem, const void* samples, int64_t count, int64_t start) {
+    try {
+        return static_cast<const Modem*>(modem)->end(view(samples, count), start);
+    } catch (const std::exception&) {
+        return kNoMemory;
+    }
+}
+
+// 1, or 0 where there is no burst, or -1 without memory.
+GR_ROS2_API int modem_read(const void* modem, const void* samples, int64_t count, int64_t start, float* soft, void* points,
+                           double* snr) {
+    try {
+        return static_cast<const Modem*>(modem)->read(view(samples, count), start, soft, static_cast<Sample*>(points), snr);
+    } catch (const std::exception&) {
+        return -1;
+    }
+}
+
+// 1, or 0 where the kernel leaves it to numpy, or -1 without memory.
+GR_ROS2_API int modem_modulate(const void* modem, const uint8_t* bits, void* out) {
+    try {
+        return static_cast<const Modem*>(modem)->modulate(bits, static_cast<Sample*>(out));
+    } catch (const std::exception&) {
+        return -1;
+    }
+}

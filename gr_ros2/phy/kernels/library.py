@@ -1,0 +1,75 @@
+"""The library of compiled kernels: which variant this processor runs, or why there is none.
+
+Laws: what is missing or does not load is no error, but a reason that can be told; a library is loaded once, and changes
+nothing in the process beside itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from typing import Any
+
+_FOLDER = Path(__file__).parent
+_EVERYWHERE, _AVX2 = "_baseline", "_avx2"
+"""Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
+_POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
+_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "kernels_target": (ctypes.c_char_p, []),
+    "kernels_has_avx2": (_INT, []),
+    "modem_new": (_POINTER, [_INT, _POINTER, _LONG]),
+    "modem_free": (None, [_POINTER]),
+    "modem_find": (_LONG, [_POINTER, _POINTER, _LONG, _POINTER]),
+    "modem_end": (_LONG, [_POINTER, _POINTER, _LONG, _LONG]),
+    "modem_read": (_INT, [_POINTER, _POINTER, _LONG, _LONG, _POINTER, _POINTER, _POINTER]),
+    "modem_modulate": (_INT, [_POINTER, _POINTER, _POINTER]),
+}
+"""Result and arguments of each function of ``abi.cpp``."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What came of looking for the library.
+
+    :param functions: those of ``abi.cpp``, None where there is no library
+    :param about: what they were compiled for, such as ``AVX2``, or why there are none
+    """
+
+    functions: Any
+    about: str
+
+
+@lru_cache(maxsize=1)
+def loaded() -> Loaded:
+    """The variant for this processor."""
+    return load(_FOLDER)
+
+
+def load(folder: Path) -> Loaded:
+    """The variant for this processor out of a folder."""
+    baseline = _file(folder, _EVERYWHERE)
+    if baseline is None:
+        return Loaded(None, "they were not built; install a C++ compiler (apt install g++), then gr-ros2 once more")
+    try:
+        functions = _open(baseline)
+        newer = _file(folder, _AVX2)
+        if newer is not None and functions.kernels_has_avx2():
+            functions = _open(newer)
+    except (OSError, AttributeError) as error:  # built for another machine, or by another version
+        return Loaded(None, f"they do not load ({error}); install gr-ros2 once more")
+    return Loaded(functions, functions.kernels_target().decode())
+
+
+def _file(folder: Path, variant: str) -> Path | None:
+    return next((path for suffix in EXTENSION_SUFFIXES if (path := folder / f"{variant}{suffix}").is_file()), None)
+
+
+def _open(path: Path) -> Any:
+    functions = ctypes.CDLL(str(path))  # its calls release Python's lock
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(functions, name)
+        function.restype, function.argtypes = result, arguments
+    return functions

@@ -1,0 +1,349 @@
+// The kernel of gr_ros2/phy/linear.py, whose methods have the same names and say why: psk and gfsk behind their filter.
+
+#include "constellation.h"
+#include "modem.h"
+
+namespace gr_ros2 {
+namespace {
+
+constexpr double kTiny = 1e-30;
+constexpr double kSmallestNoise = 1e-6;
+constexpr int kPad = 4;       // FFT bins per bin of the preamble's length
+constexpr int kStep = 64;     // positions searched at a time
+constexpr double kFar = 1e6;  // samples that no burst can be late
+
+// A preamble's symbols without their signs, in `symbols`, and the carrier that is left.
+struct Carrier {
+    double frequency, alike;
+};
+
+struct Scratch {
+    std::vector<float> re, im, power, match, chance;       // per sample, per position
+    std::vector<Sample> symbols, spectrum, spare, rotation;  // per preamble symbol, per bin
+    std::vector<Sample> raw, turned, other;                // per symbol of a chunk
+    std::vector<float> heights;
+    std::vector<double> drift, places, angles;
+    std::vector<int> decided;
+};
+
+Scratch& scratch() {
+    static thread_local Scratch mine;
+    return mine;
+}
+
+class Linear final : public Modem {
+   public:
+    explicit Linear(const LinearParameters& p)
+        : p_(p),
+          steps_(p.steps, p.steps + p.preamble - 1),
+          known_(p.known, p.known + p.preamble),
+          explained_(p.explained, p.explained + static_cast<size_t>(p.unknowns) * (p.preamble - 2 * p.edge)),
+          points_(p.points, p.order, p.point_bits, p.marks),
+          fft_(kPad * p.preamble) {}
+
+    Search find(Samples samples) const override {
+        const int sps = p_.sps;
+        const int64_t positions = samples.count - static_cast<int64_t>(p_.preamble - 1) * sps;
+        if (positions <= 0) return {0, kNone};
+        Scratch& s = prepared();
+        correlate(samples, positions, s);
+        const float *match = s.match.data(), *chance = s.chance.data();
+        const auto level = static_cast<float>(p_.threshold * p_.threshold * (p_.preamble - 1));
+        const int64_t rise = static_cast<int64_t>(p_.rise) * sps;
+        for (int64_t at = 0; at < positions;) {
+            int64_t first = at;
+            while (first < positions && !(match[first] > level * chance[first] + static_cast<float>(kTiny))) first++;
+            if (first == positions) break;
+            if (first + rise > positions) return {first, kNone};  // the highest point may still be to come
+            const int64_t best = first + argmax(match + first, static_cast<int>(rise));
+            if (carrier(samples, best, s).alike > p_.alike) return {first, best};
+            at = best + 1;
+        }
+        return {positions, kNone};
+    }
+
+    int64_t end(Samples, int64_t start) const override {
+        return start + static_cast<int64_t>(p_.preamble + p_.payload - 1) * p_.sps + 1 + p_.slack;
+    }
+
+    bool read(Samples samples, int64_t start, float* soft, Sample* points, double* snr) const override {
+        if (start < 1 || start >= samples.count) return false;
+        Scratch& s = prepared();
+        const Carrier found = carrier(samples, start, s);
+        const double frequency = found.frequency + p_.turn;
+        const double phase = straighten(found.frequency, s);
+        *snr = signal_to_noise(s);
+        const double begin = static_cast<double>(start) + lateness(samples, start, found.frequency, s);
+        if (!follow(samples, begin, phase, frequency, points, s)) return false;
+        decide(points, soft, s);
+        if (p_.differential) differ(soft);
+        return true;
+    }
+
+   private:
+    Scratch& prepared() const {
+        Scratch& s = scratch();
+        for (auto* one : {&s.symbols, &s.rotation}) one->resize(p_.preamble);
+        for (auto* one : {&s.spectrum, &s.spare}) one->resize(fft_.size());
+        for (auto* one : {&s.raw, &s.turned, &s.other}) one->resize(p_.chunk);
+        s.heights.resize(fft_.size());
+        s.drift.resize(p_.chunk);
+        const int blocks = std::max(1, p_.chunk / p_.block);
+        for (auto* one : {&s.places, &s.angles}) one->resize(blocks + 1);
+        s.decided.resize(p_.payload);
+        return s;
+    }
+
+    // Of each position, how much its phase steps are those of the preamble, and how much they would be by chance.
+    void correlate(Samples samples, int64_t positions, Scratch& s) const {
+        const int sps = p_.sps, count = p_.preamble - 1;
+        const int64_t steps = samples.count - sps;
+        for (auto* one : {&s.re, &s.im, &s.power}) one->resize(steps);
+        for (auto* one : {&s.match, &s.chance}) one->resize(positions);
+        float *re = s.re.data(), *im = s.im.data(), *power = s.power.data();
+        for (int64_t k = 0; k < steps; k++) {
+            const Sample p = mul_conj(samples.at[k + sps], samples.at[k]);
+            re[k] = p.real();
+            im[k] = p.imag();
+            power[k] = square(p);
+        }
+        for (int64_t at = 0; at < positions; at += kStep) {
+            float a[kStep] = {}, b[kStep] = {}, c[kStep] = {};
+            const int width = static_cast<int>(std::min<int64_t>(kStep, positions - at));
+            for (int j = 0; j < count; j++) {
+                const int64_t from = at + static_cast<int64_t>(j) * sps;
+                if (width == kStep) add<kStep>(steps_[j], re + from, im + from, power + from, kStep, a, b, c);
+                else add<0>(steps_[j], re + from, im + from, power + from, width, a, b, c);
+            }
+            for (int k = 0; k < width; k++) {
+                s.match[at + k] = a[k] * a[k] + b[k] * b[k];
+                s.chance[at + k] = c[k];
+            }
+        }
+    }
+
+    // A width that the compiler knows lets it keep the sums in registers.
+    template <int Known>
+    static void add(float sign, const float* re, const float* im, const float* power, int width, float* a, float* b,
+                    float* c) {
+        for (int k = 0; k < (Known ? Known : width); k++) {
+            a[k] += sign * re[k];
+            b[k] += sign * im[k];
+            c[k] += power[k];
+        }
+    }
+
+    // Look closely at a preamble.
+    Carrier carrier(Samples samples, int64_t at, Scratch& s) const {
+        const int size = fft_.size();
+        float power = 0;
+        std::fill(s.spectrum.begin(), s.spectrum.end(), Sample());
+        for (int k = 0; k < p_.preamble; k++) {
+            const int64_t place = at + static_cast<int64_t>(k) * p_.sps;
+            s.symbols[k] = place < samples.count ? mul_conj(samples.at[place], known_[k]) : Sample();
+            s.spectrum[k] = s.symbols[k];
+            power += square(s.symbols[k]);
+        }
+        fft_.run(s.spectrum.data(), s.spare.data());
+        squares(s.spectrum.data(), size, s.heights.data());
+        const int peak = argmax(s.heights.data(), size);
+        const auto height = [&](int bin) { return std::sqrt(static_cast<double>(s.heights[bin & (size - 1)])); };
+        const double place = peak + summit(height(peak - 1), height(peak), height(peak + 1));
+        const double frequency = kTau * (wrapped(place + size / 2.0, size) - size / 2.0) / size;
+        const double all = static_cast<double>(p_.preamble) * power;
+        return {frequency, std::isfinite(power) ? s.heights[peak] / std::max(all, kTiny) : 0.0};
+    }
+
+    // Take the carrier from the preamble's symbols; returns their phase.
+    double straighten(double frequency, Scratch& s) const {
+        Rotation(0, -frequency).fill(s.rotation.data(), p_.preamble);
+        double re = 0, im = 0;
+        for (int k = 0; k < p_.preamble; k++) {
+            s.symbols[k] = mul(s.symbols[k], s.rotation[k]);
+            re += s.symbols[k].real();
+            im += s.symbols[k].imag();
+        }
+        return std::atan2(im, re);
+    }
+
+    // Mean power of a burst over that of the noise, from its preamble's inner symbols.
+    double signal_to_noise(const Scratch& s) const {
+        const int inner = p_.preamble - 2 * p_.edge;
+        const Sample* received = s.symbols.data() + p_.edge;
+        double total = 0, explained = 0;
+        for (int k = 0; k < inner; k++) total += square(received[k]);
+        for (int u = 0; u < p_.unknowns; u++) {
+            const Sample* column = &explained_[static_cast<size_t>(u) * inner];
+            double re = 0, im = 0;
+            for (int k = 0; k < inner; k++) {
+                const Sample p = mul(column[k], received[k]);
+                re += p.real();
+                im += p.imag();
+            }
+            explained += re * re + im * im;
+        }
+        const double noise = std::max(total - explained, kTiny) / (inner - p_.unknowns);
+        return (total - inner * noise) / (p_.clean_energy * noise);
+    }
+
+    // Samples by which the preamble's symbols lie behind `start`, -0.5..0.5.
+    double lateness(Samples samples, int64_t start, double frequency, Scratch& s) const {
+        Rotation(0, -frequency).fill(s.rotation.data(), p_.preamble);
+        double heights[3];
+        for (int off = -1; off <= 1; off++) {
+            double re = 0, im = 0;
+            for (int k = 0; k < p_.preamble; k++) {
+                const int64_t place = start + off + static_cast<int64_t>(k) * p_.sps;
+                if (place >= samples.count) break;
+                const Sample p = mul(mul_conj(samples.at[place], known_[k]), s.rotation[k]);
+                re += p.real();
+                im += p.imag();
+            }
+            heights[off + 1] = std::sqrt(re * re + im * im);
+        }
+        return summit(heights[0], heights[1], heights[2]);
+    }
+
+    // The payload's points, straightened, in blocks and chunks; false where this cannot be a burst.
+    bool follow(Samples samples, double begin, double phase, double frequency, Sample* points, Scratch& s) const {
+        const int order = p_.order;
+        double late = 0, known_at = (p_.preamble - 1) / 2.0, known = 0;
+        for (int first = 0; first < p_.payload; first += p_.chunk) {
+            const int count = std::min(p_.chunk, p_.payload - first), symbol = first + p_.preamble;
+            const double at = begin + late + static_cast<double>(symbol) * p_.sps;
+            if (!(std::abs(late) < kFar)) return false;
+            between(samples, at, count, s.raw.data());
+            Rotation(-(phase + frequency * symbol), -frequency).fill(s.turned.data(), count);
+            for (int k = 0; k < count; k++) s.raw[k] = mul(s.raw[k], s.turned[k]);
+            const int blocks = std::max(1, count / p_.block);
+            s.places[0] = known_at;
+            s.angles[0] = known;
+            for (int b = 0; b < blocks; b++) {
+                const int from = b * p_.block, to = b + 1 < blocks ? from + p_.block : count;
+                const double angle = raised_angle(s.raw.data() + from, to - from), last = s.angles[b] * order;
+                s.angles[b + 1] = (angle + kTau * std::nearbyint((last - angle) / kTau)) / order;
+                s.places[b + 1] = symbol + (from + to - 1) / 2.0;
+            }
+            interpolate(blocks, symbol, count, s);
+            for (int k = 0; k < count; k++) {
+                s.other[k] = unit_near(-s.drift[k]);
+                points[first + k] = mul(s.raw[k], s.other[k]);
+            }
+            known_at = symbol + count - 1;
+            known = s.drift[count - 1];
+            if (first + count < p_.payload) late += chunk_lateness(samples, at, points + first, count, s);
+        }
+        return true;
+    }
+
+    // Angle of symbols raised to the power of `order`, each as heavy as it is strong.
+    double raised_angle(const Sample* symbols, int count) const {
+        float re = 0, im = 0;
+        for (int k = 0; k < count; k++) {
+            const float power = square(symbols[k]) + static_cast<float>(kTiny), inverse = 1.0f / std::sqrt(power);
+            Sample raised = symbols[k] * inverse;
+            for (int doubled = 1; doubled < p_.order; doubled *= 2) raised = mul(raised, raised);
+            re += raised.real() * power * inverse;
+            im += raised.imag() * power * inverse;
+        }
+        return std::atan2(im, re);
+    }
+
+    // Phase of each symbol, on straight lines between the blocks' centres.
+    void interpolate(int blocks, int symbol, int count, Scratch& s) const {
+        int left = 0;
+        for (int k = 0; k < count; k++) {
+            const double at = symbol + k;
+            while (left + 1 < blocks && at > s.places[left + 1]) left++;
+            const double from = s.places[left], to = s.places[left + 1];
+            const double share = std::max(0.0, std::min(1.0, (at - from) / (to - from)));
+            s.drift[k] = s.angles[left] + (s.angles[left + 1] - s.angles[left]) * share;
+        }
+    }
+
+    static Sample unit_near(double angle) {
+        return {std::cos(static_cast<float>(angle)), std::sin(static_cast<float>(angle))};
+    }
+
+    // Samples by which a chunk's symbols came late, as their decisions say; `other` holds what straightened them.
+    double chunk_lateness(Samples samples, double at, const Sample* points, int count, Scratch& s) const {
+        for (int k = 0; k < count; k++) {
+            const Sample decided = points_.point(points_.nearest(points[k]));
+            s.turned[k] = mul(mul(s.turned[k], s.other[k]), std::conj(decided));
+        }
+        double heights[3];
+        for (int off = -1; off <= 1; off++) {
+            between(samples, at + off, count, s.other.data());
+            float sum = 0;
+            for (int k = 0; k < count; k++)
+                sum += s.other[k].real() * s.turned[k].real() - s.other[k].imag() * s.turned[k].imag();
+            heights[off + 1] = sum;
+        }
+        return summit(heights[0], heights[1], heights[2]);
+    }
+
+    // `count` values a symbol apart from a fractional place on, by cubic interpolation; zeros outside.
+    void between(Samples samples, double at, int count, Sample* out) const {
+        const double floor = std::floor(at), x = at - floor;
+        const auto base = static_cast<int64_t>(floor);
+        const float weights[4] = {
+            static_cast<float>(-x * (x - 1) * (x - 2) / 6), static_cast<float>((x + 1) * (x - 1) * (x - 2) / 2),
+            static_cast<float>(-(x + 1) * x * (x - 2) / 2), static_cast<float>((x + 1) * x * (x - 1) / 6)};
+        for (int k = 0; k < count; k++) {
+            const int64_t place = base - 1 + static_cast<int64_t>(k) * p_.sps;
+            Sample sum;
+            if (place >= 0 && place + 3 < samples.count) {
+                for (int j = 0; j < 4; j++) sum += weights[j] * samples.at[place + j];
+            } else {
+                for (int j = 0; j < 4; j++)
+                    if (place + j >= 0 && place + j < samples.count) sum += weights[j] * samples.at[place + j];
+            }
+            out[k] = sum;
+        }
+    }
+
+    // Points made as large as the constellation's, and their soft bits.
+    void decide(Sample* points, float* soft, Scratch& s) const {
+        double energy = 0, alike = 0, rest = 0;
+        for (int k = 0; k < p_.payload; k++) {
+            s.decided[k] = points_.nearest(points[k]);
+            const Sample decided = points_.point(s.decided[k]);
+            energy += square(decided);
+            alike += mul_conj(points[k], decided).real();
+        }
+        const double gain = std::max(alike / std::max(energy, 1e-20), 1e-20);
+        for (int k = 0; k < p_.payload; k++)
+            rest += square(points[k] - points_.point(s.decided[k]) * static_cast<float>(gain));
+        const double noise = rest / p_.payload / (gain * gain);
+        const auto sharpness = static_cast<float>(1 / std::max(noise, kSmallestNoise * points_.power()));
+        const auto inverse = static_cast<float>(1 / gain);
+        float likely[64];
+        for (int k = 0; k < p_.payload; k++) {
+            points[k] *= inverse;
+            for (int q = 0; q < p_.order; q++) likely[q] = points_.likelihood(points[k], q) * sharpness;
+            points_.soft_of(likely, soft + static_cast<size_t>(k) * p_.point_bits);
+        }
+    }
+
+    // Bits that are 1 where a phase is that of the symbol before; the first one's before is the preamble's last.
+    void differ(float* soft) const {
+        float before = p_.last_one ? INFINITY : -INFINITY;
+        for (int k = 0; k < p_.payload; k++) {
+            const float here = soft[k], least = std::min(std::abs(here), std::abs(before));
+            soft[k] = here == 0 || before == 0 ? 0.0f : (here > 0) == (before > 0) ? least : -least;
+            before = here;
+        }
+    }
+
+    LinearParameters p_;  // its numbers; arrays are copied below
+    std::vector<float> steps_;
+    std::vector<Sample> known_, explained_;
+    Constellation points_;
+    Fft fft_;
+};
+
+}  // namespace
+
+std::unique_ptr<Modem> make_linear(const LinearParameters& given) { return std::make_unique<Linear>(given); }
+
+}  // namespace gr_ros2

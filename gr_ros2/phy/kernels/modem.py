@@ -1,0 +1,169 @@
+"""A burst modem whose samples a compiled kernel searches and reads.
+
+Laws: everything that is no work on samples is the numpy modem's, which stays the reference; a kernel knows nothing but
+the constants that modem tells; calls from several threads do not meet.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gr_ros2.phy.burst import BurstModem, Constants, Reading, Samples, Search
+from gr_ros2.phy.kernels.library import loaded
+
+_NONE = -(2**63)
+_NO_MEMORY = 2**63 - 1
+
+Fields = Mapping[str, str]
+"""Names of a kernel's numbers and arrays, in the order of its struct in ``modem.h``, by type."""
+
+
+def _fields(**names: str) -> Fields:
+    return {name: kind for kind, listed in names.items() for name in listed.split()}
+
+
+KERNELS: dict[str, tuple[int, Fields]] = {
+    "ofdm": (
+        0,
+        _fields(
+            int32="size prefix symbols repeat frame_bits degrees chunk carrier_count data_count pilot_count once_count "
+            "twice_count shift_count point_count point_bits",
+            float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
+            int32s="carriers data pilots once twice shifts",
+            complex64s="words known turns whole smooth smooth_words crosswise header points",
+            float32s="word_weight",
+            uint8s="marks",
+        ),
+    ),
+    "linear": (
+        1,
+        _fields(
+            int32="sps order point_bits payload preamble chunk block rise edge slack unknowns differential last_one",
+            float64="turn clean_energy threshold alike",
+            float32s="steps",
+            complex64s="known explained points",
+            uint8s="marks",
+        ),
+    ),
+    "lora": (
+        2,
+        _fields(
+            int32="chips spreading_factor code_bits symbols step look head sync down fine sinc",
+            float64="median_share limit threshold gain pace_gain certain",
+            complex64s="down_chirp up_chirp tapered",
+            int32s="words",
+        ),
+    ),
+}
+"""Number of each kernel, and what it has to be told."""
+_NUMBERS = {"int32": ctypes.c_int32, "float64": ctypes.c_double}
+
+
+class CompiledModem(BurstModem):
+    """The modem given, with the compiled kernel's search and reading.
+
+    :param reference: whose constants tell of a kernel
+    :raises MemoryError: where there is not enough
+    """
+
+    def __init__(self, reference: BurstModem) -> None:
+        super().__init__(reference.frame)
+        constants = reference.constants()
+        assert constants is not None
+        self._reference = reference
+        self.margin, self.stretch = reference.margin, reference.stretch
+        self._functions = loaded().functions
+        self._kernel = _new(self._functions, constants)
+        weakref.finalize(self, self._functions.modem_free, self._kernel)
+        self._soft, self._points = constants.soft_bits, constants.points
+        self._fixed_span = reference.span if type(reference).end is BurstModem.end else None
+
+    def __reduce__(self) -> Any:
+        return CompiledModem, (self._reference,)  # memory of a library stays in its process
+
+    @property
+    def burst_samples(self) -> int:
+        return self._reference.burst_samples
+
+    @property
+    def span(self) -> int:
+        return self._reference.span
+
+    @property
+    def preamble_samples(self) -> int:
+        return self._reference.preamble_samples
+
+    @property
+    def peak_samples(self) -> int:
+        return self._reference.peak_samples
+
+    def modulate(self, packet: bytes) -> Samples:
+        bits = self.frame.wrap(packet)
+        out = np.empty(self.burst_samples, np.complex64)
+        if _done(self._functions.modem_modulate(self._kernel, _address(bits), _address(out))):
+            return out
+        return self._reference.modulate(packet)
+
+    def find(self, samples: Samples) -> Search:
+        samples = np.ascontiguousarray(samples, np.complex64)
+        start = ctypes.c_int64()
+        found = self._functions.modem_find(self._kernel, _address(samples), len(samples), ctypes.addressof(start))
+        return Search(_counted(found), None if start.value == _NONE else start.value)
+
+    def end(self, samples: Samples, start: int) -> int:
+        if self._fixed_span is not None:
+            return start + self._fixed_span
+        samples = np.ascontiguousarray(samples, np.complex64)
+        return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
+
+    def read(self, samples: Samples, start: int) -> Reading | None:
+        samples = np.ascontiguousarray(samples, np.complex64)
+        soft, points = np.empty(self._soft, np.float32), np.empty(self._points, np.complex64)
+        snr = ctypes.c_double()
+        given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(snr))
+        if not _done(self._functions.modem_read(self._kernel, *given)):
+            return None
+        return Reading(soft, points, snr.value)
+
+
+def _new(functions: Any, constants: Constants) -> int:
+    """A kernel in the library's memory."""
+    number, fields = KERNELS[constants.kernel]
+    arrays = []
+    values: list[Any] = []
+    for name, kind in fields.items():
+        value = constants.values[name]
+        if kind in _NUMBERS:
+            values.append(value)
+        else:
+            arrays.append(np.ascontiguousarray(value, kind.removesuffix("s")))
+            values.append(_address(arrays[-1]))
+    types = [(name, _NUMBERS.get(kind, ctypes.c_void_p)) for name, kind in fields.items()]
+    struct = type("Parameters", (ctypes.Structure,), {"_fields_": types})(*values)
+    kernel: int | None = functions.modem_new(number, ctypes.addressof(struct), ctypes.sizeof(struct))
+    if kernel is None:
+        raise MemoryError(f"no memory for the compiled kernel of {constants.kernel}, or it is of another version")
+    return kernel
+
+
+def _address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]  # a third of the time that array.ctypes takes
+    return address
+
+
+def _counted(result: int) -> int:
+    if result == _NO_MEMORY:
+        raise MemoryError("no memory for a compiled kernel to work in")
+    return result
+
+
+def _done(result: int) -> bool:
+    if result < 0:
+        raise MemoryError("no memory for a compiled kernel to work in")
+    return bool(result)

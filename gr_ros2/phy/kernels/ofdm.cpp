@@ -1,0 +1,538 @@
+// The kernel of gr_ros2/phy/ofdm_modem.py, whose methods have the same names and say why.
+
+#include "constellation.h"
+#include "modem.h"
+
+namespace gr_ros2 {
+namespace {
+
+constexpr double kTiny = 1e-20;
+constexpr int kHead = 3;          // two sync words and the header
+constexpr int kToneSize = 1024;   // the finest grid of `tone`
+constexpr float kSmallestNoise = 1e-6f;
+constexpr double kFar = 1e6;         // samples that no burst can be late
+
+struct Place {
+    int64_t begin;
+    double frequency, alike;
+};
+
+struct Clock {
+    double begin, pace;
+};
+
+// What a call works in.
+struct Scratch {
+    std::vector<double> products[2], powers;                       // running sums
+    std::vector<Sample> rotation, first, second, profile, spare;   // an FFT long
+    std::vector<Sample> rows, model, turns;                        // a chunk of symbols by used carriers
+    std::vector<float> energies, heights;
+    std::vector<Sample> gains, before, sum, step, known;           // per used carrier
+    std::vector<float> weight, total;
+    std::vector<Sample> inverse;                                   // per data carrier
+    std::vector<float> sharpness;
+    std::vector<Sample> tone, straight;                            // per symbol
+    Received seen;
+};
+
+Scratch& scratch() {
+    static thread_local Scratch mine;
+    return mine;
+}
+
+template <typename T>
+std::vector<T> copied(const T* from, size_t count) {
+    return std::vector<T>(from, from + count);
+}
+
+void matrix_times(const Sample* matrix, const Sample* vector, Sample* out, int count) {
+    for (int row = 0; row < count; row++, matrix += count) {
+        float real = 0, imag = 0;
+        for (int k = 0; k < count; k++) {
+            const Sample p = mul(matrix[k], vector[k]);
+            real += p.real();
+            imag += p.imag();
+        }
+        out[row] = {real, imag};
+    }
+}
+
+Constellation bpsk() {
+    const Sample points[2] = {{-1, 0}, {1, 0}};
+    const uint8_t marks[2] = {0, 1};
+    return Constellation(points, 2, 1, marks);
+}
+
+class Ofdm final : public Modem {
+   public:
+    explicit Ofdm(const OfdmParameters& p)
+        : p_(p),
+          symbol_(p.size + p.prefix),
+          half_(p.size / 2),
+          window_(symbol_ - p.size / 2),
+          back_(p.prefix / 4),
+          used_(p.carrier_count),
+          carriers_(copied(p.carriers, p.carrier_count)),
+          data_(copied(p.data, p.data_count)),
+          pilots_(copied(p.pilots, p.pilot_count)),
+          once_(copied(p.once, p.once_count)),
+          twice_(copied(p.twice, p.twice_count)),
+          shifts_(copied(p.shifts, p.shift_count)),
+          words_(copied(p.words, 2 * used_)),
+          known_(copied(p.known, used_)),
+          turns_(copied(p.turns, static_cast<size_t>(p.shift_count) * p.size)),
+          whole_(copied(p.whole, 2 * p.size)),
+          smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
+          smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
+          crosswise_(copied(p.crosswise, 2 * p.twice_count)),
+          header_(copied(p.header, p.data_count)),
+          word_weight_(copied(p.word_weight, used_)),
+          points_(p.points, p.point_count, p.point_bits, p.marks),
+          bpsk_(bpsk()),
+          fft_(p.size),
+          roots_(kToneSize) {
+        for (int carrier : carriers_) bins_.push_back((carrier + p.size) % p.size);
+        for (int k = 0; k < kToneSize; k++) roots_[k] = unit(-kTau * k / kToneSize);
+    }
+
+    Search find(Samples samples) const override {
+        const int64_t positions = samples.count - 2 * symbol_ - p_.prefix;
+        if (positions <= 0) return {0, kNone};
+        Scratch& s = prepared();
+        const int64_t count = positions + window_ + half_;
+        sum_up(samples.at, count, s);
+        const double all = s.powers[count];
+        if (!(all <= 1e38)) return {positions, kNone};  // numpy's sums are no numbers from there on either
+        const double least = kTiny * (all + kTiny), level = p_.level;
+        const double *re = s.products[0].data(), *im = s.products[1].data(), *power = s.powers.data();
+        const auto both = [&](int64_t k) {
+            return 0.5 * (power[k + window_] - power[k] + power[k + half_ + window_] - power[k + half_]);
+        };
+        const auto repeated = [&](int64_t k) {
+            const double a = re[k + window_] - re[k], b = im[k + window_] - im[k];
+            return a * a + b * b;
+        };
+        const double root = std::sqrt(level);
+        for (int64_t at = 0; at < positions;) {
+            int64_t first = at;
+            for (; first < positions; first++) {
+                const double least_here = root * both(first) + least;
+                if (least_here < 0 || repeated(first) > least_here * least_here) break;
+            }
+            if (first == positions) break;
+            if (first + symbol_ > positions) return {first, kNone};  // the highest point may still be to come
+            int64_t best = first;
+            double highest = -1;
+            for (int64_t k = first; k < first + symbol_; k++) {
+                const double below = both(k) + kTiny, ratio = repeated(k) / (below * below);
+                if (ratio > highest) {
+                    highest = ratio;
+                    best = k;
+                }
+            }
+            const Place place = look(samples, best, s);
+            if (place.alike > p_.alike) return {std::max<int64_t>(0, std::min(first, place.begin)), place.begin};
+            at = best + 1;
+        }
+        return {positions, kNone};
+    }
+
+    int64_t end(Samples, int64_t start) const override { return start + p_.symbols * symbol_ - back_; }
+
+    bool read(Samples samples, int64_t start, float* soft, Sample* seen, double* snr) const override {
+        Scratch& s = prepared();
+        const Place place = look(samples, start, s);
+        Clock clock{static_cast<double>(place.begin), 0.0};
+        spectra(samples, clock, place.frequency, 0, kHead, s);
+        const float noise = first_estimate(s);
+        *snr = signal_to_noise(s);
+        std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
+        decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
+        const int count = p_.symbols - kHead, all = (p_.frame_bits + p_.point_bits - 1) / p_.point_bits;
+        int done = 0;
+        for (int first = 0; first < count; first += p_.chunk) {
+            const int rows = std::min(p_.chunk, count - first);
+            const int used = std::min(rows * p_.data_count, all - first * p_.data_count);
+            spectra(samples, clock, place.frequency, kHead + first, rows, s);
+            const double late = decide(s, 0, rows, noise, points_, used, 2);
+            if (!(std::abs(late) < kFar)) return false;
+            points_.soft(s.seen, used, soft + static_cast<size_t>(done) * p_.point_bits);
+            std::copy_n(s.seen.points.begin(), used, seen + done);
+            done += used;
+            const double pace = clock.pace + p_.pace_gain * late / p_.chunk;
+            clock = {clock.begin + late + (clock.pace - pace) * (kHead + first + rows), pace};
+        }
+        return true;
+    }
+
+    bool modulate(const uint8_t* bits, Sample* out) const override {
+        Scratch& s = prepared();
+        int taken = 0;
+        for (int symbol = 0; symbol < p_.symbols; symbol++, out += symbol_) {
+            Sample* grid = s.first.data();
+            std::fill_n(grid, p_.size, Sample());
+            const Sample* word = symbol < 2 ? &words_[symbol * used_] : known_.data();
+            for (int c = 0; c < used_; c++) grid[bins_[c]] = word[c];
+            for (int d = 0; symbol >= 2 && d < p_.data_count; d++) {
+                Sample& at = grid[bins_[data_[d]]];
+                if (symbol == 2) at = header_[d];
+                else if (taken < p_.frame_bits) {
+                    int value = 0;
+                    for (int bit = 0; bit < p_.point_bits && taken < p_.frame_bits; bit++) value |= bits[taken++] << bit;
+                    at = points_.point(value);
+                }
+            }
+            // The inverse of a spectrum is the conjugate of the forward FFT of its conjugate.
+            for (int k = 0; k < p_.size; k++) grid[k] = std::conj(grid[k]);
+            fft_.run(grid, s.spare.data());
+            for (int k = 0; k < p_.size; k++) out[p_.prefix + k] = std::conj(grid[k]);
+            std::copy_n(out + p_.size, p_.prefix, out);
+        }
+        return true;
+    }
+
+   private:
+    Scratch& prepared() const {
+        Scratch& s = scratch();
+        for (auto* one : {&s.rotation, &s.first, &s.second, &s.profile, &s.spare}) one->resize(p_.size);
+        const int rows = std::max(p_.chunk, kHead);
+        for (auto* one : {&s.rows, &s.model, &s.turns}) one->resize(static_cast<size_t>(rows) * used_);
+        s.energies.resize(static_cast<size_t>(rows) * used_);
+        for (auto* one : {&s.gains, &s.before, &s.sum, &s.step, &s.known}) one->resize(used_);
+        for (auto* one : {&s.weight, &s.total}) one->resize(used_);
+        s.heights.resize(p_.size);
+        s.inverse.resize(p_.data_count);
+        s.sharpness.resize(p_.data_count);
+        for (auto* one : {&s.tone, &s.straight}) one->resize(rows);
+        s.seen.resize(rows * p_.data_count, points_.count());
+        return s;
+    }
+
+    // Running sums of powers, and of what each sample says of the one half a symbol behind it: in double precision and
+    // from the front, so that silence adds exactly nothing.
+    void sum_up(const Sample* samples, int64_t count, Scratch& s) const {
+        for (auto* one : {&s.products[0], &s.products[1], &s.powers}) one->resize(count + 1);
+        double re = 0, im = 0, power = 0;
+        double *re_out = s.products[0].data(), *im_out = s.products[1].data(), *power_out = s.powers.data();
+        re_out[0] = im_out[0] = power_out[0] = 0;
+        for (int64_t k = 0; k < count - half_; k++) {
+            const Sample p = mul_conj(samples[k + half_], samples[k]);
+            re += static_cast<double>(p.real());
+            im += static_cast<double>(p.imag());
+            power += static_cast<double>(square(samples[k]));
+            re_out[k + 1] = re;
+            im_out[k + 1] = im;
+            power_out[k + 1] = power;
+        }
+        for (int64_t k = count - half_; k < count; k++) power_out[k + 1] = power += static_cast<double>(square(samples[k]));
+    }
+
+    // Look closely at a place where the first half of a symbol is repeated.
+    Place look(Samples samples, int64_t at, Scratch& s) const {
+        at = std::max<int64_t>(0, at);
+        float re = 0, im = 0;
+        const int64_t length = std::min<int64_t>(window_, samples.count - half_ - at);
+        for (int64_t k = 0; k < length; k++) {
+            const Sample p = mul_conj(samples.at[at + half_ + k], samples.at[at + k]);
+            re += p.real();
+            im += p.imag();
+        }
+        double frequency = std::atan2(p_.repeat * im, p_.repeat * re) / half_;
+        const int64_t first = at + p_.prefix - back_;
+        const int size = p_.size;
+        if (samples.count - first < symbol_ + size) return {at, frequency, 0.0};
+        Sample *one = s.first.data(), *two = s.second.data(), *profile = s.profile.data();
+        Rotation(0, -frequency).fill(s.rotation.data(), size);
+        const Sample between = unit(-frequency * symbol_);
+        for (int k = 0; k < size; k++) one[k] = mul(samples.at[first + k], s.rotation[k]);
+        for (int k = 0; k < size; k++) two[k] = mul(mul(samples.at[first + symbol_ + k], s.rotation[k]), between);
+        fft_.run(one, s.spare.data());
+        fft_.run(two, s.spare.data());
+        for (int k = 0; k < size; k++) profile[k] = mul_conj(two[k], one[k]);
+        float heights[16] = {};
+        for (int row = 0; row < p_.shift_count; row++) {
+            const Sample* expected = &turns_[static_cast<size_t>(row) * size];
+            float a = 0, b = 0;
+            for (int k = 0; k < size; k++) {
+                const Sample p = mul(expected[k], profile[k]);
+                a += p.real();
+                b += p.imag();
+            }
+            heights[row] = a * a + b * b;
+        }
+        const int shift = shifts_[argmax(heights, p_.shift_count)];
+        if (shift) {
+            frequency += kTau * shift / size;
+            const int left = (shift % size + size) % size;
+            std::rotate(one, one + left, one + size);
+            std::rotate(two, two + left, two + size);
+            const Sample rest = unit(-kTau * shift * symbol_ / size);
+            for (int k = 0; k < size; k++) two[k] = mul(two[k], rest);
+        }
+        float power = 0;
+        re = im = 0;
+        for (int k = 0; k < size; k++) {
+            power += square(one[k]) + square(two[k]);
+            one[k] = mul(one[k], whole_[k]);
+            two[k] = mul(two[k], whole_[size + k]);
+            const Sample p = mul_conj(two[k], one[k]);
+            re += p.real();
+            im += p.imag();
+        }
+        const double angle = std::atan2(im, re);
+        const Sample straight = unit(-angle);
+        // Of the inverse FFT only the magnitude is wanted: the forward one of the conjugate has it.
+        for (int k = 0; k < size; k++) profile[k] = std::conj(one[k] + mul(two[k], straight));
+        fft_.run(profile, s.spare.data());
+        squares(profile, size, s.heights.data());
+        const int peak = argmax(s.heights.data(), size);
+        const double alike = s.heights[peak] / std::max(static_cast<double>(power) * p_.energy, kTiny);
+        const int late = (peak + half_) % size - half_;
+        return {first - p_.prefix + late, frequency + angle / symbol_, std::isfinite(power) ? alike : 0.0};
+    }
+
+    // Used carriers of some of a burst's symbols, into `rows`.
+    void spectra(Samples samples, Clock clock, double frequency, int symbol, int count, Scratch& s) const {
+        const int64_t base = std::llrint(clock.begin + clock.pace * symbol);
+        const int64_t first = std::max<int64_t>(0, base + static_cast<int64_t>(symbol) * symbol_ + p_.prefix - back_);
+        Rotation(0, -frequency).fill(s.rotation.data(), p_.size);
+        const float scale = 1.0f / p_.size;
+        for (int row = 0; row < count; row++) {
+            const int64_t at = first + static_cast<int64_t>(row) * symbol_;
+            const int have = static_cast<int>(std::max<int64_t>(0, std::min<int64_t>(p_.size, samples.count - at)));
+            const Sample start = unit(-frequency * static_cast<double>(at));
+            Sample *body = s.first.data(), *out = &s.rows[static_cast<size_t>(row) * used_];
+            for (int k = 0; k < have; k++) body[k] = mul(mul(samples.at[at + k], s.rotation[k]), start);
+            std::fill(body + have, body + p_.size, Sample());
+            fft_.run(body, s.spare.data());
+            for (int c = 0; c < used_; c++) out[c] = body[bins_[c]] * scale;
+            const double late = clock.begin + clock.pace * (symbol + row) - static_cast<double>(base);
+            if (late != 0) {
+                advance(late, s.step.data());
+                for (int c = 0; c < used_; c++) out[c] = mul(out[c], s.step[c]);
+            }
+        }
+    }
+
+    // What brings carriers forward by a fraction of a sample, or some.
+    void advance(double samples, Sample* out) const {
+        const double step = kTau / p_.size * samples;
+        // Carriers are in order, with few gaps: one recurrence passes all of them.
+        Turn next = turn(step * carriers_[0]);
+        const Turn one = turn(step);
+        for (int c = 0; c < used_; c++) {
+            out[c] = Sample(next);
+            for (int k = carriers_[c]; c + 1 < used_ && k < carriers_[c + 1]; k++) next = mul(next, one);
+        }
+    }
+
+    // Channel from both sync words, into `gains`; returns the noise on each carrier.
+    float first_estimate(Scratch& s) const {
+        const Sample* rows = s.rows.data();
+        for (int c = 0; c < used_; c++)
+            s.sum[c] = mul_conj(rows[c], words_[c]) + mul_conj(rows[used_ + c], words_[used_ + c]);
+        matrix_times(smooth_words_.data(), s.sum.data(), s.gains.data(), used_);
+        double noise = 0;
+        for (int word = 0; word < 2; word++) {
+            for (int c = 0; c < used_; c++) {
+                const int k = word * used_ + c;
+                noise += square(rows[k] - mul(s.gains[c], words_[k]));
+            }
+        }
+        return static_cast<float>(std::max(noise / p_.degrees, kTiny));
+    }
+
+    // Mean power of a burst over that of the noise in the sampled band, from both sync words.
+    double signal_to_noise(const Scratch& s) const {
+        const Sample *rows = s.rows.data(), *next = rows + used_;
+        double re = 0, im = 0, own = 0, empty = 0, all = 0;
+        for (int k = 0; k < p_.twice_count; k++) {
+            const Sample a = mul(rows[twice_[k]], crosswise_[k]);
+            const Sample b = mul(next[twice_[k]], crosswise_[p_.twice_count + k]);
+            const Sample p = mul_conj(b, a);
+            re += p.real();
+            im += p.imag();
+            own += square(a) + square(b);
+        }
+        for (int c : once_) empty += square(rows[c]);
+        for (int k = 0; k < 2 * used_; k++) all += square(rows[k]);
+        const double differ = own - 2 * std::sqrt(re * re + im * im);
+        const double noise = std::max(empty + differ / p_.pair_weight, kTiny) / (used_ - 0.5);
+        return (all - 2 * used_ * noise) * p_.power / (p_.word_weight_sum * noise * p_.size);
+    }
+
+    // Symbols (rows from `row` on) to likelihoods of points, with a channel estimate that they have made better; returns
+    // by how many samples they came late.
+    double decide(Scratch& s, int row, int count, float noise, const Constellation& points, int used, int rounds) const {
+        Sample* rows = &s.rows[static_cast<size_t>(row) * used_];
+        std::copy(s.gains.begin(), s.gains.end(), s.before.begin());
+        for (int i = 0; i < count; i++) {
+            float re = 0, im = 0;
+            for (int c : pilots_) {
+                const Sample p = mul_conj(rows[i * used_ + c], mul(s.gains[c], known_[c]));
+                re += p.real();
+                im += p.imag();
+            }
+            s.tone[i] = {re, im};
+        }
+        tone(s, count);
+        for (int i = 0; i < count; i++) {
+            const Sample straight = s.straight[i];
+            for (int c = 0; c < used_; c++) rows[i * used_ + c] = mul(rows[i * used_ + c], straight);
+        }
+        double late = 0;
+        for (int round = 0; round < rounds; round++) {
+            weigh(s, rows, noise, points, used);
+            points.expect(s.seen, used);
+            double certain = 0, all = 0;
+            model(s, count, used, &certain, &all);
+            for (int i = 0; i < count; i++) {
+                const Sample *in = rows + i * used_, *sent = &s.model[i * used_], *gains = s.gains.data();
+                Sample* out = &s.turns[i * used_];
+                float re = 0, im = 0;
+                for (int c = 0; c < used_; c++) {
+                    out[c] = mul_conj(in[c], mul(gains[c], sent[c]));
+                    re += out[c].real();
+                    im += out[c].imag();
+                }
+                s.tone[i] = {re, im};
+            }
+            tone(s, count);
+            const double more = lateness(s, count);
+            late += more;
+            advance(more, s.step.data());
+            for (int c = 0; c < used_; c++) {
+                s.total[c] = std::min(s.weight[c], static_cast<float>(p_.memory));
+                s.sum[c] = s.before[c] * s.total[c];
+            }
+            for (int i = 0; i < count; i++) {
+                Sample* in = rows + i * used_;
+                const Sample *sent = &s.model[i * used_], straight = s.straight[i];
+                const float* energies = &s.energies[i * used_];
+                for (int c = 0; c < used_; c++) {
+                    in[c] = mul(mul(in[c], straight), s.step[c]);
+                    s.sum[c] += mul_conj(in[c], sent[c]);
+                    s.total[c] += energies[c];
+                }
+            }
+            for (int c = 0; c < used_; c++) s.sum[c] /= s.total[c];
+            matrix_times(smooth_.data(), s.sum.data(), s.gains.data(), used_);
+            if (certain > (1 - p_.doubt) * all) break;
+        }
+        std::swap(s.weight, s.total);
+        weigh(s, rows, noise, points, used);
+        return late;
+    }
+
+    // What was sent, as far as is known: pilots, and what the points that were received are expected to be.
+    void model(Scratch& s, int count, int used, double* certain, double* all) const {
+        for (int i = 0; i < count; i++) {
+            Sample* sent = &s.model[i * used_];
+            float* energies = &s.energies[i * used_];
+            std::copy(known_.begin(), known_.end(), sent);
+            std::fill_n(energies, used_, 1.0f);
+            const int first = i * p_.data_count, here = std::max(0, std::min(p_.data_count, used - first));
+            float squares = 0, powers = 0;
+            for (int d = 0; d < here; d++) {
+                const float re = s.seen.means[0][first + d], im = s.seen.means[1][first + d];
+                const float power = s.seen.squares[0][first + d] + s.seen.squares[1][first + d];
+                sent[data_[d]] = {re, im};
+                energies[data_[d]] = power;
+                squares += re * re + im * im;
+                powers += power;
+            }
+            for (int d = here; d < p_.data_count; d++) {
+                sent[data_[d]] = Sample();
+                energies[data_[d]] = 0;
+            }
+            *certain += squares;
+            *all += powers;
+        }
+    }
+
+    // Points as received, and how sharp each is.
+    void weigh(Scratch& s, const Sample* rows, float noise, const Constellation& points, int used) const {
+        for (int d = 0; d < p_.data_count; d++) {
+            const Sample gain = s.gains[data_[d]];
+            const float power = square(gain) + static_cast<float>(kTiny);
+            s.inverse[d] = std::conj(gain) / power;
+            s.sharpness[d] = 1.0f / std::max(noise / power, kSmallestNoise * points.power());
+        }
+        for (int first = 0; first < used; first += p_.data_count, rows += used_) {
+            const int here = std::min(p_.data_count, used - first);
+            for (int d = 0; d < here; d++) {
+                const Sample point = mul(rows[data_[d]], s.inverse[d]);
+                s.seen.points[first + d] = point;
+                s.seen.parts[0][first + d] = point.real();
+                s.seen.parts[1][first + d] = point.imag();
+                s.seen.sharpness[first + d] = s.sharpness[d];
+            }
+        }
+        points.weigh(s.seen, used);
+    }
+
+    // What straightens symbols of which each is turned further than the one before by the same angle: from `tone` into
+    // `straight`.
+    void tone(Scratch& s, int count) const {
+        int size = 8;
+        while (size < 8 * count) size *= 2;
+        const int reach = static_cast<int>(size * p_.reach / kTau), stride = kToneSize / size;
+        float heights[kToneSize / 4];
+        for (int place = -reach; place <= reach; place++) {
+            float re = 0, im = 0;
+            for (int k = 0; k < count; k++) {
+                const Sample p = mul(s.tone[k], roots_[static_cast<unsigned>(place * k * stride) & (kToneSize - 1)]);
+                re += p.real();
+                im += p.imag();
+            }
+            heights[place + reach] = std::sqrt(re * re + im * im);
+        }
+        const int best = argmax(heights, 2 * reach + 1);
+        double exact = best - reach;
+        if (best > 0 && best < 2 * reach) {
+            const double before = heights[best - 1], at = heights[best], after = heights[best + 1];
+            const double bend = before - 2 * at + after;
+            if (bend < 0) exact += 0.5 * (before - after) / bend;
+        }
+        Rotation(0, -kTau * exact / size).fill(s.straight.data(), count);
+        double re = 0, im = 0;
+        for (int k = 0; k < count; k++) {
+            const Sample p = mul(s.tone[k], s.straight[k]);
+            re += p.real();
+            im += p.imag();
+        }
+        const Sample back = unit(-std::atan2(im, re));
+        for (int k = 0; k < count; k++) s.straight[k] = mul(s.straight[k], back);
+    }
+
+    // Samples by which symbols come late, from by how little their carriers are turned.
+    double lateness(Scratch& s, int count) const {
+        std::fill(s.known.begin(), s.known.end(), Sample());
+        for (int i = 0; i < count; i++) {
+            const Sample *turns = &s.turns[i * used_], straight = s.straight[i];
+            for (int c = 0; c < used_; c++) s.known[c] += mul(straight, turns[c]);
+        }
+        double top = 0, bottom = 0;
+        for (int c = 0; c < used_; c++) {
+            const double carrier = carriers_[c];
+            top += carrier * s.known[c].imag();
+            bottom += carrier * carrier * std::abs(s.known[c].real());
+        }
+        return -top / std::max(bottom, kTiny) * p_.size / kTau;
+    }
+
+    OfdmParameters p_;  // its numbers; arrays are copied below
+    int symbol_, half_, window_, back_, used_;
+    std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
+    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_, header_;
+    std::vector<float> word_weight_;
+    Constellation points_, bpsk_;
+    Fft fft_;
+    std::vector<Sample> roots_;
+};
+
+}  // namespace
+
+std::unique_ptr<Modem> make_ofdm(const OfdmParameters& given) { return std::make_unique<Ofdm>(given); }
+
+}  // namespace gr_ros2

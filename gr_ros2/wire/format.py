@@ -1,0 +1,154 @@
+"""What every version of the wire format can do, and what is the same in all of them.
+
+Laws: a format object has no state; sizes are bytes, and those that a scheduler asks for are exact or promise too
+little, never too much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+BROADCAST = 255
+"""Destination id of a packet for everybody; source ids are below it."""
+
+QOS_DEFAULT, QOS_LATENCY, QOS_BULK = 0, 1, 2
+QOS_NAMES = ("default", "latency", "bulk")
+"""By their code."""
+
+
+class Entry(Protocol):
+    """A message, or a part of one, in a packet."""
+
+    @property
+    def topic_id(self) -> int:
+        """Registry row."""
+
+    @property
+    def payload(self) -> bytes:
+        """Bytes of the message."""
+
+    @property
+    def label(self) -> str:
+        """Which message, and which part of it, in a few characters."""
+
+    def describe(self) -> str:
+        """The same in words."""
+
+
+class Packet(Protocol):
+    """A packet as a value: what those who only look at packets need of any version.
+
+    ``seq`` is the packet's number as the wire has it, ``Format.number_bits`` wide.
+    """
+
+    @property
+    def version(self) -> int: ...
+    @property
+    def src_id(self) -> int: ...
+    @property
+    def dst_id(self) -> int: ...
+    @property
+    def seq(self) -> int: ...
+    @property
+    def qos(self) -> int: ...
+    @property
+    def hop(self) -> int: ...
+    @property
+    def compressed(self) -> bool: ...
+    @property
+    def encrypted(self) -> bool: ...
+    @property
+    def entries(self) -> Sequence[Entry]: ...
+
+
+class Span(NamedTuple):
+    """A stretch of a packet's bytes.
+
+    :param kind: head, ids, entry, pad or crc
+    :param size: bytes, an entry's own header included
+    :param entry: where it is one
+    """
+
+    kind: str
+    size: int
+    entry: Entry | None = None
+
+
+class Format(Protocol):
+    """One version of the wire format: its limits, its arithmetic, packets to bytes and back."""
+
+    @property
+    def version(self) -> int:
+        """As the first four bits of a packet say it."""
+
+    @property
+    def number_bits(self) -> int:
+        """Width of packet numbers."""
+
+    @property
+    def id_bits(self) -> int:
+        """Width of what names a message among those of its source and topic."""
+
+    @property
+    def max_topics(self) -> int:
+        """Topic ids are below it."""
+
+    @property
+    def max_entries(self) -> int:
+        """Of one packet."""
+
+    @property
+    def max_fragments(self) -> int:
+        """Of one message."""
+
+    @property
+    def min_packet_len(self) -> int:
+        """Shortest ``packet_len`` of a link."""
+
+    @property
+    def max_packet_len(self) -> int:
+        """Longest ``packet_len`` of a link."""
+
+    @property
+    def entry_cost(self) -> int:
+        """Most bytes that a further entry takes beside its payload."""
+
+    def largest_message(self, packet_len: int) -> int:
+        """Most bytes that a message can have."""
+
+    def smallest_packet_len(self, size: int) -> int | None:
+        """Smallest ``packet_len`` that carries a message of ``size`` bytes, None where none does."""
+
+    def room(self, packet_len: int, entries: int, payload: int) -> int:
+        """Payload bytes that one more entry may have.
+
+        :param entries: in the packet so far
+        :param payload: bytes of payload in the packet so far, all entries together
+        :return: negative where no further entry fits
+        """
+
+    def single_entry_payload(self, packet_len: int) -> int:
+        """Most payload bytes of a packet with one entry."""
+
+    def equal_entry_payload(self, packet_len: int, entries: int) -> int:
+        """Most payload bytes of each of so many equal entries; negative where they do not fit."""
+
+    def packed_len(self, payload_lens: Sequence[int]) -> int:
+        """Bytes of a packet with entries of these payloads, padding aside."""
+
+    def layout(self, packet: Any, packet_len: int) -> list[Span]:
+        """What stands where in a packet, in the order of its bytes."""
+
+    def encode(self, packet: Any, packet_len: int) -> bytes:
+        """A packet's bytes.
+
+        :param packet: a value of this version
+        :raises EncodeError: a field out of range, or more than fits
+        """
+
+    def decode(self, data: bytes, packet_len: int) -> Packet:
+        """The packet in these bytes.
+
+        :raises WireError: they are none of this version
+        """

@@ -1,0 +1,77 @@
+"""What a YAML text may cost, checked before any of it is made: its length, its depth, and what its aliases expand to.
+
+Law: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
+settings file needs, every text of that length passes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from gr_ros2.errors import ConfigError
+
+MOST_CHARACTERS = 1 << 18
+MOST_LEVELS = 50
+"""One within the other; a scenario's settings go five deep."""
+MOST_VALUES = 20_000
+"""With every alias written out."""
+
+
+@dataclass
+class _Open:
+    """A list or mapping whose end has not come. ``values`` counts what is in it, itself included."""
+
+    anchor: str | None
+    values: int = 1
+
+
+def read_bounded(path: Path) -> str:
+    """The text of a file, of which no more is read than may be.
+
+    :raises ConfigError: when it is longer
+    :raises OSError: when it cannot be read
+    :raises UnicodeDecodeError: when it is no UTF-8
+    """
+    with path.open(encoding="utf-8") as file:
+        text = file.read(MOST_CHARACTERS + 1)
+    if len(text) > MOST_CHARACTERS:
+        raise ConfigError(f"{path}: longer than {MOST_CHARACTERS:,} characters; a file of settings is not")
+    return text
+
+
+def check_bounds(text: str) -> None:
+    """Refuse a text that would take too long to load, or too much memory.
+
+    :raises ConfigError: for a text that is too long, goes too deep, or whose aliases expand to too much
+    :raises yaml.YAMLError: when it is no YAML
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise ConfigError(f"longer than {MOST_CHARACTERS:,} characters; settings are not")
+    sizes: dict[str, int] = {}
+    levels = [_Open(None)]
+    for event in yaml.parse(text):  # events come one by one and build nothing
+        line = 0 if event.start_mark is None else event.start_mark.line + 1
+        if isinstance(event, yaml.CollectionStartEvent):
+            levels.append(_Open(event.anchor))
+            if len(levels) > MOST_LEVELS:
+                raise ConfigError(f"line {line}: more than {MOST_LEVELS} levels one within the other")
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            closed = levels.pop()
+            anchor, values = closed.anchor, closed.values
+        elif isinstance(event, yaml.ScalarEvent):
+            anchor, values = event.anchor, 1
+        elif isinstance(event, yaml.AliasEvent):
+            if any(level.anchor == event.anchor for level in levels):
+                raise ConfigError(f"line {line}: *{event.anchor} stands within &{event.anchor} itself")
+            anchor, values = None, sizes.get(str(event.anchor), 1)
+        else:
+            continue
+        if anchor is not None:
+            sizes[anchor] = values
+        levels[-1].values += values
+        if levels[-1].values > MOST_VALUES:
+            raise ConfigError(f"line {line}: more than {MOST_VALUES:,} values with every alias written out")

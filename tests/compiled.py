@@ -1,0 +1,35 @@
+"""C++ programs and drivers of the tests, compiled once for all processes of a clone."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+
+def compiled(config: pytest.Config, source: Path, name: str, options: Sequence[str]) -> Path:
+    """A file that ``g++`` makes of one source, alone in a folder of its own; kept until source or options change.
+
+    :param name: of the file
+    :param options: of ``g++``; those behind the source are libraries (``-l…``)
+    """
+    number = hashlib.sha256(source.read_bytes() + repr(options).encode()).hexdigest()[:16]
+    folder = Path(config.cache.mkdir("compiled")) / f"{source.stem}-{number}"
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait until one has made it
+        if not folder.exists():
+            with tempfile.TemporaryDirectory(dir=folder.parent) as fresh:
+                made = Path(fresh) / "made"
+                made.mkdir()
+                libraries = [option for option in options if option.startswith("-l")]
+                others = [option for option in options if option not in libraries]
+                command = ["g++", *others, "-O1", "-o", str(made / name), str(source), *libraries]
+                done = subprocess.run(command, capture_output=True, text=True)
+                assert done.returncode == 0, done.stderr
+                made.rename(folder)
+    return folder / name

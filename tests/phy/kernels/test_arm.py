@@ -1,0 +1,92 @@
+"""The kernels on 64-bit ARM: cross-compiled, run by an emulator, compared with numpy here."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import numpy as np
+
+from gr_ros2.phy.burst import BurstModem, Constants, Samples
+from gr_ros2.phy.kernels.modem import KERNELS
+from tests.phy.kernels.support import IDS, SETTINGS, make, received
+from tests.phy.test_burst import bursts, noise
+
+ROOT = Path(__file__).resolve().parents[3]
+COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
+EXACT = 1e-3
+_TYPES = {"int32": np.dtype("<i4"), "float64": np.dtype("<f8")}
+
+
+def flags() -> list[str]:
+    """What setup.py compiles with."""
+    tree = ast.parse((ROOT / "setup.py").read_text("utf-8"))
+    (given,) = (node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "COMPILE")  # type: ignore[attr-defined]
+    return list(ast.literal_eval(given))
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The command that runs the kernels on ARM."""
+    emulator = shutil.which(EMULATOR) or shutil.which(f"{EMULATOR}-static")
+    if shutil.which(COMPILER) is None or emulator is None:
+        pytest.skip("needs a compiler for ARM and an emulator: apt install g++-aarch64-linux-gnu qemu-user")
+    path = tmp_path_factory.mktemp("arm") / "replay"
+    sources = [*sorted((ROOT / "gr_ros2" / "phy" / "kernels").glob("*.cpp")), Path(__file__).parent / "replay.cpp"]
+    subprocess.run([COMPILER, *flags(), "-static", *map(str, sources), "-o", str(path)], check=True)
+    return [emulator, str(path)]
+
+
+def written(path: Path, constants: Constants, samples: Samples) -> None:
+    """The file that ``replay.cpp`` reads."""
+    kind, fields = KERNELS[constants.kernel]
+    numbers, arrays = b"", []
+    for name, type_name in fields.items():
+        value = constants.values[name]
+        if type_name in _TYPES:
+            one = _TYPES[type_name]
+            numbers += bytes(-len(numbers) % one.itemsize) + np.array(value, one).tobytes()
+        else:
+            arrays.append(np.ascontiguousarray(value, type_name.removesuffix("s")).tobytes())
+    numbers += bytes(-len(numbers) % 8)
+    head = [kind, len(numbers), len(arrays), len(samples), constants.soft_bits, constants.points]
+    parts = [np.array(head, "<i8").tobytes(), numbers]
+    for array in arrays:
+        parts += [np.array(len(array), "<i8").tobytes(), array]
+    path.write_bytes(b"".join([*parts, samples.tobytes()]))
+
+
+def test_it_is_compiled_for_neon(program: list[str]) -> None:
+    assert subprocess.run(program, capture_output=True, text=True, check=True).stdout.strip() == "NEON"
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_same_as_numpy(name: str, options: dict[str, Any], program: list[str], tmp_path: Path) -> None:
+    phy = make(name, options)
+    modem: BurstModem = phy.modem
+    packets, samples = bursts(phy, 1)
+    turned = samples * np.exp(2j * np.pi * 0.003 * np.arange(len(samples)))
+    stream = received(phy, turned + noise(len(samples), 30) * phy.burst_power() ** 0.5)
+    constants = modem.constants()
+    assert constants is not None
+    written(tmp_path / "burst", constants, stream)
+    out = subprocess.run([*program, str(tmp_path / "burst")], capture_output=True, check=True).stdout
+    searched, start, end, read = np.frombuffer(out, "<i8", 4).tolist()
+    snr = float(np.frombuffer(out, "<f8", 1, 32)[0])
+    soft = np.frombuffer(out, "<f4", constants.soft_bits, 40)
+    found = modem.find(stream)
+    assert found.start is not None
+    wanted = modem.read(stream, found.start)
+    assert wanted is not None
+    assert (searched, start, end) == (found.searched, found.start, modem.end(stream, found.start))
+    assert read == 1
+    assert snr == pytest.approx(wanted.snr, rel=EXACT)
+    assert np.abs(soft - wanted.soft).max() <= EXACT * float(np.abs(wanted.soft).mean())
+    assert phy.modem.frame.unwrap(soft) == packets[0]

@@ -1,0 +1,207 @@
+"""Compiled kernels and numpy are fed the same samples: same packets, same moments, same damage, same soft bits."""
+
+from __future__ import annotations
+
+import pickle
+import random
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import numpy as np
+
+from gr_ros2.phy.burst import BurstModem, Samples
+from gr_ros2.phy.theory import half_point
+from tests.phy.kernels.support import IDS, SETTINGS, VARIANTS, hear, make, received, variant, with_kernel
+from tests.phy.test_burst import bursts, delayed, noise
+
+NAMES: list[tuple[str, dict[str, Any]]] = [("ofdm", {}), ("psk", {}), ("gfsk", {}), ("lora", {})]
+EXACT = 1e-3
+"""By how much a soft bit may differ, of the typical one of its burst: single precision and another order of sums."""
+
+
+@pytest.fixture(params=VARIANTS)
+def functions(request: pytest.FixtureRequest) -> Any:
+    return variant(request.param)
+
+
+def both(name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, BurstModem]:
+    phy = make(name, options)
+    return phy, with_kernel(phy.modem, functions, monkeypatch)
+
+
+def impaired(phy: Any, count: int, snr_db: float, seed: int) -> tuple[list[bytes], np.ndarray]:
+    """Bursts between samples, with carrier offset and noise, before the receiver's filter."""
+    packets, samples = bursts(phy, count, seed)
+    moved = delayed(samples, 0.3) * np.exp(2j * np.pi * 0.003 * np.arange(len(samples)))
+    return packets, moved + noise(len(moved), snr_db, seed) * phy.burst_power() ** 0.5
+
+
+def each_burst(modem: BurstModem, samples: Samples) -> Iterator[int]:
+    """Reference samples of bursts, one behind the other."""
+    at = modem.margin
+    while True:
+        stretch = samples[at : at + modem.preamble_samples + modem.stretch]
+        found = modem.find(stretch)
+        if found.start is not None:
+            yield at + found.start
+            at += found.start + modem.peak_samples
+        elif not found.searched:
+            return
+        at += found.searched if found.start is None else 0
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_same_packets_at_the_same_sample_and_the_same_damage(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    count = 4 if name == "lora" else 10
+    middle = half_point(phy.computed_pdr)
+    draw = random.Random(5)
+    for seed, snr_db in enumerate((middle + 0.7, middle + 3, middle + 20)):
+        packets, samples = impaired(phy, count, snr_db, seed)
+        cuts = [draw.randrange(1, 5000) for _ in range(20)]
+        stream = received(phy, samples)
+        heard = hear(phy.modem, stream, cuts)
+        assert hear(fast, stream, cuts) == heard
+    assert [packet for _, packet in heard.packets] == packets
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_same_soft_bits_within_rounding(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    read = 0
+    for snr_db in (half_point(phy.computed_pdr) + 1, 20):
+        _, samples = impaired(phy, 3, snr_db, 1)
+        stream = received(phy, samples)
+        for start in each_burst(phy.modem, stream):
+            if start + phy.modem.burst_samples > len(stream):
+                break
+            assert fast.end(stream, start) == phy.modem.end(stream, start)
+            wanted, found = phy.modem.read(stream, start), fast.read(stream, start)
+            if wanted is None:
+                assert found is None
+                continue
+            typical = float(np.abs(wanted.soft).mean())
+            assert np.abs(found.soft - wanted.soft).max() <= EXACT * typical
+            assert np.abs(found.points - wanted.points).max() <= EXACT * np.abs(wanted.points).max()
+            assert found.snr == pytest.approx(wanted.snr, rel=EXACT)
+            read += 1
+    assert read >= 3
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_same_samples_are_sent(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    packet = random.Random(1).randbytes(64)
+    wanted = phy.modem.modulate(packet)
+    assert fast.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
+def test_same_with_a_sample_that_is_no_number(
+    name: str, options: dict[str, Any], value: float, functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    packets, samples = bursts(phy, 12)
+    clean = received(phy, samples)
+    length, draw = phy.airtime_samples(), random.Random(3)
+    for at in (10, length // 2, length - 20):
+        stream = clean.copy()
+        for burst in (2, 5):
+            stream[400 + burst * length + at] = value
+        cuts = [draw.randrange(1, 5000) for _ in range(20)]
+        with np.errstate(all="ignore"):
+            heard = hear(phy.modem, stream, cuts)
+            assert hear(fast, stream, cuts) == heard
+        assert [packet for _, packet in heard.packets][-3:] == packets[-3:]
+
+
+@pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
+def test_same_with_bursts_that_are_cut(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    packets, samples = impaired(phy, 12, 25, 4)
+    length, draw = phy.airtime_samples(), random.Random(4)
+    for burst in (1, 4, 7):  # the middle, the beginning, a piece that is not there at all
+        first, last = {1: (0.4, 0.8), 4: (0.0, 0.1), 7: (0.3, 0.5)}[burst]
+        samples[400 + burst * length + int(first * length) : 400 + burst * length + int(last * length)] = 0
+    gone = 400 + 9 * length + length // 3
+    stream = received(phy, np.delete(samples, slice(gone, gone + length // 4)))[: -length // 2]
+    cuts = [draw.randrange(1, 5000) for _ in range(20)]
+    heard = hear(phy.modem, stream, cuts)
+    assert hear(fast, stream, cuts) == heard
+    assert packets[2] in [packet for _, packet in heard.packets]
+    assert packets[-1] not in [packet for _, packet in heard.packets]
+
+
+@pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
+def test_same_with_a_burst_whose_beginning_was_missed(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So the place where it began may lie before the first sample there is."""
+    phy, fast = both(name, options, functions, monkeypatch)
+    _, samples = impaired(phy, 2, 25, 2)
+    for missed in range(400, 480, 4):
+        stream = received(phy, samples[missed:])
+        found = phy.modem.find(stream)
+        assert fast.find(stream) == found
+        if found.start is not None and name == "ofdm":
+            wanted, got = phy.modem.read(stream, found.start), fast.read(stream, found.start)
+            assert got.soft == pytest.approx(wanted.soft, abs=EXACT * float(np.abs(wanted.soft).mean()))
+        assert hear(fast, stream, [700]) == hear(phy.modem, stream, [700])
+    if name == "ofdm":
+        assert any((phy.modem.find(received(phy, samples[missed:])).start or 0) < 0 for missed in range(400, 480, 4))
+
+
+@pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
+def test_same_in_noise_alone(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    stream = noise(300_000, 0, seed=9).astype(np.complex64)
+    assert hear(fast, stream, [8192]) == hear(phy.modem, stream, [8192])
+
+
+@pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
+def test_threads_do_not_meet_in_one_kernel(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    streams = [received(phy, impaired(phy, 6, 25, seed)[1]) for seed in range(4)]
+    wanted = [hear(fast, stream, [3000]) for stream in streams]
+    found: list[Any] = [None] * len(streams)
+
+    def run(number: int) -> None:
+        found[number] = [hear(fast, streams[number], [3000]) for _ in range(5)]
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(len(streams))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [[heard] * 5 for heard in wanted]
+
+
+def test_a_compiled_modem_reaches_another_process_by_its_constants(
+    functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both("ofdm", {}, functions, monkeypatch)
+    stream = received(phy, impaired(phy, 3, 25, 0)[1])
+    assert hear(pickle.loads(pickle.dumps(fast)), stream, [900]) == hear(fast, stream, [900])
+
+
+def test_parameters_of_another_version_are_refused(functions: Any) -> None:
+    assert functions.modem_new(0, 0, 1) is None
+    assert functions.modem_new(99, 0, 1) is None
