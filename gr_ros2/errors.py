@@ -212,7 +212,7 @@ class RadioError(PhyError):
 
 
 class BackendMissingError(GrRos2Error, ImportError):
-    """A back-end was chosen whose package is not installed; the message names the package."""
+    """A back-end was chosen whose package is not installed or is broken; the message names the package."""
 
 
 class RunError(GrRos2Error, RuntimeError):

@@ -28,6 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "suite", "least"),
     [
@@ -47,6 +48,7 @@ def test_a_worked_example_keeps_the_contract(
     assert "skipped" not in done.stdout, done.stdout[-1000:]
 
 
+@pytest.mark.slow
 def test_the_worked_examples_carry_a_run_together(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     scenario = tmp_path / "worked.yaml"

@@ -104,6 +104,7 @@ except BackendMissingError as error:
     assert f"middleware {name!r}: package echo-package has it as {why}" in done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_them_by_name_and_lives_with_broken_ones(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     scenario = tmp_path / "echo.yaml"
