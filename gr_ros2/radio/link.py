@@ -126,7 +126,7 @@ class RobotLink(Flowgraph):
         settings: dict[str, Any] = {"domain_id": domain_id, "node_name": node_name}
         if name == "bag":
             raise ConfigError("middleware = 'bag': a link is between live graphs; play the bag on a graph beside it")
-        if name == "dds" and self.config.localhost_only is not None:
+        if name in ("dds", "rclpy") and self.config.localhost_only is not None:
             settings["localhost_only"] = self.config.localhost_only
         graph: Middleware = MIDDLEWARE.load(name)(**settings)
         self._stack.callback(graph.close)

@@ -34,7 +34,7 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     :param node: what it is called there, after ``gr_ros2_``
     """
     settings: dict[str, Any] = {"domain_id": end.domain_id, "node_name": f"gr_ros2_{node}"}
-    if end.middleware == "dds":
+    if end.middleware in ("dds", "rclpy"):
         settings["localhost_only"] = scenario.localhost_only
     graph: Middleware = MIDDLEWARE.load(end.middleware)(**settings)
     return graph
