@@ -25,7 +25,14 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 # A test that names no domain is on one of this process's own, and tests never meet robots on the network.
 os.environ.update(ROS_DOMAIN_ID=str(domains.domain()), ROS_LOCALHOST_ONLY="1")
 # What a person has set for their own robots is not for tests.
-for name in ("CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "ZENOH_CONFIG_OVERRIDE", "ZENOH_SESSION_CONFIG_URI"):
+for name in (
+    "CYCLONEDDS_URI",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ZENOH_CONFIG_OVERRIDE",
+    "ZENOH_SESSION_CONFIG_URI",
+):
     os.environ.pop(name, None)
 
 # A shell script's background jobs ignore Ctrl-C, and so would every program that a test starts and interrupts.

@@ -45,7 +45,8 @@ class DdsMiddleware(DdsParticipant):
     :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
     :param node_name: as ``ros2 node list`` shows it
     :param namespace: of the node
-    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY
+    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY. Where neither says so,
+        ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS count
     :raises ConfigError: a name, number or environment variable is malformed, or the domain is open otherwise
     :raises MiddlewareError: the domain cannot be joined
     """
@@ -62,7 +63,7 @@ class DdsMiddleware(DdsParticipant):
     ) -> None:
         super().__init__()
         self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
-        self.localhost_only = ros_graph.localhost_only() if localhost_only is None else localhost_only
+        options = ros_graph.discovery_options(localhost_only)
         self._node = ros_graph.check_node(node_name, namespace)
         self._gid_bytes = ros_graph.gid_size(os.environ)
         self._closed = False
@@ -76,7 +77,7 @@ class DdsMiddleware(DdsParticipant):
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
         self._found: dict[int, dict[bytes, DiscoveredEndpoint]] = {_PUBLICATIONS: {}, _SUBSCRIPTIONS: {}}
-        self._participant = POOL.join(self.domain_id, self.localhost_only, ros_graph.PARTICIPANT_USER_DATA)
+        self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
             self._guid = guid(self._participant)
             self._waitset = WaitSet(self._participant)

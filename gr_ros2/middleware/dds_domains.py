@@ -1,30 +1,56 @@
-"""Which DDS domains this process has open, and on which interfaces.
+"""Which DDS domains this process has open, and whom they look for.
 
 Law: a domain is configured once, by whoever opens it first, and is shared by all participants of the process; one
 that would need another configuration is refused instead of silently leaving or not leaving the machine.
+Source of what the discovery ranges mean: rmw_cyclonedds and rcl of Jazzy.
 """
 
 from __future__ import annotations
 
+import os
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import cdr_dds
+from gr_ros2.middleware.ros_graph import DiscoveryOptions
 
-LOOPBACK_XML = (
-    '<CycloneDDS><Domain Id="any">'
-    '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>'
-    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
-    "</Domain></CycloneDDS>"
-)
-"""Loopback interface only. Multicast stays on: without it Fast DDS may never match."""
+_LOOPBACK = '<NetworkInterface address="127.0.0.1"/>'
+_UNICAST_ONLY = '<NetworkInterface autodetermine="true" multicast="false" priority="3"/>'
+"""Cyclone DDS looks for peers through the interface of the highest priority only; the loopback interface has 2."""
+_SPDP_INTERVAL = "<SPDPInterval>250ms</SPDPInterval>"
+"""A node on another interface is heard by nobody on the loopback interface: it finds us when we announce ourselves, and
+not the other way round. Cyclone DDS does so every 8 s by itself. On the loopback interface often costs nothing."""
+
+
+def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
+    """The XML of a domain, followed by CYCLONEDDS_URI, which so has the last word; '' = the library's own way."""
+    if options.range == "SYSTEM_DEFAULT":
+        return ""
+    peers = options.peers
+    if options.range == "OFF":
+        general = "<AllowMulticast>false</AllowMulticast>"
+        # Only participants with the same tag find each other.
+        discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>gr_ros2_discovery_off_{os.getpid()}</Tag>"
+    elif options.range == "LOCALHOST":
+        # Multicast stays on: without it Fast DDS may never match. Peers need another interface, without multicast.
+        general = f"<Interfaces>{_LOOPBACK}{_UNICAST_ONLY if peers else ''}</Interfaces>"
+        discovery = f"<ParticipantIndex>auto</ParticipantIndex>{'' if peers else _SPDP_INTERVAL}"
+        peers = ("127.0.0.1", *peers)
+    else:
+        general = "<AllowMulticast>spdp</AllowMulticast>"
+        discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # gives the ports at which peers look for us
+    if peers:
+        discovery += f"<Peers>{''.join(f'<Peer address={quoteattr(peer)}/>' for peer in peers)}</Peers>"
+    domain = f'<Domain Id="any"><General>{general}</General><Discovery>{discovery}</Discovery></Domain>'
+    return f"<CycloneDDS>{domain}</CycloneDDS>,{environment.get('CYCLONEDDS_URI', '')}"
 
 
 @dataclass
 class _Domain:
-    localhost_only: bool
+    options: DiscoveryOptions
     entity: cdr_dds.Entity | None
     members: int = 0
 
@@ -36,18 +62,18 @@ class DomainPool:
         self._domains: dict[int, _Domain] = {}
         self._lock = threading.Lock()
 
-    def join(self, domain_id: int, localhost_only: bool, user_data: bytes) -> cdr_dds.Entity:
+    def join(self, domain_id: int, options: DiscoveryOptions, user_data: bytes) -> cdr_dds.Entity:
         """A new participant.
 
-        :raises ConfigError: the domain is open in this process with other interfaces
+        :raises ConfigError: the domain is open in this process with other options
         :raises DdsError: it cannot be opened
         """
         with self._lock:
-            domain = self._domains.get(domain_id) or self._open(domain_id, localhost_only)
-            if domain.localhost_only != localhost_only:
+            domain = self._domains.get(domain_id) or self._open(domain_id, options)
+            if domain.options != options:
                 raise ConfigError(
-                    f"domain {domain_id}: open in this process with ROS_LOCALHOST_ONLY={int(domain.localhost_only)}, "
-                    f"asked for {int(localhost_only)}; use one value or another domain"
+                    f"domain {domain_id}: open in this process with {domain.options}, asked for {options}; "
+                    "use the same or another domain"
                 )
             self._domains[domain_id] = domain
             try:
@@ -65,15 +91,17 @@ class DomainPool:
             self._domains[domain_id].members -= 1
             self._close_unused(domain_id)
 
-    def _open(self, domain_id: int, localhost_only: bool) -> _Domain:
-        if not localhost_only:
-            return _Domain(False, None)  # opened implicitly, configured by CYCLONEDDS_URI
-        if cdr_dds.participants_in(domain_id):
+    def _open(self, domain_id: int, options: DiscoveryOptions) -> _Domain:
+        xml = configuration(options)
+        others = cdr_dds.participants_in(domain_id)
+        if others and options.range in ("LOCALHOST", "OFF"):
             raise ConfigError(
                 f"domain {domain_id}: other code of this process has it open; "
-                "ROS_LOCALHOST_ONLY=1 needs it opened here first, or another domain"
+                f"{options} needs it opened here first, or another domain"
             )
-        return _Domain(True, cdr_dds.create_domain(domain_id, LOOPBACK_XML))
+        if others or not xml:
+            return _Domain(options, None)  # open already, or to be opened by the first participant
+        return _Domain(options, cdr_dds.create_domain(domain_id, xml))
 
     def _close_unused(self, domain_id: int) -> None:
         domain = self._domains[domain_id]

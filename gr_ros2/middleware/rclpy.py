@@ -14,10 +14,11 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
+import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -119,6 +120,27 @@ def _policy_name(event: Any) -> str:
         return str(event.last_policy_kind)
 
 
+_environment = threading.Lock()
+
+
+@contextlib.contextmanager
+def _told(localhost_only: bool | None) -> Iterator[None]:
+    """ROS_LOCALHOST_ONLY as given: rcl reads it when a context is initialised, and has no other way to be told."""
+    if localhost_only is None:
+        yield
+        return
+    with _environment:
+        before = os.environ.get("ROS_LOCALHOST_ONLY")
+        os.environ["ROS_LOCALHOST_ONLY"] = str(int(localhost_only))
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["ROS_LOCALHOST_ONLY"]
+            else:
+                os.environ["ROS_LOCALHOST_ONLY"] = before
+
+
 class RclpyMiddleware(Middleware):
     """One ROS 2 node in a context of its own, spinning in a thread of its own.
 
@@ -127,20 +149,29 @@ class RclpyMiddleware(Middleware):
     :param domain_id: 0..232; -1 takes ROS_DOMAIN_ID
     :param node_name: base name of the node
     :param namespace: its namespace
+    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
     :raises ConfigError: for a domain id or name ROS does not allow
     :raises MiddlewareError: when ROS cannot start, e.g. no RMW installed
     """
 
     name = "rclpy"
 
-    def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
+    def __init__(
+        self,
+        *,
+        domain_id: int = -1,
+        node_name: str = "gr_ros2",
+        namespace: str = "/",
+        localhost_only: bool | None = None,
+    ) -> None:
         super().__init__()
         self.domain_id = domain_id = resolve_domain_id(domain_id)
         node_name, namespace = check_node(node_name, namespace)
         self._context = Context()
         try:
             # Context.init, not rclpy.init: it leaves signals alone; args=[]: or it would parse our own command line.
-            self._context.init(args=[], domain_id=domain_id)
+            with _told(localhost_only):
+                self._context.init(args=[], domain_id=domain_id)
             self._node = Node(
                 node_name,
                 context=self._context,

@@ -11,6 +11,8 @@ import os
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.names import check_node, check_topic
@@ -20,12 +22,14 @@ __all__ = [
     "DISCOVERY_TYPE",
     "MAX_DOMAIN_ID",
     "PARTICIPANT_USER_DATA",
+    "DiscoveryOptions",
+    "DiscoveryRange",
     "check_node",
     "check_topic",
     "dds_topic",
     "dds_type",
+    "discovery_options",
     "gid_size",
-    "localhost_only",
     "participant_entities_info",
     "resolve_domain_id",
     "ros_topic",
@@ -79,15 +83,45 @@ def resolve_domain_id(domain_id: int, environment: Mapping[str, str] = os.enviro
     return int(text)
 
 
-def localhost_only(environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether ROS_LOCALHOST_ONLY asks for the loopback interface.
+DiscoveryRange = Literal["SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"]
 
-    :raises ConfigError: when it is neither 0 nor 1
+
+@dataclass(frozen=True)
+class DiscoveryOptions:
+    """Whom a participant looks for, as ROS 2 has it since Iron (rmw_discovery_options_t).
+
+    :param range: SUBNET, whom multicast reaches; LOCALHOST, this machine; OFF, nobody outside this process;
+        SYSTEM_DEFAULT, what the DDS does by itself
+    :param peers: addresses or names of machines to look for besides; for the first two ranges only
+    """
+
+    range: DiscoveryRange = "SUBNET"
+    peers: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        peers = f" and ROS_STATIC_PEERS={';'.join(self.peers)}" if self.peers else ""
+        return f"ROS_AUTOMATIC_DISCOVERY_RANGE={self.range}{peers}"
+
+
+def discovery_options(
+    localhost_only: bool | None = None, environment: Mapping[str, str] = os.environ
+) -> DiscoveryOptions:
+    """What ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS ask for; the first wins, as in rcl.
+
+    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
+    :raises ConfigError: for a value that means nothing (where rcl assumes one and warns)
     """
     text = environment.get("ROS_LOCALHOST_ONLY", "").strip() or "0"
     if text not in ("0", "1"):
         raise ConfigError(f"ROS_LOCALHOST_ONLY = {text!r}: write 0 or 1")
-    return text == "1"
+    if localhost_only or (localhost_only is None and text == "1"):
+        return DiscoveryOptions("LOCALHOST")
+    found = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip() or "SUBNET"
+    if found not in get_args(DiscoveryRange):
+        raise ConfigError(f"ROS_AUTOMATIC_DISCOVERY_RANGE = {found!r}: write {', '.join(get_args(DiscoveryRange))}")
+    peers = (peer.strip() for peer in environment.get("ROS_STATIC_PEERS", "").split(";"))
+    searching = found in ("SUBNET", "LOCALHOST")
+    return DiscoveryOptions(cast("DiscoveryRange", found), tuple(peer for peer in peers if peer) if searching else ())
 
 
 def gid_size(environment: Mapping[str, str] = os.environ) -> int:

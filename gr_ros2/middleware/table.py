@@ -48,6 +48,7 @@ MIDDLEWARE = BackendTable(
             "a sourced ROS 2 setup",
             title="rclpy (ROS 2)",
             meets=("dds", "zenoh"),  # whichever its RMW is
+            localhost_only=True,
         ),
         "zenoh": GraphBackend(
             "gr_ros2.middleware.zenoh",

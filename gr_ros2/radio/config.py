@@ -37,7 +37,7 @@ class LinkConfig:
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
-    :param localhost_only: DDS stays on the loopback interface; None takes ROS_LOCALHOST_ONLY
+    :param localhost_only: DDS stays on the loopback interface; None takes what the environment of ROS says
     """
 
     registry: Annotated[str, Field(min_length=1)]

@@ -143,9 +143,7 @@ class Recorder:
         if position is None:
             track.left_out += 1
             return
-        track.t.append(t)
-        track.x.append(position[0])
-        track.y.append(position[1])
+        track.add(t, *position)
 
     def _topic(self, topic_id: int) -> Topic | None:
         return self._registry[topic_id] if topic_id < len(self._registry) else None
@@ -159,6 +157,7 @@ class Recorder:
         topic = self._topic(book.topic_id)
         key = (book.src_id, book.topic_id)
         sent, received = self.sent.get(key, Track()), self.received.get(key, Track())
+        (t_sent, xy_sent), (t_received, xy_received) = sent.points(), received.points()
         return TopicResult(
             topic=self._name(*key),
             type=topic.type_name if topic is not None else "",
@@ -170,8 +169,8 @@ class Recorder:
             latency_s=LatencyResult(**_values(numbers.latency_s)),
             latency_clock=self._latency_clock if numbers.latency_s is not None else None,
             age_s=AgeResult(**_values(numbers.age_s)),
-            path_error_m=path_error(sent.xy, received.xy),
-            rms_error_m=rms_error(sent.t, sent.xy, received.t, received.xy),
+            path_error_m=path_error(xy_sent, xy_received),
+            rms_error_m=rms_error(t_sent, xy_sent, t_received, xy_received),
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
             ledger=dict(sorted(book.rows.items())),

@@ -85,10 +85,16 @@ class Track:
     y: array[float] = field(default_factory=lambda: array("d"))
     left_out: int = 0
 
-    @property
-    def xy(self) -> Floats:
-        """Positions, shape (n, 2)."""
-        return np.column_stack([np.array(self.x), np.array(self.y)])
+    def add(self, t: float, x: float, y: float) -> None:
+        """One more position. The last array counts: :meth:`points` may be called at any time, from another thread."""
+        self.t.append(t)
+        self.x.append(x)
+        self.y.append(y)
+
+    def points(self) -> tuple[Floats, Floats]:
+        """Times, shape (n,), and positions, shape (n, 2): those that are complete now."""
+        count = len(self.y)
+        return _copied(self.t, count), np.column_stack([_copied(self.x, count), _copied(self.y, count)])
 
 
 class PacketLog:
@@ -120,21 +126,23 @@ class PacketLog:
 
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
         """The columns of table `packets`; the topics by name."""
-        count = np.array(self._entries, dtype=np.int64)
+        # A run that is stopped may still be sending: these are the packets that are complete now.
+        count = _copied(self._entries, len(self._entries)).astype(np.int64)
         packet = np.repeat(np.arange(len(count)), count)
-        entries = slice(len(packet))  # a run that is stopped may still be sending
-        names = {topic_id: name_of(topic_id) for topic_id in set(self._topic_id)}
+        packets, entries = len(count), len(packet)
+        topic_ids = _copied(self._topic_id, entries).astype(np.int64)
+        names = {topic_id: name_of(topic_id) for topic_id in set(topic_ids.tolist())}
         return {
             "packet": packet,
             "src_id": np.full(len(packet), src_id),
-            "seq": np.array(self._seq, dtype=np.int64)[packet],
-            "t_sent": np.array(self._t_sent)[packet] - t0,
-            "t_received": np.array(self._t_received)[packet] - t0,
-            "topic": _named(np.array(self._topic_id, dtype=np.int64)[entries], names),
-            "serial": np.array(self._serial, dtype=np.int64)[entries],
-            "entry_id": np.array(self._name, dtype=np.int64)[entries],
-            "index": np.array(self._index, dtype=np.int64)[entries],
-            "total": np.array(self._total, dtype=np.int64)[entries],
+            "seq": _copied(self._seq, packets).astype(np.int64)[packet],
+            "t_sent": _copied(self._t_sent, packets)[packet] - t0,
+            "t_received": _copied(self._t_received, packets)[packet] - t0,
+            "topic": _named(topic_ids, names),
+            "serial": _copied(self._serial, entries),
+            "entry_id": _copied(self._name, entries).astype(np.int64),
+            "index": _copied(self._index, entries).astype(np.int64),
+            "total": _copied(self._total, entries).astype(np.int64),
         }
 
 
@@ -257,9 +265,10 @@ def make_trace(
     for key, pair in tracks.items():
         topic = name_of(*key)
         for end, track in zip(("sent", "received"), pair, strict=True):
+            t, xy = track.points()
             same = {"topic": topic, "published_as": published_as.get(topic, topic), "end": end}
-            columns: dict[str, Any] = {name: np.full(len(track.t), value, dtype=object) for name, value in same.items()}
-            paths.append({**columns, "t": np.array(track.t) - t0, "x": np.array(track.x), "y": np.array(track.y)})
+            columns: dict[str, Any] = {name: np.full(len(t), value, dtype=object) for name, value in same.items()}
+            paths.append({**columns, "t": t - t0, "x": xy[:, 0], "y": xy[:, 1]})
     tables = {
         MESSAGES: _table(MESSAGES, messages).sort_by([("src_id", "ascending"), ("serial", "ascending")]),
         # The sort is stable: the entries of a packet keep their order.
@@ -374,6 +383,15 @@ def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]
         "size": np.array(book.size, dtype=np.int64),
         "row": _named(np.array(book.row, dtype=np.int64), {code: row for row, code in book.codes.items()}),
     }
+
+
+def _copied(values: array[Any], count: int) -> npt.NDArray[Any]:
+    """The first ``count`` values, though another thread may be appending.
+
+    Slicing is one step of the interpreter. An array that numpy reads itself cannot grow meanwhile, and the thread that
+    appends would fail.
+    """
+    return np.frombuffer(values[:count], dtype=values.typecode)
 
 
 def _named(codes: Ints, names: Mapping[int, str]) -> Texts:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import shutil
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
 
@@ -20,9 +23,11 @@ from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_domains import POOL
+from gr_ros2.race.namespaces import Namespace, inside
 from tests.domains import domain
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, Peer, message, same
-from tests.waiting import wait_for
+from tests.race.support import needs_namespaces
+from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).parents[2]
 PEER = [sys.executable, "-m", "tests.middleware.dds_peer"]
@@ -321,7 +326,7 @@ def test_what_is_no_cdr_is_refused(join: Callable[..., DdsMiddleware], payload: 
 def test_ros_discovery_info_names_the_node_and_its_endpoints(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DISTRO", raising=False)
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    watching = POOL.join(domain(), True, b"")
+    watching = POOL.join(domain(), ros_graph.discovery_options(), b"")
     try:
         topic = cdr_dds.create_topic(watching, ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
         reader = RawReader(watching, topic, LATCHED)
@@ -377,14 +382,14 @@ def parse_entities(data: bytes, gid_bytes: int) -> tuple[str, str, list[bytes], 
 
 
 def test_a_domain_is_on_loopback_or_not_for_the_whole_process(join: Callable[..., DdsMiddleware]) -> None:
-    assert join().localhost_only
-    with pytest.raises(ConfigError, match="ROS_LOCALHOST_ONLY=1"):
+    join()
+    with pytest.raises(ConfigError, match="RANGE=LOCALHOST, asked for ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"):
         DdsMiddleware(domain_id=domain(), localhost_only=False)
 
 
 INTERFACES = (
     "ip link set lo up && ip link add eth9 type veth peer name eth8 && ip addr add 10.9.8.7/24 dev eth9"
-    " && ip link set eth8 up && ip link set eth9 up"
+    " && ip addr add 10.9.9.7/24 dev eth8 && ip link set eth8 up && ip link set eth9 up"
 )
 JOINED_GROUPS = """
 from gr_ros2.middleware.dds import DdsMiddleware
@@ -392,24 +397,91 @@ with DdsMiddleware(domain_id=7):
     for line in open("/proc/net/igmp"):
         if line[0].isdigit():
             device = line.split()[1]
-        elif "0100FFEF" in line:
-            print(device)
+        elif "00FFEF" in line:
+            print(device + "@" + line.split()[0])
 """
+SPDP, ELSEWHERE = "0100FFEF", "0200FFEF"
+RANGE, PEERS, URI = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"
+OTHER_DEVICE = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='eth9'/></Interfaces></General></Domain>"
+    "</CycloneDDS>"
+)
+OTHER_GROUP = (
+    "<CycloneDDS><Domain><Discovery><SPDPMulticastAddress>239.255.0.2</SPDPMulticastAddress></Discovery></Domain>"
+    "</CycloneDDS>"
+)
 
 
-@pytest.mark.parametrize(("setting", "device"), [("1", "lo"), ("0", "eth9")])
-def test_localhost_only_stays_on_the_loopback_interface(setting: str, device: str) -> None:
-    """In a network namespace of its own, with a second interface: where is the discovery group joined?"""
+@pytest.mark.parametrize(
+    ("environment", "groups"),
+    [
+        ({"ROS_LOCALHOST_ONLY": "1"}, [f"lo@{SPDP}"]),
+        ({"ROS_LOCALHOST_ONLY": "1", RANGE: "SUBNET"}, [f"lo@{SPDP}"]),
+        ({"ROS_LOCALHOST_ONLY": "0"}, [f"eth8@{SPDP}"]),
+        ({RANGE: "SUBNET", PEERS: "10.9.8.6"}, [f"eth8@{SPDP}"]),
+        ({RANGE: "LOCALHOST"}, [f"lo@{SPDP}"]),
+        ({RANGE: "LOCALHOST", PEERS: "10.9.8.6;localhost"}, [f"lo@{SPDP}"]),
+        ({RANGE: "OFF"}, []),
+        ({RANGE: "SYSTEM_DEFAULT"}, [f"eth8@{SPDP}"]),
+        ({RANGE: "SUBNET", URI: OTHER_DEVICE}, [f"eth9@{SPDP}"]),
+        ({RANGE: "LOCALHOST", URI: OTHER_GROUP}, [f"lo@{ELSEWHERE}"]),
+    ],
+)
+def test_discovery_is_on_the_interface_that_the_environment_says(
+    environment: dict[str, str], groups: list[str]
+) -> None:
+    """In a network namespace of its own, with two more interfaces: where is which discovery group joined?"""
 
     def isolated(command: str) -> subprocess.CompletedProcess[str]:
-        environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "ROS_LOCALHOST_ONLY": setting, "PYTHONPATH": str(ROOT)}
+        paths = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT)}
         words = ["unshare", "-n", "sh", "-c", command]
-        return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=60)
+        return subprocess.run(words, env={**paths, **environment}, capture_output=True, text=True, timeout=60)
 
     if not shutil.which("unshare") or isolated(INTERFACES).returncode:
         pytest.skip("needs the right to make a network namespace and a device in it")
     result = isolated(f"{INTERFACES} && exec {sys.executable} -c '{JOINED_GROUPS}'")
-    assert result.stdout.split() == [device], result.stderr
+    assert result.stdout.split() == groups, result.stderr
+
+
+@needs_namespaces
+@pytest.mark.parametrize(
+    ("here", "there"),
+    [(("LOCALHOST", "10.9.8.6"), ("LOCALHOST", "10.9.8.7")), (("LOCALHOST", "10.9.8.6"), ("SUBNET", ""))],
+)
+def test_static_peers_are_found_on_another_machine(here: tuple[str, str], there: tuple[str, str]) -> None:
+    """Two network namespaces, a cable between them."""
+    with ExitStack() as stack:
+        one, other = (stack.enter_context(Namespace()).path for _ in range(2))
+        ends = ((one, "10.9.8.7", "eth9", here, "pub"), (other, "10.9.8.6", "eth8", there, "sub"))
+        cable = f"ip link add eth9 type veth peer name eth8 && ip link set eth8 netns {other}"
+        inside(one, lambda: subprocess.run(cable, shell=True, check=True))
+        for path, address, device, *_ in ends:
+            setup = f"ip link set lo up && ip addr add {address}/24 dev {device} && ip link set {device} up"
+            inside(path, lambda command=setup: subprocess.run(command, shell=True, check=True))  # type: ignore[misc]
+        peers = []
+        for path, _, _, (chosen, named), role in ends:
+            environment = {"ROS_LOCALHOST_ONLY": "0", RANGE: chosen, PEERS: named}
+            command = [*PEER, "7", "/a", STRING, role, "reliable", "transient_local", "1"]
+            peers.append(inside(path, lambda c=command, e=environment: Peer(c, e)))  # type: ignore[misc]
+            stack.callback(peers[-1].close)
+        peers[0].publish([message(1)])
+        wait_for(lambda: peers[1].received == [message(1)], "the message across the cable")
+
+
+def test_a_participant_on_loopback_announces_itself_often(join: Callable[..., DdsMiddleware]) -> None:
+    """Nodes on another interface find it only then; by itself Cyclone DDS would do so every 8 s."""
+    node = join()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ears:
+        ears.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        ears.bind(("239.255.0.1", 7400 + 250 * node.domain_id))
+        membership = socket.inet_aton("239.255.0.1") + socket.inet_aton("127.0.0.1")
+        ears.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        ears.settimeout(PATIENCE_S)
+        heard: list[float] = []
+        while len(heard) < 9:
+            if node._guid[:12] in ears.recv(65536)[:20]:
+                heard.append(time.monotonic())
+        assert heard[-1] - heard[0] < 8 * 8 / 4, "eight announcements in a quarter of what they would take"
 
 
 def test_ros_domain_id_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -427,6 +499,7 @@ def test_ros_domain_id_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, {"ROS_DOMAIN_ID": "robot"}),
         ({}, {"ROS_DOMAIN_ID": "300"}),
         ({"domain_id": 5}, {"ROS_LOCALHOST_ONLY": "yes"}),
+        ({"domain_id": 5, "localhost_only": False}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "near"}),
         ({"domain_id": 5, "node_name": "a node"}, {}),
         ({"domain_id": 5, "namespace": "/1"}, {}),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -410,3 +411,20 @@ middleware.advertise("/chatter", "{STRING}", Qos()).publish(b"\\0\\1\\0\\0\\1\\0
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("localhost_only", [True, False, None])
+def test_localhost_only_is_what_a_context_begins_with_and_nobody_else(
+    start: Start, monkeypatch: pytest.MonkeyPatch, localhost_only: bool | None
+) -> None:
+    found: list[str] = []
+    begin = rclpy.context.Context.init
+
+    def init(context: rclpy.context.Context, *args: Any, **options: Any) -> None:
+        found.append(os.environ["ROS_LOCALHOST_ONLY"])
+        begin(context, *args, **options)
+
+    monkeypatch.setattr(rclpy.context.Context, "init", init)
+    start(localhost_only=localhost_only)
+    assert found == ["0" if localhost_only is False else "1"]
+    assert os.environ["ROS_LOCALHOST_ONLY"] == "1"

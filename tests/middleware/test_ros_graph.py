@@ -53,11 +53,21 @@ def test_domain_from_argument_and_environment() -> None:
             ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": text})
 
 
-def test_localhost_from_environment() -> None:
-    assert not ros_graph.localhost_only({}) and not ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "0"})
-    assert ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "1"})
+def test_discovery_options_are_those_of_rcl() -> None:
+    def options(localhost_only: bool | None = None, **environment: str) -> tuple[str, tuple[str, ...]]:
+        found = ros_graph.discovery_options(localhost_only, environment)
+        return found.range, found.peers
+
+    assert options() == options(ROS_LOCALHOST_ONLY="0") == options(ROS_AUTOMATIC_DISCOVERY_RANGE="") == ("SUBNET", ())
+    assert options(ROS_STATIC_PEERS="192.0.2.1; robot.local;") == ("SUBNET", ("192.0.2.1", "robot.local"))
+    for name, peers in (("SUBNET", ("a",)), ("LOCALHOST", ("a",)), ("OFF", ()), ("SYSTEM_DEFAULT", ())):
+        chosen = {"ROS_AUTOMATIC_DISCOVERY_RANGE": name, "ROS_STATIC_PEERS": "a"}
+        assert options(**chosen) == options(False, ROS_LOCALHOST_ONLY="1", **chosen) == (name, peers)
+        assert options(True, **chosen) == options(ROS_LOCALHOST_ONLY="1", **chosen) == ("LOCALHOST", ())
     with pytest.raises(ConfigError, match="ROS_LOCALHOST_ONLY"):
-        ros_graph.localhost_only({"ROS_LOCALHOST_ONLY": "true"})
+        options(ROS_LOCALHOST_ONLY="true")
+    with pytest.raises(ConfigError, match="ROS_AUTOMATIC_DISCOVERY_RANGE = 'local': write SUBNET, LOCALHOST"):
+        options(ROS_AUTOMATIC_DISCOVERY_RANGE="local")
 
 
 @pytest.mark.parametrize(("distro", "size"), [("", 24), ("humble", 24), ("iron", 16), ("jazzy", 16), ("rolling", 16)])

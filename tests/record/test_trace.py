@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import random
 import shutil
+import threading
 import tracemalloc
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pytest
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Accepted, Delivered, SentEntry, SentPacket
 from gr_ros2.record.ledger import Ledger
-from gr_ros2.record.trace import PacketLog, read_trace, write_trace
+from gr_ros2.record.trace import PacketLog, Track, make_trace, read_trace, write_trace
 from gr_ros2.wire.v0 import Entry, Packet
 from tests.record.runs import DURATION_S, IMU, IN_FLIGHT, LOST, ODOM, TOO_LARGE, UNSENT, empty_trace, make_run
 
@@ -167,3 +168,38 @@ def test_a_packet_costs_numbers_and_no_objects() -> None:
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert grown / 20000 < 120  # 33 + 34 bytes, and what arrays reserve for growth
+
+
+def test_a_track_that_grows_is_cut_to_what_is_complete() -> None:
+    """Ctrl-C: the tables are made while a position is being added."""
+    track = Track()
+    track.add(1.0, 2.0, 3.0)
+    track.t.append(2.0)
+    track.x.append(4.0)
+    trace = make_trace(
+        [], logs={}, tracks={(1, 0): (track, Track())}, name_of=lambda *_: "/odom", published_as={}, t0=0.0, t_end=3.0
+    )
+    (path,) = trace.paths()
+    assert path.sent.tolist() == [[2.0, 3.0]]
+
+
+def test_reading_what_grows_disturbs_nobody() -> None:
+    track, log, done = Track(), PacketLog(), threading.Event()
+
+    def write() -> None:
+        try:
+            for number in range(30_000):
+                track.add(float(number), 1.0, 2.0)
+                entries = (SentEntry(number, 0, number & 255, 0, 1),) * 2
+                log.sent(SentPacket(number.to_bytes(8, "big"), entries, float(number)))
+        finally:
+            done.set()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    while not done.is_set():
+        t, xy = track.points()
+        assert t.shape == (len(xy),)
+        assert len({len(column) for column in log.columns(1, str, 0.0).values()}) == 1
+    writer.join()
+    assert len(track.points()[0]) == 30_000 and len(log.columns(1, str, 0.0)["packet"]) == 60_000

@@ -26,6 +26,7 @@ from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, str(ROOT / "resource" / "link"), "--ros-args"]
+INFO, WARN = (level if isinstance(level, int) else level[0] for level in (Log.INFO, Log.WARN))  # bytes before Jazzy
 
 
 @pytest.fixture
@@ -130,8 +131,8 @@ def test_what_the_library_logs_is_in_the_log_of_ros(config: Path, graph: Graph) 
     given = ["-p", f"config:={config}", "-p", "ros_source.debug:=true"]
     process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy())
     try:
-        wait_for(lambda: publisher.publish(Header()) or "0:header#" in said.get(Log.INFO[0], ""), "a packet")
-        wait_for(lambda: "/robot_1/other: a publisher sends" in said.get(Log.WARN[0], ""), "the warning")
+        wait_for(lambda: publisher.publish(Header()) or "0:header#" in said.get(INFO, ""), "a packet")
+        wait_for(lambda: "/robot_1/other: a publisher sends" in said.get(WARN, ""), "the warning")
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
     finally:
