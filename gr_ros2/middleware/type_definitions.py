@@ -68,6 +68,9 @@ def recorded_definition(type_name: str, text: str, digest: str) -> Definition:
         return Definition(text, digest or text_hash(type_name, text) or _unknown(type_name).digest)
     if known(type_name) and digest in ("", type_hash(type_name)):
         return definition(type_name)
+    distribution = _distribution_of(type_name, digest)
+    if distribution is not None:
+        return Definition(distribution.generate_msgdef(type_name, ros_version=2)[0], digest)
     unknown = _unknown(type_name)
     return Definition(unknown.text, digest or unknown.digest)
 
@@ -119,6 +122,19 @@ def _uint8_for_char(kind: FieldDesc) -> FieldDesc:
         return kind
     element, count = kind[1]
     return (kind[0], (_uint8_for_char(element), count))  # type: ignore[return-value]
+
+
+@cache
+def _distribution_of(type_name: str, digest: str) -> Typestore | None:
+    """The types of a distribution in which a type has this hash, the oldest first."""
+    for store in Stores:
+        if not store.name.startswith("ROS2_"):
+            continue
+        found, hashed = get_typestore(store), Typestore()
+        hashed.fielddefs = _without_char(found.fielddefs)
+        if type_name in found.fielddefs and hashed.hash_rihs01(type_name) == digest:
+            return found
+    return None
 
 
 def _unknown(type_name: str) -> Definition:

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import ros_graph
-from gr_ros2.middleware.type_definitions import UNKNOWN, definition, text_hash, type_hash
+from gr_ros2.middleware.type_definitions import UNKNOWN, definition, recorded_definition, text_hash, type_hash
 
 NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
@@ -127,6 +127,18 @@ def test_who_has_short_gids() -> None:
     assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_USER_DATA)  # another gr-ros2
     assert not ros_graph.has_short_gids("rt/chatter", told)
     assert ros_graph.endpoint_user_data("") == b"" and ros_graph.hash_told(b"xtypehash=RIHS01_;") == ""
+
+
+def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None:
+    """sensor_msgs/Range has a variance since Jazzy; a bag may have the hash alone."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    digest = jazzy.hash_rihs01("sensor_msgs/msg/Range")
+    assert digest != type_hash("sensor_msgs/msg/Range")
+    found = recorded_definition("sensor_msgs/msg/Range", "", digest)
+    assert "float32 variance" in found.text and found.digest == digest
+    assert text_hash("sensor_msgs/msg/Range", found.text) == digest
+    strange = "RIHS01_" + 64 * "5"
+    assert recorded_definition("sensor_msgs/msg/Range", "", strange) == (UNKNOWN, strange)
 
 
 def test_definitions() -> None:
