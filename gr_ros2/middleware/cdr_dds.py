@@ -307,12 +307,10 @@ def _read_qos(pointer: int, key: bytes) -> Qos:
 
 def _read_user_data(pointer: int) -> bytes:
     value, size = _ptr(), _size(0)
-    if not _get_userdata(pointer, c.byref(value), c.byref(size)) or not value.value:
-        return b""
-    try:
-        return c.string_at(value.value, size.value)
-    finally:
-        _free(value)
+    _get_userdata(pointer, c.byref(value), c.byref(size))
+    data = c.string_at(value, size.value)  # b"" of no address and no bytes
+    _free(value)
+    return data
 
 
 class _Endpoint:
