@@ -69,6 +69,11 @@ class FramePrefix:
         return _encode(type_name, message, payload)
 
 
+STATIC_DEPTH = 100
+"""Messages that a subscription of static transforms takes at least, as tf2's listener does: the depth counts over all
+broadcasters, of which each has told something else, and a DDS drops in silence what exceeds it."""
+
+
 class StaticTransforms:
     """All static transforms of several broadcasters, of which each knows only its own.
 

@@ -22,7 +22,7 @@ from gnuradio import gr
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
-from gr_ros2.gr.frames import TF_TYPE, StaticTransforms
+from gr_ros2.gr.frames import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
@@ -255,6 +255,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         for name, topic in self.subscribed.items():
             options = topic.options
             depth = self.config.subscriber_depth if options.depth is None else options.depth
+            if topic.topic_id in self._static and depth:
+                depth = max(depth, STATIC_DEPTH)
             qos = Qos(options.reliability, options.durability, depth)
             callback = partial(self._take, topic.topic_id)
             subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)

@@ -190,6 +190,8 @@ _set_durability_service = _function(
 )  # what a late joiner gets: without it one sample only
 _set_lifecycle = _function("dds_qset_writer_data_lifecycle", None, _ptr, c.c_bool)
 _set_representation = _function("dds_qset_data_representation", None, _ptr, _u32, c.POINTER(c.c_int16))
+_get_userdata = _function("dds_qget_userdata", c.c_bool, _ptr, c.POINTER(_ptr), c.POINTER(_size))
+_free = _function("dds_free", None, _ptr)  # of what the library allocated for us
 _get_reliability = _function("dds_qget_reliability", c.c_bool, _ptr, c.POINTER(c.c_int), c.POINTER(_i64))
 _get_durability = _function("dds_qget_durability", c.c_bool, _ptr, c.POINTER(c.c_int))
 _set_lifespan = _function("dds_qset_lifespan", None, _ptr, _i64)
@@ -297,6 +299,14 @@ def _read_qos(pointer: int, key: bytes) -> Qos:
         lifespan_s,
         finite(nanoseconds.value * 1e-9),
     )
+
+
+def _read_user_data(pointer: int) -> bytes:
+    value, size = _ptr(), _size(0)
+    _get_userdata(pointer, c.byref(value), c.byref(size))
+    data = c.string_at(value, size.value)  # b"" of no address and no bytes
+    _free(value)
+    return data
 
 
 class _Endpoint:
@@ -424,6 +434,7 @@ class DiscoveredEndpoint:
     topic: str
     type_name: str
     qos: Qos
+    user_data: bytes = b""
 
 
 class EndpointWatch:
@@ -446,7 +457,8 @@ class EndpointWatch:
                 changes.append((key, None))
                 continue
             topic, type_name = data.topic_name.decode(errors="replace"), data.type_name.decode(errors="replace")
-            found = DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, _read_qos(data.qos, key))
+            qos, user_data = _read_qos(data.qos, key), _read_user_data(data.qos)
+            found = DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, qos, user_data)
             changes.append((key, found))
         if taken:
             _return_loan(self.entity, samples, taken)

@@ -88,7 +88,7 @@ class DdsMiddleware(DdsParticipant):
             for number, watch in self._watches.items():
                 self._waitset.attach(watch.condition, number)
             topic = create_topic(self._participant, ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
-            self._discovery = RawWriter(self._participant, topic, _DISCOVERY_QOS)
+            self._discovery = RawWriter(self._participant, topic, _DISCOVERY_QOS, ros_graph.DISCOVERY_USER_DATA)
             self.announce()
         except BaseException:
             POOL.leave(self.domain_id, self._participant)
@@ -237,11 +237,19 @@ class DdsMiddleware(DdsParticipant):
                     if endpoint is not None:
                         found[key] = endpoint
                 changed |= {e.topic for e in (before, endpoint) if e is not None}
+        if self._gid_bytes == 24 and ros_graph.DISCOVERY_TOPIC in changed and self._sees_short_gids():
+            self._gid_bytes = 16
+            self.announce()
         if number == _PUBLICATIONS:
             with self._lock:
                 affected = [s for s in self._subscriptions if ros_graph.dds_topic(s.topic) in changed]
             for subscription in affected:
                 subscription.adapt(self._offers(subscription.topic, subscription.type_name))
+
+    def _sees_short_gids(self) -> bool:
+        with self._lock:
+            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
+        return any(ros_graph.has_short_gids(endpoint.topic, endpoint.user_data) for endpoint in everyone)
 
     def _offers(self, topic: str, type_name: str) -> list[Qos]:
         """What the publishers of a topic offer; those of another type are counted and left out."""
@@ -275,13 +283,18 @@ class DdsMiddleware(DdsParticipant):
             return entity
 
     def _user_data(self, type_name: str) -> bytes:
-        """Since Iron an endpoint tells the hash of its type (REP-2016); where it is not known, nothing is said."""
-        if self._gid_bytes == 24:
-            return b""
+        """What an endpoint of ours says: the hash that others on the graph give the type, else that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
-        known = type_hash(type_name)
-        return f"typehash={known};".encode() if known else b""
+        name = ros_graph.dds_type(type_name)
+        with self._lock:
+            told = [
+                ros_graph.hash_told(endpoint.user_data)
+                for found in self._found.values()
+                for endpoint in found.values()
+                if endpoint.type_name == name and endpoint.participant != self._guid
+            ]
+        return ros_graph.endpoint_user_data(next(filter(None, told), "") or type_hash(type_name))
 
     def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
         with self._lock:

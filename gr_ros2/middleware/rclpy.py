@@ -14,11 +14,10 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
-import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
 
@@ -43,6 +42,7 @@ from gr_ros2.middleware.base import (
     TopicInfo,
     finite,
 )
+from gr_ros2.middleware.rcl import told, translated
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.registry import normalize_type
 
@@ -120,27 +120,6 @@ def _policy_name(event: Any) -> str:
         return str(event.last_policy_kind)
 
 
-_environment = threading.Lock()
-
-
-@contextlib.contextmanager
-def _told(localhost_only: bool | None) -> Iterator[None]:
-    """ROS_LOCALHOST_ONLY as given: rcl reads it when a context is initialised, and has no other way to be told."""
-    if localhost_only is None:
-        yield
-        return
-    with _environment:
-        before = os.environ.get("ROS_LOCALHOST_ONLY")
-        os.environ["ROS_LOCALHOST_ONLY"] = str(int(localhost_only))
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ["ROS_LOCALHOST_ONLY"]
-            else:
-                os.environ["ROS_LOCALHOST_ONLY"] = before
-
-
 class RclpyMiddleware(Middleware):
     """One ROS 2 node in a context of its own, spinning in a thread of its own.
 
@@ -170,7 +149,7 @@ class RclpyMiddleware(Middleware):
         self._context = Context()
         try:
             # Context.init, not rclpy.init: it leaves signals alone; args=[]: or it would parse our own command line.
-            with _told(localhost_only):
+            with told(localhost_only):
                 self._context.init(args=[], domain_id=domain_id)
             self._node = Node(
                 node_name,
@@ -225,7 +204,7 @@ class RclpyMiddleware(Middleware):
         self.check_open()
         node = self._node
         found = []
-        with _translated("the graph cannot be read"):
+        with translated("the graph cannot be read"):
             for topic, type_names in node.get_topic_names_and_types():
                 publishers = self._foreign(node.get_publishers_info_by_topic(topic), topic, node.publishers)
                 subscribers = self._foreign(node.get_subscriptions_info_by_topic(topic), topic, node.subscriptions)
@@ -257,7 +236,7 @@ class RclpyMiddleware(Middleware):
 
     def publishers_of(self, topic: str, type_name: str) -> dict[bytes, Qos]:
         """What the publishers of a topic and type offer, our own included, by their ids; others are counted."""
-        with _translated(f"publishers of {topic} cannot be read"):
+        with translated(f"publishers of {topic} cannot be read"):
             infos = self._node.get_publishers_info_by_topic(topic)
         strangers = {i.topic_type for i in infos} - {type_name}
         if strangers:
@@ -423,7 +402,7 @@ class _RclpySubscription(Subscription):
         endpoint, qos = self._endpoint, self._adaptation.settled
         if endpoint is None or qos is None or self._closed or self._middleware.closing:
             return 0
-        with _translated(f"{self._topic} is closed"):
+        with translated(f"{self._topic} is closed"):
             if hasattr(endpoint, "get_publisher_count"):  # since Jazzy
                 return int(endpoint.get_publisher_count())
             offers = self._middleware.publishers_of(self._topic, self._type_name).values()
@@ -477,13 +456,13 @@ class _RclpyPublisher(Publisher):
         self._middleware.check_open()
         if len(payload) < ENCAPSULATION:  # an empty one makes rclpy's subscribers deaf
             raise MiddlewareError(f"{self._topic}: {len(payload)} bytes are no serialized message")
-        with _translated(f"{self._topic}: publishing {len(payload)} bytes failed"):
+        with translated(f"{self._topic}: publishing {len(payload)} bytes failed"):
             self._endpoint.publish(payload)
 
     def matched(self) -> int:
         if self._closed or self._middleware.closing:
             return 0
-        with _translated(f"{self._topic} is closed"):
+        with translated(f"{self._topic} is closed"):
             return int(self._endpoint.get_subscription_count())
 
     def close(self) -> None:
@@ -498,14 +477,3 @@ class _RclpyPublisher(Publisher):
             f"{self._topic}: a subscriber asks for another {policy} than this publisher offers; it gets nothing",
             event.total_count_change,
         )
-
-
-class _translated(contextlib.AbstractContextManager[None]):
-    """RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, RuntimeError) and not isinstance(error, MiddlewareError):
-            raise MiddlewareError(f"{self._what}: {error}") from error

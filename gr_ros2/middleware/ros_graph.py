@@ -20,6 +20,7 @@ from gr_ros2.names import check_node, check_topic
 __all__ = [
     "DISCOVERY_TOPIC",
     "DISCOVERY_TYPE",
+    "DISCOVERY_USER_DATA",
     "MAX_DOMAIN_ID",
     "PARTICIPANT_USER_DATA",
     "DiscoveryOptions",
@@ -29,7 +30,10 @@ __all__ = [
     "dds_topic",
     "dds_type",
     "discovery_options",
+    "endpoint_user_data",
     "gid_size",
+    "has_short_gids",
+    "hash_told",
     "participant_entities_info",
     "resolve_domain_id",
     "ros_topic",
@@ -43,7 +47,12 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 PARTICIPANT_USER_DATA = b"enclave=/;"
 
+_OURS = b"gr_ros2=;"
+DISCOVERY_USER_DATA = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e;" + _OURS
+"""Of our own endpoint on ros_discovery_info: the hash of its type since Iron, and that it is ours."""
+
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
+_TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
 _CDR_LE = b"\x00\x01\x00\x00"
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 
@@ -125,8 +134,33 @@ def discovery_options(
 
 
 def gid_size(environment: Mapping[str, str] = os.environ) -> int:
-    """Bytes of a Gid in ros_discovery_info: 24 up to Humble (assumed where ROS_DISTRO is not set), 16 since Iron."""
+    """Bytes of a Gid in ros_discovery_info to begin with: 24 up to Humble, 16 since Iron.
+
+    Where ROS_DISTRO is not set, 24 is assumed until the graph says otherwise (:func:`has_short_gids`).
+    """
     return 24 if environment.get("ROS_DISTRO", "").strip().lower() in _24_BYTE_GID_DISTROS else 16
+
+
+def has_short_gids(topic: str, user_data: bytes) -> bool:
+    """Whether an endpoint is that of a ROS node since Iron: a foreign one on ros_discovery_info with a type hash.
+
+    :param topic: as DDS sees it
+    """
+    return topic == DISCOVERY_TOPIC and bool(hash_told(user_data)) and _OURS not in user_data
+
+
+def endpoint_user_data(type_hash: str) -> bytes:
+    """What an endpoint says about its type since Iron (REP-2016); nodes up to Humble do not read it.
+
+    :param type_hash: '' where it is not known
+    """
+    return f"typehash={type_hash};".encode() if type_hash else b""
+
+
+def hash_told(user_data: bytes) -> str:
+    """The inverse of :func:`endpoint_user_data`, of anybody's endpoint."""
+    match = _TYPE_HASH.search(user_data)
+    return match[1].decode() if match else ""
 
 
 def participant_entities_info(

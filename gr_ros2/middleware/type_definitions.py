@@ -12,6 +12,8 @@ import struct
 from functools import cache
 from typing import NamedTuple
 
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -66,6 +68,9 @@ def recorded_definition(type_name: str, text: str, digest: str) -> Definition:
         return Definition(text, digest or text_hash(type_name, text) or _unknown(type_name).digest)
     if known(type_name) and digest in ("", type_hash(type_name)):
         return definition(type_name)
+    distribution = _distribution_of(type_name, digest)
+    if distribution is not None:
+        return Definition(distribution.generate_msgdef(type_name, ros_version=2)[0], digest)
     unknown = _unknown(type_name)
     return Definition(unknown.text, digest or unknown.digest)
 
@@ -77,18 +82,59 @@ def same_type(type_name: str, text: str, other: str) -> bool:
 
 def type_hash(type_name: str) -> str:
     """RIHS01 hash of a type ROS ships, '' for others."""
-    return str(typestore().hash_rihs01(type_name)) if known(type_name) else ""
+    return str(_as_hashed().hash_rihs01(type_name)) if known(type_name) else ""
 
 
 def text_hash(type_name: str, text: str) -> str:
     """RIHS01 hash of what a text defines, '' where it cannot be read; what it does not bring along is ROS's."""
     store = Typestore()
     try:
-        own = get_types_from_idl(text) if text.startswith(_IDL) else get_types_from_msg(text, type_name)
-        store.fielddefs = {**typestore().fielddefs, **own}
+        own = get_types_from_idl(text) if text.startswith(_IDL) else _without_char(get_types_from_msg(text, type_name))
+        store.fielddefs = {**_as_hashed().fielddefs, **own}
         return str(store.hash_rihs01(type_name))
     except (TypesysError, KeyError, RecursionError):  # the last of a type within itself
         return ""
+
+
+@cache
+def _as_hashed() -> Typestore:
+    """The types of ROS as their hashes are made."""
+    store = Typestore()
+    store.fielddefs = _without_char(typestore().fielddefs)
+    return store
+
+
+def _without_char(types: Typesdict) -> Typesdict:
+    """Definitions from ``.msg`` texts as their hashes see them: rosidl_adapter makes ``char`` a uint8 of IDL.
+
+    A ``char`` that stands in an IDL text is another type, and stays one.
+    """
+    return {
+        name: (constants, [(field, _uint8_for_char(kind)) for field, kind in fields])
+        for name, (constants, fields) in types.items()
+    }
+
+
+def _uint8_for_char(kind: FieldDesc) -> FieldDesc:
+    if kind[0] == Nodetype.BASE:
+        return (Nodetype.BASE, ("uint8", 0)) if kind[1][0] == "char" else kind
+    if kind[0] == Nodetype.NAME:
+        return kind
+    element, count = kind[1]
+    return (kind[0], (_uint8_for_char(element), count))  # type: ignore[return-value]
+
+
+@cache
+def _distribution_of(type_name: str, digest: str) -> Typestore | None:
+    """The types of a distribution in which a type has this hash, the oldest first."""
+    for store in Stores:
+        if not store.name.startswith("ROS2_"):
+            continue
+        found, hashed = get_typestore(store), Typestore()
+        hashed.fielddefs = _without_char(found.fielddefs)
+        if type_name in found.fielddefs and hashed.hash_rihs01(type_name) == digest:
+            return found
+    return None
 
 
 def _unknown(type_name: str) -> Definition:

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import SinkConfig, SourceConfig, build
+from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.frames import MAX_STATIC, TF_TYPE, FramePrefix, MergedTransforms, StaticTransforms, prefixed_frame
 from gr_ros2.link import Sender
+from gr_ros2.link.events import Accepted
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -214,6 +215,26 @@ def test_a_source_repeats_the_static_transforms_of_all_its_broadcasters() -> Non
         wait_for(lambda: len(events) >= 2)
         assert tree(events[1].payload).keys() == {"imu", "laser"}
         source.close()
+
+
+def test_no_broadcaster_is_lost_to_a_small_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three of them told theirs before the source came."""
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    (domain,) = free_domains(1)
+    events: list[Any] = []
+    rows = Registry.from_rows({"/tf_static": TF_TYPE}).with_options({"/tf_static": TopicOptions(depth=1)})
+    with DdsMiddleware(domain_id=domain) as robot:
+        for child in ("imu", "laser", "camera"):
+            robot.advertise("/tf_static", TF_TYPE, Qos("reliable", "transient_local", 1)).publish(transforms(child))
+        source = RosSource(rows, robot_id=1, middleware="dds", domain_id=domain, observer=events.append)
+        try:
+
+            def told() -> list[set[str]]:
+                return [set(tree(event.payload)) for event in list(events) if isinstance(event, Accepted)]
+
+            wait_for(lambda: {"imu", "laser", "camera"} in told(), "all three in one message")
+        finally:
+            source.close()
 
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "tf": TF_TYPE, "tf_static": TF_TYPE})

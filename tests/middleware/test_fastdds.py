@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -50,12 +50,15 @@ def program(pytestconfig: pytest.Config) -> Path:
 def peer(program: Path) -> Iterator[Callable[..., Peer]]:
     made: list[Peer] = []
 
-    def make(role: str, topic: str, qos: Qos) -> Peer:
-        names = [ros_graph.dds_topic(topic), ros_graph.dds_type(CUSTOM)]
+    def make(
+        role: str, topic: str, qos: Qos, *, user_data: str = "", names: Sequence[str] = (), offset: int = 2
+    ) -> Peer:
+        names = names or [ros_graph.dds_topic(topic), ros_graph.dds_type(CUSTOM)]
         words = [qos.reliability or "", qos.durability or "", str(qos.depth)]
         if qos.lifespan_s and qos.deadline_s:
             words += [str(qos.lifespan_s * 1e3), str(qos.deadline_s * 1e3)]
-        made.append(Peer([str(program), str(domain(2)), *names, role, *words]))
+        environment = {"USER_DATA": user_data} if user_data else {}
+        made.append(Peer([str(program), str(domain(offset)), *names, role, *words], environment))
         wait_for(lambda: made[-1].ready, "the Fast DDS process")
         return made[-1]
 
@@ -180,3 +183,46 @@ def test_lifespan_and_deadline_are_told_and_the_depth_is_not(
     (offer,) = found.publishers
     assert (offer.lifespan_s, offer.deadline_s) == pytest.approx((0.25, 1.5), abs=1e-6)
     assert offer.depth == Qos().depth, "what is not told is no depth of 1"
+
+
+PEI_HASH = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"
+"""Of rmw_dds_common/msg/ParticipantEntitiesInfo since Iron."""
+
+
+def listed_gid_bytes(info: bytes) -> int:
+    """Bytes of a Gid in ParticipantEntitiesInfo of one node: behind the first of them stands the number of nodes."""
+    return next((size for size in (16, 24) if info[4 + size : 8 + size] == b"\1\0\0\0"), 0)
+
+
+def test_gids_are_as_wide_as_the_graph_has_them(peer: Callable[..., Peer], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node of Humble sees 24 bytes, also beside another gr-ros2; once one of Jazzy is there, both see 16."""
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    names = (ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
+    latched = Qos("reliable", "transient_local", 1)
+    with (
+        DdsMiddleware(domain_id=domain(3), node_name="one") as one,
+        DdsMiddleware(domain_id=domain(3), node_name="two"),
+    ):
+        humble = peer("sub", "", latched, names=names, offset=3)
+        wait_for(lambda: len({info[4:20] for info in humble.received}) == 2, "both nodes")
+        one.advertise("/a", CUSTOM, RELIABLE)  # by now each gr-ros2 knows the other
+        wait_for(lambda: len(humble.received) >= 3, "the node with its publisher")
+        assert {listed_gid_bytes(info) for info in humble.received} == {24}
+        jazzy = peer("sub", "", latched, names=names, user_data=f"typehash={PEI_HASH};", offset=3)
+        wait_for(lambda: len({i[4:20] for i in jazzy.received if listed_gid_bytes(i) == 16}) == 2, "both nodes anew")
+
+
+def test_a_type_has_the_hash_that_the_graph_gives_it(middleware: DdsMiddleware, peer: Callable[..., Peer]) -> None:
+    given = "RIHS01_" + 64 * "5"
+    peer("pub", "/in", RELIABLE, user_data=f"typehash={given};")
+    wait_for(middleware.discover, "the publisher")
+    publisher = middleware.advertise("/out", CUSTOM, RELIABLE)
+    with DdsMiddleware(domain_id=domain(2), node_name="watching") as watching:
+
+        def told() -> list[str]:
+            found = [e for endpoints in watching._found.values() for e in endpoints.values()]
+            return [ros_graph.hash_told(e.user_data) for e in found if e.key == publisher.writer.guid]
+
+        wait_for(told, "our publisher")
+        assert told() == [given]

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import ros_graph
-from gr_ros2.middleware.type_definitions import UNKNOWN, definition, type_hash
+from gr_ros2.middleware.type_definitions import UNKNOWN, definition, recorded_definition, text_hash, type_hash
 
 NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
@@ -91,6 +91,54 @@ def test_discovery_info_reads_as_the_message_it_is(gid_bytes: int, node_name: st
     assert [bytes(gid.data)[:16] for gid in node.reader_gid_seq] == guids[1:2]
     assert [bytes(gid.data)[:16] for gid in node.writer_gid_seq] == guids[2:]
     assert bytes(info.gid.data) == guids[0].ljust(gid_bytes, b"\0")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("type_name", "digest"),
+    [
+        ("std_msgs/msg/Char", "3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9"),
+        ("sensor_msgs/msg/BatteryState", "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741"),
+        ("std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+    ],
+)
+def test_hashes_of_ros(type_name: str, digest: str) -> None:
+    """A char of a .msg is a uint8 to rosidl."""
+    assert type_hash(type_name) == f"RIHS01_{digest}"
+
+
+def test_char_is_a_uint8_in_arrays_too() -> None:
+    one, other = (text_hash("a_msgs/msg/A", f"{k}[3] a\n{k}[] b\n{k}[<=4] c\n") for k in ("char", "uint8"))
+    assert one == other != text_hash("a_msgs/msg/A", "byte[3] a\nbyte[] b\nbyte[<=4] c\n")
+
+
+def test_the_discovery_endpoint_tells_the_hash_of_its_type() -> None:
+    store = get_typestore(Stores.EMPTY)
+    for name, text in HUMBLE_MSGS.items():
+        store.register(get_types_from_msg(text.replace("char[24]", "uint8[16]"), name))
+    digest = store.hash_rihs01("rmw_dds_common/msg/ParticipantEntitiesInfo")
+    assert ros_graph.hash_told(ros_graph.DISCOVERY_USER_DATA) == digest
+
+
+def test_who_has_short_gids() -> None:
+    told = ros_graph.endpoint_user_data("RIHS01_" + 64 * "a")
+    assert ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, told)
+    assert ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, b"qos=x;" + told)
+    assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, b"")  # Humble
+    assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_USER_DATA)  # another gr-ros2
+    assert not ros_graph.has_short_gids("rt/chatter", told)
+    assert ros_graph.endpoint_user_data("") == b"" and ros_graph.hash_told(b"xtypehash=RIHS01_;") == ""
+
+
+def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None:
+    """sensor_msgs/Range has a variance since Jazzy; a bag may have the hash alone."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    digest = jazzy.hash_rihs01("sensor_msgs/msg/Range")
+    assert digest != type_hash("sensor_msgs/msg/Range")
+    found = recorded_definition("sensor_msgs/msg/Range", "", digest)
+    assert "float32 variance" in found.text and found.digest == digest
+    assert text_hash("sensor_msgs/msg/Range", found.text) == digest
+    strange = "RIHS01_" + 64 * "5"
+    assert recorded_definition("sensor_msgs/msg/Range", "", strange) == (UNKNOWN, strange)
 
 
 def test_definitions() -> None:

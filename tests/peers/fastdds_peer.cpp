@@ -2,9 +2,12 @@
 //
 //     fastdds_peer DOMAIN DDS_TOPIC DDS_TYPE pub|sub RELIABILITY DURABILITY DEPTH [LIFESPAN_MS DEADLINE_MS]
 //
+// USER_DATA in the environment is that of its endpoint.
+//
 // Out: `ready`, `matched N` whenever the number of matched endpoints changes, `data HEX` per message received
 // (encapsulation header included). In, for pub: one message per line, in hex. End of input ends it.
 
+#include <cstdlib>
 #include <cstring>
 #include <iostream>
 #include <memory>
@@ -185,6 +188,9 @@ void apply(EndpointQos& qos, const std::string& reliability, const std::string& 
     qos.history().depth = depth == 0 ? 1 : depth;
     qos.endpoint().history_memory_policy = fast::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
     qos.data_sharing().off();
+    if (const char* text = std::getenv("USER_DATA")) {
+        qos.user_data().data_vec(std::vector<unsigned char>(text, text + std::strlen(text)));
+    }
 }
 
 Duration_t milliseconds(const char* text)

@@ -1,0 +1,44 @@
+"""What rclpy leaves to its environment: how rcl is told a setting, and what its errors become.
+
+Law: nothing here imports rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Iterator
+
+from gr_ros2.errors import MiddlewareError
+
+_environment = threading.Lock()
+
+
+@contextlib.contextmanager
+def told(localhost_only: bool | None) -> Iterator[None]:
+    """ROS_LOCALHOST_ONLY as given: rcl reads it when a context is initialised, and has no other way to be told."""
+    if localhost_only is None:
+        yield
+        return
+    with _environment:
+        before = os.environ.get("ROS_LOCALHOST_ONLY")
+        os.environ["ROS_LOCALHOST_ONLY"] = str(int(localhost_only))
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["ROS_LOCALHOST_ONLY"]
+            else:
+                os.environ["ROS_LOCALHOST_ONLY"] = before
+
+
+class translated(contextlib.AbstractContextManager[None]):
+    """RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, RuntimeError) and not isinstance(error, MiddlewareError):
+            raise MiddlewareError(f"{self._what}: {error}") from error

@@ -1,0 +1,33 @@
+"""What rcl is told by its environment, and what becomes of its errors."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware.rcl import told, translated
+
+NAME = "ROS_LOCALHOST_ONLY"
+
+
+@pytest.mark.parametrize("before", [None, "0", "1"])
+@pytest.mark.parametrize("localhost_only", [True, False, None])
+def test_the_environment_says_it_for_a_moment_only(
+    monkeypatch: pytest.MonkeyPatch, before: str | None, localhost_only: bool | None
+) -> None:
+    monkeypatch.delenv(NAME, raising=False)
+    if before is not None:
+        monkeypatch.setenv(NAME, before)
+    with pytest.raises(ValueError, match="inside"), told(localhost_only):
+        assert os.environ.get(NAME) == {True: "1", False: "0", None: before}[localhost_only]
+        raise ValueError("inside")
+    assert os.environ.get(NAME) == before
+
+
+def test_errors_of_rcl_are_errors_of_the_middleware() -> None:
+    with pytest.raises(MiddlewareError, match="/odom is closed: invalid handle"), translated("/odom is closed"):
+        raise RuntimeError("invalid handle")
+    with pytest.raises(KeyError), translated("/odom"):
+        raise KeyError("another")
