@@ -21,6 +21,7 @@ from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.compression.dictionary import shipped
 from gr_ros2.settings_file import BUILTIN_DIR
 from gr_ros2.grc_path import example, grc_path
+from gr_ros2.middleware.dds_library import load
 from gr_ros2.phy.kernels.library import loaded
 print(json.dumps({
     "package": str(Path(gr_ros2.__file__).parent),
@@ -30,6 +31,7 @@ print(json.dumps({
     "dissector": DISSECTOR.read_text(),
     "dictionary": shipped().number,
     "kernels": loaded().functions is not None,
+    "dds": load()._name,
 }))
 """
 
@@ -76,6 +78,8 @@ def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
     assert found["dissector"] == (package / "wireshark" / "gr_ros2.lua").read_text()
     assert found["dictionary"] > 0
     assert found["kernels"] == bool(shutil.which("g++"))
+    if sys.version_info >= (3, 14):  # before, it comes from a package of its own
+        assert found["dds"].startswith(str(installed))
 
 
 @pytest.mark.slow
