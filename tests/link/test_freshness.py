@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.config import TopicOptions, build
-from gr_ros2.link import Sender
+from gr_ros2.link import Delivered, Sender
 from gr_ros2.link.freshness import TURN
 from gr_ros2.wire.v0 import V0
-from tests.link.engines import delivered, drain, read, receiver, sender, trace
+from tests.link.engines import delivered, drain, read, receiver, sender, take, trace
 
 
 def engine(topics: int = 3, packet_len: int = 220, **options: Any) -> Sender:
@@ -106,8 +106,9 @@ def test_every_message_arrives_whole_and_in_order_however_it_is_cut(
 
     def arrive(data: bytes | None) -> None:
         if data is not None:
-            for event in sink.receive(data, now):
-                got[event.topic_id].append(event.payload)  # type: ignore[union-attr]
+            for event in take(sink, data, now):
+                assert isinstance(event, Delivered)
+                got[event.topic_id].append(event.payload)
 
     now = 0.0
     for topic, size, packets, pause in messages:
