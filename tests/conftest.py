@@ -51,8 +51,11 @@ GROUPS = {
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Workers of ``-n auto``: tests mostly wait, for radios in real time and for other programs, so two per core."""
-    return 2 * len(os.sched_getaffinity(0))
+    """Workers of ``-n auto``: one more than cores, since tests often wait for radios in real time and other programs.
+
+    Each worker imports everything once, and tests in real time suffer from more.
+    """
+    return len(os.sched_getaffinity(0)) + 1
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups

@@ -139,7 +139,7 @@ def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path:
         viewer.wait(lambda: viewer.topic(ODOM)["delivered"] > first["delivered"], "numbers that move")
         viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now", 0) > 0.9, "a good link")
         assert viewer.phase() == "live"
-        assert any(re.match(r"odom #\d+ \d/4", text) for text in viewer.text(".bytes .entry"))
+        assert any(re.match(r"odom #\d+\[\d/4\]", text) for text in viewer.text(".bytes .entry"))
         points = "return Bokeh.documents[0].get_model_by_name(arguments[0]).renderers[0].data_source.length"
         for plot in ("map", "error", "latency", "pdr", "constellation", "spectrum"):
             viewer.wait(lambda plot=plot: viewer.run(points, plot) > 0, f"something on {plot}")

@@ -226,7 +226,7 @@ def test_no_broadcaster_is_lost_to_a_small_depth(monkeypatch: pytest.MonkeyPatch
     with DdsMiddleware(domain_id=domain) as robot:
         for child in ("imu", "laser", "camera"):
             robot.advertise("/tf_static", TF_TYPE, Qos("reliable", "transient_local", 1)).publish(transforms(child))
-        source = RosSource(rows, robot_id=1, middleware="dds", domain_id=domain, observer=events.append)
+        source = RosSource(rows, robot_id=1, middleware="dds", domain_id=domain, observer=Hears(events.append))
         try:
 
             def told() -> list[set[str]]:

@@ -30,7 +30,7 @@ def test_no_two_rows_look_alike() -> None:
 
 
 def test_the_documentation_has_every_row_and_no_other() -> None:
-    page = (ROOT.parent / "docs" / "measurements.md").read_text("utf-8")
+    page = (ROOT.parent / "docs" / "explanation" / "measurements.md").read_text("utf-8")
     table = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| `")]
     shown = {cells[0].strip("`"): tuple(cells[1:]) for cells in table if len(cells) == 3 and cells[1] in ENDS}
     assert shown == {row.value: (row.end, row.words) for row in Row}

@@ -19,8 +19,8 @@ from tests.waiting import wait_for
 
 SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
-THIRD = Path("/usr/include/fastdds/config.hpp")
-"""Fast DDS 3 has it; before, half of its names were `fastrtps`."""
+THIRD = Path("/usr/include/fastdds/rtps/transport/UDPv4TransportDescriptor.hpp")
+"""Fast DDS 3 has it; before, it was called `….h` and half of all names were `fastrtps`."""
 OLDEST = (2, 6, 2)
 """Fast DDS before that throws the announcement of every Cyclone DDS 11 participant away: it holds binary properties."""
 RELIABLE = Qos("reliable", "volatile", 100)

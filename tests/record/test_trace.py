@@ -190,8 +190,9 @@ def test_reading_what_grows_disturbs_nobody() -> None:
         try:
             for number in range(30_000):
                 track.add(float(number), 1.0, 2.0)
+                packet = Packet(1, 255, number & 255, 1, (Entry(0, number & 255, 0, 1, b""),) * 2)
                 entries = (SentEntry(number, 0, number & 255, 0, 1),) * 2
-                log.sent(SentPacket(number.to_bytes(8, "big"), entries, float(number)))
+                log.sent(SentPacket(number.to_bytes(8, "big"), packet, entries, float(number)))
         finally:
             done.set()
 

@@ -102,7 +102,8 @@ def test_an_idl_definition_stays_one(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_definitions_gets_ros_definition_only_where_its_hash_agrees(tmp_path: Path) -> None:
-    digest = definition(RANGE, NEWER_RANGE).digest
+    nobodys = NEWER_RANGE.replace("float32 variance\n", "float32 variance\nfloat32 drift\n")
+    digest = definition(RANGE, nobodys).digest
     older = make_sqlite(tmp_path / "older.db3", [Foreign("/sonar", RANGE)])
     run(older, tmp_path / "out_older")
     assert bag_definitions(tmp_path / "out_older") == {RANGE: definition(RANGE).text}
