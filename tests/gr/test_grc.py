@@ -307,6 +307,8 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
             publisher = robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=0))
             for payload in sent:
                 publisher.publish(payload)
+            taken = lambda: top.ros2_source_0.stats()["topics"]["/robot_1/odom"]["submitted"]  # noqa: E731
+            wait_for(lambda: taken() == len(sent), "every message")
             wait_for(lambda: top.ros2_source_0.idle and top.radio.counts().backlog == 0, "every packet to leave")
             packets = top.ros2_source_0.stats()["packets"]
             wait_for(lambda: top.radio.counts().transmitted == packets, "every sample")
