@@ -30,7 +30,7 @@ LAYERS = (
     {"record"},
     {"run", "report"},
     {"study"},
-    {"dashboard", "race"},
+    {"dashboard", "race", "doctor"},
     {"cli"},
     {"ros"},
 )
