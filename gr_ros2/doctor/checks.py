@@ -14,6 +14,7 @@ CHECKS: tuple[Check, ...] = (
     Check("Installed", "middleware", installed.middleware),
     Check("Installed", "phy", installed.phys),
     Check("Installed", "front ends", installed.front_ends),
+    Check("Installed", "GRC", installed.companion),
     Check("Installed", "optional parts", installed.parts),
     Check("Radios", "USB", radios.usb),
     Check("Radios", "drivers", radios.programs),

@@ -17,6 +17,7 @@ from gr_ros2.config import DEFAULT_MIDDLEWARE
 from gr_ros2.doctor.finding import Finding
 from gr_ros2.doctor.programs import output_of
 from gr_ros2.errors import BackendMissingError
+from gr_ros2.grc_python import finds_us, grc_program
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.phy.kernels.library import loaded
@@ -79,6 +80,14 @@ def phys() -> Iterator[Finding]:
 def front_ends() -> Iterator[Finding]:
     """The radios that there is software for."""
     return _rows(FRONT_ENDS)
+
+
+def companion() -> Finding:
+    """Whether flowgraphs in the Python of GNU Radio Companion find the blocks."""
+    program = grc_program()
+    if finds_us(program):
+        return Finding("GRC", "ok", f"{program} finds gr-ros2")
+    return Finding("GRC", "note", f"{program} does not find gr-ros2", "gr-ros2 grc-path --install")
 
 
 def parts() -> Iterator[Finding]:

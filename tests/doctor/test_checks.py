@@ -84,6 +84,13 @@ def test_back_ends_that_are_missing_say_what_they_need(monkeypatch: pytest.Monke
     assert found["middleware zenoh"].remedy.startswith("pip install eclipse-zenoh")
 
 
+def test_flowgraphs_that_do_not_find_the_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    found = installed.companion()
+    if found.state == "note":  # else the blocks are installed for everybody
+        assert found.remedy == "gr-ros2 grc-path --install"
+
+
 def test_a_radio_on_usb_and_whether_it_may_be_opened(tmp_path: Path) -> None:
     device, node = tmp_path / "sys" / "1-1", tmp_path / "dev" / "001" / "007"
     device.mkdir(parents=True)
