@@ -100,7 +100,7 @@ def without_blocks_path(text: str, folder: str) -> str:
     """
     lines = text.splitlines(keepends=True)
     headings = [number for number, line in enumerate(lines) if _SECTION.match(line)]
-    for heading, end in zip(headings, [*headings[1:], len(lines)], strict=True):
+    for heading, end in zip(headings, [*headings, len(lines)][1:], strict=True):
         section = _SECTION.match(lines[heading])
         if section is None or section[1].lower() != "grc":
             continue
