@@ -45,7 +45,7 @@ class Lost:
     """A message of which at least one fragment came will never be complete.
 
     ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
-    outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
+    outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
     or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
     """
 
