@@ -9,7 +9,7 @@ import pytest
 
 from fuzz.loop import inputs
 from gr_ros2.config import TopicOptions
-from gr_ros2.link.v1.events import Delivered
+from gr_ros2.link.events import Delivered
 from gr_ros2.registry import Registry
 from tests.link.v1.air import SLOT_S, Robot, registry
 
@@ -37,7 +37,7 @@ def test_40000_messages_with_outages_restarts_reordering_and_duplicates(loss: fl
 
     def hear(data: bytes) -> None:
         nonlocal here
-        for event in two.end.receive(data, now):
+        for event in two.receive(data, now):
             if isinstance(event, Delivered):
                 number = sent[event.topic_id].get(event.payload)
                 assert number is not None, f"never sent: {event.payload!r}"
@@ -71,10 +71,10 @@ def test_40000_messages_with_outages_restarts_reordering_and_duplicates(loss: fl
             hear(late.popleft())
         answer = two.slot(now)
         if answer is not None and not outage and rng.random() >= loss:
-            one.end.receive(answer, now)
+            one.receive(answer, now)
         if int(now / SLOT_S) % 8 == 0:
-            one.end.handle_timeout(now)
-            two.end.handle_timeout(now)
+            one.events += one.end.handle_timeout(now)
+            two.events += two.end.handle_timeout(now)
     assert here > 10_000
 
 
@@ -95,12 +95,12 @@ def test_nothing_is_accepted_that_was_not_sent(mode: str) -> None:
             if data is not None:
                 genuine.append(data)
                 if rng.random() < 0.8:
-                    two.end.receive(data, now)
+                    two.receive(data, now)
     for data, _ in zip(inputs(genuine, 7), range(60_000), strict=False):
         now += 0.001
-        for event in two.end.receive(data[:64], now):
+        for event in two.receive(data[:64], now):
             assert not isinstance(event, Delivered) or event.payload in sent
-    two.end.handle_timeout(now)
+    two.events += two.end.handle_timeout(now)
     here = two.delivered()
     assert len(here) == len(set(here))
     inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
