@@ -134,7 +134,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions.values())
+        return not self.unmatched
+
+    @property
+    def unmatched(self) -> list[str]:
+        """Topics, by their names on the ROS graph, that nobody publishes yet."""
+        subscriptions = dict(self._subscriptions)
+        names = {topic.topic_id: name for name, topic in self.subscribed.items()}
+        return [names[number] for number, subscription in subscriptions.items() if not subscription.matched()]
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -206,6 +213,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "repeats": stats.repeats,
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
+                "unmatched": self.unmatched,
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
@@ -214,9 +222,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """Packets/s offered to the flowgraph, 0 unpaced (raises ConfigError out of range, like all setters)."""
         self._reconfigure(packet_rate=packet_rate)
 
-    def set_flush_timeout(self, flush_timeout: float) -> None:
+    def set_flush_timeout_s(self, flush_timeout_s: float) -> None:
         """s a partly filled packet waits for company."""
-        self._reconfigure(flush_timeout=flush_timeout)
+        self._reconfigure(flush_timeout_s=flush_timeout_s)
 
     def set_greedy(self, greedy: bool) -> None:
         """Several entries of one topic in a packet."""

@@ -48,7 +48,7 @@ class Lost:
     """A message of which at least something came will not be delivered.
 
     ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
-    outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
+    outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
     ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (nothing
     says what its topic is), ``sender_restarted``; or it is complete and its codec says ``unknown_dictionary`` or
     ``damaged``.

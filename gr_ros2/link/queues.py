@@ -134,8 +134,8 @@ def queue_for(
     :param period_s: their deadline: s within which they promise a message, 0 no promise
     """
     if options.queue is not None:
-        return options.queue, options.deadline_ms / 1e3
-    deadline_s = options.deadline_ms / 1e3 or lifespan_s
+        return options.queue, options.deadline_s
+    deadline_s = options.deadline_s or lifespan_s
     if options.depth == 1 or (options.depth is None and (depth == 1 or period_s)):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

@@ -72,7 +72,7 @@ from gr_ros2.wire.v1 import (
 
 FORCED = 20
 """New packets after which a report that found no room goes by itself: 5 % of the slots."""
-LIVE_SETTINGS = ("packet_rate", "flush_timeout", "dst_id", "hop", "repeat_s", "queue_depth")
+LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change while it runs; others of a sending block that do not concern version 1 are left out."""
 _INTERVALS = 15
 _POLL_S = 0.02

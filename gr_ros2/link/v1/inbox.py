@@ -105,7 +105,7 @@ class Inbox:
         self._void: set[int] = set()
         """Packets that their sender has left out of a repair."""
         self._gaps: deque[tuple[float, int]] = deque()
-        """Packets that were missing, and since when."""
+        """Packets that were missing, and since when; none that is not remembered."""
         self._hope = 1.0
         """Share of missing packets that come back in time."""
         self._reassembly = Reassembly(settings.max_source_bytes)
@@ -188,7 +188,7 @@ class Inbox:
         """Go on without what has been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout):
+        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
             self._lose(partial, Row.EXPIRED)
         return self._given()
 
@@ -199,7 +199,7 @@ class Inbox:
             times.append(self._gaps[0][0] + self._settings.hold_s)
         waiting = self._reassembly.next_timeout()
         if waiting is not None:
-            times.append(waiting + self._settings.reassembly_timeout)
+            times.append(waiting + self._settings.reassembly_timeout_s)
         return min(times) if times else None
 
     def close(self, reason: Row) -> Events:
@@ -279,9 +279,11 @@ class Inbox:
             self._stats.packet_loss_est += gone
             self._missed = True
             self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
-            first = max(newest + 1, number - SPAN)
-            self._gaps.extend((now, missing) for missing in range(first, newest + 1 + gone))
         self.decoder.advance(number)
+        gaps, floor = self._gaps, self.decoder.floor
+        gaps.extend((now, missing) for missing in range(max(newest + 1, floor), newest + 1 + gone))
+        while gaps and gaps[0][1] < floor:
+            gaps.popleft()
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found

@@ -250,7 +250,7 @@ class Outbox:
                 heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
         if not picks:
             return None
-        wait = self._settings.flush_timeout
+        wait = self._settings.flush_timeout_s
         if wait and room - used >= self._settings.min_fragment + _ENTRY:
             since = min(min(message.submitted, self._queues[message.topic_id].since) for message, _ in picks)
             if now < since + wait:
@@ -297,7 +297,7 @@ class Outbox:
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
-        return queue.since + self._settings.flush_timeout if self._settings.flush_timeout else now
+        return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def depth(self, topic_id: int) -> int:
         """Messages of a topic that may wait, 0 unbounded."""

@@ -13,7 +13,7 @@ from gr_ros2.link.v1.repair import RepairMode
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
 NOBODY = -1
-_LEAST = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
+MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class Settings:
     :param report_every: packets received from one report to the next
     :param repeat_s: s between repeats of latched messages while nobody reports; 0 off
     :param give_up_s: s of silence after which a robot is taken for gone
-    :param reassembly_timeout: s that an incomplete message waits for its next fragment
+    :param reassembly_timeout_s: s that an incomplete message waits for its next fragment
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
     :param min_fragment: bytes of a message below which no fragment begins in a packet that others share
-    :param flush_timeout: s that a partly filled packet waits for company
+    :param flush_timeout_s: s that a partly filled packet waits for company
     :param packet_rate: packets/s, 0 unpaced or paced by credits
     :param queue_depth: messages waiting per topic; 0 unbounded
     :param depth: newer messages after which one of a topic without lifespan is not repaired any more, while nobody
@@ -57,18 +57,18 @@ class Settings:
     report_every: int = 5
     repeat_s: float = 10.0
     give_up_s: float = 10.0
-    reassembly_timeout: float = 60.0
+    reassembly_timeout_s: float = 60.0
     max_source_bytes: int = 32_000_000
     max_sources: int = 16
     min_fragment: int = 16
-    flush_timeout: float = 0.0
+    flush_timeout_s: float = 0.0
     packet_rate: float = 0.0
     queue_depth: int = 100
     depth: int = 16
 
     def __post_init__(self) -> None:
-        if not _LEAST <= self.packet_len <= 4095:
-            raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {_LEAST}..4095")
+        if not MIN_PACKET_LEN <= self.packet_len <= 4095:
+            raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {MIN_PACKET_LEN}..4095")
         if not 0 <= self.src_id < BROADCAST and (self.hears or self.src_id != NOBODY):
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")
 
@@ -97,7 +97,7 @@ def settings_of(
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,
         min_fragment=send.min_fragment,
-        flush_timeout=send.flush_timeout,
+        flush_timeout_s=send.flush_timeout_s,
         packet_rate=send.packet_rate,
         queue_depth=send.queue_depth,
     )
