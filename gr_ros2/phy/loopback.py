@@ -60,7 +60,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         self._pace = pace
         last = source
         if phy.has_samples and pace == "airtime":
-            self._gate = AirtimeGate(phy.airtime(), times=True)
+            airtime_of = phy.airtime if phy.any_length else None
+            self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)
         if phy.has_samples:
             # The channel also stops tags.
