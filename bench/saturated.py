@@ -15,11 +15,10 @@ from itertools import count
 from bench.repair import losses
 from bench.report import Row
 from gr_ros2.gr.ends import message_codec
-from gr_ros2.link.events import Delivered as DeliveredV0
+from gr_ros2.link.events import Delivered
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.events import Delivered
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phy
@@ -133,7 +132,7 @@ def run(
         lost = next(forward)
         if data is not None and not lost:
             for event in [*receiver.receive(data, after), *receiver.handle_timeout(after)]:
-                if isinstance(event, Delivered | DeliveredV0):
+                if isinstance(event, Delivered):
                     known = serials[event.topic_id, event.payload]
                     arrived[event.topic_id].append((after, known.pop(0) if len(known) > 1 else known[0]))
         if isinstance(receiver, Endpoint) and isinstance(sender, Endpoint):
@@ -145,7 +144,7 @@ def run(
                     sender.receive(answer, after)
             sender.handle_timeout(now)
     if isinstance(sender, Endpoint):
-        air.update(sender.air)
+        air.update(sender.sent.air)
     topics = [
         Topic(topic.name, len(times[n]), len(arrived[n]), mean_age(times[n], arrived[n], until))
         for n, topic in enumerate(case.registry)

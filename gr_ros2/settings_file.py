@@ -18,7 +18,7 @@ from gr_ros2.yaml_text import parse_yaml
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Where the built-in scenarios and registries lie."""
 
-SHARED_KEYS = ("registry", "packet_len")
+SHARED_KEYS = ("registry", "packet_len", "version")
 """Settings both ends of a link must agree on."""
 
 ENDS = ("ros_source", "ros_sink")

@@ -50,7 +50,7 @@ def learn(
 
     :param messages: (type name, payload)
     :param base: its words and constants follow after those that were learned
-    :param definitions: ``.msg`` texts of types that ROS 2 Humble has not; kept in the dictionary
+    :param definitions: ``.msg`` texts of types; kept in the dictionary where ROS 2 Humble has none or another one
     :param zstd_size: bytes of each type's zstd dictionary at most; 0 = none
     """
     types = Types(definitions)

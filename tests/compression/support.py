@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import random
 import struct
-from pathlib import Path
 from typing import Any
 
-import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
 from gr_ros2.config import TopicOptions
-from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.registry import Registry, Topic, normalize_type
 from gr_ros2.sim import Fleet, SimSettings
 
-HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 _CODES = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I",
@@ -45,8 +42,8 @@ _SINGLES = (
 class Writer:
     """Serializes random members of a type, once with garbage in the alignment gaps and once with zeros."""
 
-    def __init__(self, rng: random.Random, order: str = "<", garbage: bool = True) -> None:
-        self.rng, self.order, self.garbage = rng, order, garbage
+    def __init__(self, rng: random.Random, order: str = "<", garbage: bool = True, store: Typestore = STORE) -> None:
+        self.rng, self.order, self.garbage, self.store = rng, order, garbage, store
         self.with_garbage, self.clean = bytearray(), bytearray()
 
     def message(self, type_name: str, tail: int = 0) -> tuple[bytes, bytes]:
@@ -56,7 +53,7 @@ class Writer:
         return header + self.with_garbage + bytes(tail), header + self.clean + bytes(tail)
 
     def _type(self, type_name: str) -> None:
-        for _, (kind, detail) in STORE.fielddefs[type_name][1]:
+        for _, (kind, detail) in self.store.fielddefs[type_name][1]:
             if kind is Nodetype.BASE:
                 self._base(detail[0])
             elif kind is Nodetype.NAME:
@@ -127,13 +124,6 @@ def codec_for(type_name: str, *dictionaries: Dictionary, max_size: int = 1 << 20
     """The codec of a link with one topic."""
     topic = Topic(0, "topic", normalize_type(type_name), TopicOptions(**options))
     return LinkCodec(Registry([topic]), dictionaries, max_size=max_size)
-
-
-def husky(topic: str) -> list[bytes]:
-    """Payloads of the recording; skips where it is not there."""
-    if not HUSKY.exists():
-        pytest.skip(f"recording {HUSKY} is missing")
-    return [message.payload for message in read_bag(HUSKY, [topic])]
 
 
 def simulated(topic: str, seconds: float = 10.0, **settings: Any) -> list[bytes]:
