@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from statistics import mean
 
-from bench.report import Row, median_of
+from bench.rows import Row, median_of
 from gr_ros2.compression import LinkCodec
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.registry import Registry

@@ -1,8 +1,8 @@
 """Lazy tables of back-ends: name -> where its class lives and what must be installed for it.
 
-Laws: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS 2 or a
-DDS; packages of others add rows by entry points, which are read only when a name is not one of ours, or all names are
-asked for; one of these that is broken harms nobody but who chooses it.
+Invariants: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS
+2 or a DDS; packages of others add rows by entry points, which are read only when a name is not one of ours, or all
+names are asked for; one of these that is broken harms nobody but who chooses it.
 """
 
 from __future__ import annotations

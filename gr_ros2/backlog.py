@@ -1,7 +1,7 @@
 """Work that may be done later: a bounded queue and one thread that works it off.
 
-Laws: :meth:`Backlog.offer` never waits, and refuses what does not fit; work is done in the order in which it came, in
-one thread; a work that never returns holds up nobody but those behind it.
+Invariants: :meth:`Backlog.offer` never waits, and refuses what does not fit; work is done in the order in which it
+came, in one thread; a work that never returns holds up nobody but those behind it.
 """
 
 from __future__ import annotations

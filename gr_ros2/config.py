@@ -1,6 +1,6 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Law: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
+Invariant: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
 names the key, the value and what is allowed.
 """
 

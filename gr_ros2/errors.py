@@ -19,7 +19,7 @@
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
     └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
 
-Law: messages name the thing, its value and the remedy, in one line.
+Invariant: messages name the thing, its value and the remedy, in one line.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What may fail and must not matter: an observer of a link, or one part of it.
 
-Laws: it is called until its first exception; that ends it, one line that names it is logged, and every call from then
-on is counted as missed; nobody who calls it ever sees it raise. Any thread may call.
+Invariants: it is called until its first exception; that ends it, one line that names it is logged, and every call from
+then on is counted as missed; nobody who calls it ever sees it raise. Any thread may call.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The file of a fleet's keys: one key per line, 64 hex digits; the first seals, all are accepted.
 
-Laws: a key file that others than its owner may read or write is refused; a file that exists is never written over.
+Invariants: a key file that others than its owner may read or write is refused; a file that exists is never written
+over.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Names by ROS's rules: topics, namespaces, nodes, frames; and forms of them that hold the sender's id.
 
-Laws: a name that passes here passes in every ROS 2, since the rules are those its ``rmw`` package enforces
+Invariants: a name that passes here passes in every ROS 2, since the rules are those its ``rmw`` package enforces
 (``rmw_validate_full_topic_name``, ``rmw_validate_namespace``, ``rmw_validate_node_name``). They come from the ROS 2
 design article "Topic and Service name mapping to DDS"; two underscores in a row, which only the article forbids, pass.
 A form has one field, ``{src_id}``, and nothing else in braces.

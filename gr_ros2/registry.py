@@ -1,6 +1,7 @@
 """The registry: which topics cross the link and which number stands for each (the paper, section 4.3).
 
-Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
+Invariant: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it
+does.
 """
 
 from __future__ import annotations

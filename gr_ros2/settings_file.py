@@ -1,7 +1,8 @@
 """YAML files of settings: one file, registries found, and single settings replaced on the command line.
 
-Laws: a relative registry in a file is looked for beside the file, one on the command line in the current directory;
-overrides apply in their order; nothing is checked here but the form, since the settings know their own ranges.
+Invariants: a relative registry in a file is looked for beside the file, one on the command line in the current
+directory; overrides apply in their order; nothing is checked here but the form, since the settings know their own
+ranges.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a YAML text may cost, checked before any of it is made: its length, its depth, and what its aliases expand to.
 
-Law: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
+Invariant: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
 settings file needs, every text of that length passes.
 """
 
@@ -21,7 +21,7 @@ MOST_VALUES = 20_000
 
 
 @dataclass
-class _Open:
+class _OpenCollection:
     """A list or mapping whose end has not come. ``values`` counts what is in it, itself included."""
 
     anchor: str | None
@@ -51,11 +51,11 @@ def check_bounds(text: str) -> None:
     if len(text) > MOST_CHARACTERS:
         raise ConfigError(f"longer than {MOST_CHARACTERS:,} characters; settings are not")
     sizes: dict[str, int] = {}
-    levels = [_Open(None)]
+    levels = [_OpenCollection(None)]
     for event in yaml.parse(text):  # events come one by one and build nothing
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.CollectionStartEvent):
-            levels.append(_Open(event.anchor))
+            levels.append(_OpenCollection(event.anchor))
             if len(levels) > MOST_LEVELS:
                 raise ConfigError(f"line {line}: more than {MOST_LEVELS} levels one within the other")
             continue

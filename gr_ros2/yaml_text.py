@@ -1,7 +1,7 @@
 """YAML as this program reads it: plain values, and every key once.
 
-Law: whatever YAML comes in, from a file or the command line, is read here. A key that stands twice in one mapping is an
-error: YAML 1.2 (section 3.2.1.3) forbids it, and PyYAML would take the last without a word.
+Invariant: whatever YAML comes in, from a file or the command line, is read here. A key that stands twice in one mapping
+is an error: YAML 1.2 (section 3.2.1.3) forbids it, and PyYAML would take the last without a word.
 """
 
 from __future__ import annotations

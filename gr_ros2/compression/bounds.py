@@ -1,8 +1,8 @@
 """How much a coded message may stand for: the more bytes came, the more may come out, and the more parts it may have.
 
-Laws: part of the format, so both ends reckon alike; every bound grows with the length of the coded message and with
-nothing else that it says, so that a short message costs its receiver little whatever it claims. A sender whose message
-comes out too short for what it stands for makes it longer (``least``).
+Invariants: part of the format, so both ends reckon alike; every bound grows with the length of the coded message and
+with nothing else that it says, so that a short message costs its receiver little whatever it claims. A sender whose
+message comes out too short for what it stands for makes it longer (``least``).
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Each array says how it was turned: PLAIN, PLANES (byte 0 of all elements, then b
 neighbouring elements, modulo their width, folded and as planes), DECIMALS (float32 that are n / 10**k: 5 + the folded
 differences of the n, as planes; 0..4 stand for infinities and the like).
 
-Laws: little endian in and out; exact for all bytes; a turn back never yields more bytes than the size it is given, and
-only ValueError comes out of it.
+Invariants: little endian in and out; exact for all bytes; the inverse never yields more bytes than the size it is
+given, and only ValueError comes out of it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SPECIAL = np.array([0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00000, 0x80000000]
 _MAX_N = 1 << 24
 
 
-def turn(data: bytes, size: int, real: bool, compressed: Callable[[bytes], int]) -> tuple[int, int, bytes]:
+def transform(data: bytes, size: int, real: bool, compressed: Callable[[bytes], int]) -> tuple[int, int, bytes]:
     """(way, parameter, turned bytes) of the way that compresses best.
 
     :param size: bytes of an element
@@ -50,7 +50,7 @@ def _candidates(data: bytes, size: int, real: bool) -> Iterator[tuple[int, int, 
         yield DELTAS, size, _to_planes(_differences(np.frombuffer(data, _UNSIGNED[size])).tobytes(), size)
 
 
-def turn_back(way: int, parameter: int, data: bytes, size: int) -> bytes:
+def inverse_transform(way: int, parameter: int, data: bytes, size: int) -> bytes:
     """The array.
 
     :raises ValueError: no such way, or not of whole elements

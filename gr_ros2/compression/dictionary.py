@@ -1,12 +1,12 @@
 """Dictionaries: what both ends know beforehand about the messages of some types.
 
 A dictionary is one JSON file: words (frame names and the like), constants (numbers that covariances are made of), and
-for each type the float class of its fields, whole ballasts that are frequent, a zstd dictionary, and the definition
-where ROS has none.
+for each type the float class of its fields, sets of static values that are frequent, a zstd dictionary, and the
+definition where ROS has none.
 
-Laws: a dictionary never changes; another content is another dictionary with another id. The sets shipped with gr-ros2
-are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A user's own are named by
-the first two bytes of their SHA-256. A file that is no dictionary is a ConfigError that names it.
+Invariants: a dictionary never changes; another content is another dictionary with another id. The sets shipped with
+gr-ros2 are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A user's own are
+named by the first two bytes of their SHA-256. A file that is no dictionary is a ConfigError that names it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.compression.ballast import Words
-from gr_ros2.compression.floats import CLASSES, Constants
+from gr_ros2.compression.floats import CLASSES, KnownNumbers
 from gr_ros2.compression.prepared import Model
+from gr_ros2.compression.static_values import Words
 from gr_ros2.errors import ConfigError
 
 FORMAT = 1
@@ -38,7 +38,7 @@ class TypeEntry:
     """What is known about one type.
 
     :param classes: float class letter by path of the field
-    :param templates: (sequence lengths, coded ballast), most frequent first, at most 15
+    :param templates: (sequence lengths, coded static values), most frequent first, at most 15
     :param zstd: a zstd dictionary over its payloads, b'' = none
     :param definition: ``.msg`` text, '' for types of ROS 2 Humble
     """
@@ -82,8 +82,8 @@ class Dictionary:
         return Model(*self._lists, entry.classes, entry.templates)
 
     @cached_property
-    def _lists(self) -> tuple[Words, Constants]:
-        return Words([word.encode() + b"\0" for word in self.words]), Constants(self.constants)
+    def _lists(self) -> tuple[Words, KnownNumbers]:
+        return Words([word.encode() + b"\0" for word in self.words]), KnownNumbers(self.constants)
 
     def save(self, path: str | Path) -> None:
         """Write the file.

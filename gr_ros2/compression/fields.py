@@ -1,11 +1,11 @@
 """The codec ``fields``: a message taken apart by its type, each value coded for what it is.
 
 A message becomes one number (see ``number``). Popped off it come, in order: byte order, options and tail; sequence
-lengths; live values (stamps, numbers); and what is left of the number is the ballast (strings, matrices, flags), which
-therefore can be remembered under the number itself. Long arrays and strings follow as a second part.
+lengths; live values (stamps, numbers); and what is left of the number is the static values (strings, matrices, flags),
+which therefore can be remembered under the number itself. Long arrays and strings follow as a second part.
 
-Laws: exact but for alignment gaps, which become zero; no message needs another; what is remembered only saves time;
-memory is bounded; decoding arbitrary bytes ends in a message or in a DamagedError.
+Invariants: exact but for alignment gaps, which become zero; no message needs another; what is remembered only saves
+time; memory is bounded; decoding arbitrary bytes ends in a message or in a DamagedError.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
 from gr_ros2.compression import bounds, bulk
-from gr_ros2.compression.ballast import Value, pop_ballast, push_ballast
+from gr_ros2.compression.ans import Table, from_bytes, pop_natural, push_natural, to_bytes
 from gr_ros2.compression.floats import (
     pop_double,
     pop_quaternion,
@@ -25,9 +25,7 @@ from gr_ros2.compression.floats import (
     push_quaternion,
     push_single,
 )
-from gr_ros2.compression.frames import Zstd, read_varint, varint
-from gr_ros2.compression.number import Table, from_bytes, pop_natural, push_natural, to_bytes
-from gr_ros2.compression.plan import (
+from gr_ros2.compression.layout import (
     DOUBLE,
     INTEGER,
     MATRIX,
@@ -43,6 +41,8 @@ from gr_ros2.compression.plan import (
 from gr_ros2.compression.prepared import PARTS, TEMPLATES, Model, Prepared
 from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, Repeat, Shape, is_open, shape_of
 from gr_ros2.compression.stamps import pop_stamp, push_stamp
+from gr_ros2.compression.static_values import Value, pop_static, push_static
+from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
 from gr_ros2.errors import DamagedError
 
 MAX_NUMBER = 8192
@@ -123,7 +123,7 @@ class FieldsCodec:
         packed = _RAW
         if prepared.bulk or layout.long_texts:
             blob, ways, packed = self._blob(layout, prepared, values)
-        x = self._push_ballast(prepared, layout, values)
+        x = self._push_static(prepared, layout, values)
         x = self._push_live(x, prepared, values, layout.unpack_reals(payload), ways)
         if self._open:
             for count in reversed(layout.shape.counts):
@@ -151,14 +151,14 @@ class FieldsCodec:
                 raise
             raise DamagedError(f"damaged message: {' '.join(str(error).split())}") from error
 
-    def ballast(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
+    def static_values(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
         """What a template of this message would be (``Model.templates``); None where it has no use for one."""
         found = self.layout(payload)
         if found is None or found[0].long_texts or (prepared := self._prepare(found[0].shape.counts)) is None:
             return None
-        values = self._ballast_values(prepared, *found)
-        return found[0].shape.counts, push_ballast(
-            0, values, prepared.plan.ballast, self._model.words, self._model.constants
+        values = self._static_values(prepared, *found)
+        return found[0].shape.counts, push_static(
+            0, values, prepared.plan.static_values, self._model.words, self._model.constants
         )
 
     # Preparation, remembered
@@ -186,27 +186,27 @@ class FieldsCodec:
 
     # Encoding
 
-    def _ballast_values(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> tuple[Value, ...]:
-        picked = [values[index] for index in prepared.ballast_indexes]
+    def _static_values(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> tuple[Value, ...]:
+        picked = [values[index] for index in prepared.static_indexes]
         if layout.shape.order == BIG:
-            for n, slot in enumerate(prepared.plan.ballast):
+            for n, slot in enumerate(prepared.plan.static_values):
                 if slot.kind == MATRIX:
                     picked[n] = bulk.swapped(picked[n], 8)
         if layout.long_texts:
-            for n, index in enumerate(prepared.ballast_indexes):
+            for n, index in enumerate(prepared.static_indexes):
                 if index in layout.long_texts:
                     picked[n] = layout.long_texts[index]
         return tuple(picked)
 
-    def _push_ballast(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> int:
-        key = self._ballast_values(prepared, layout, values)
+    def _push_static(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> int:
+        key = self._static_values(prepared, layout, values)
         known = (prepared.counts, key)
         x = self._coded.get(known)
         if x is None:
             number = prepared.templates.get(key, PARTS)
             x = 0
             if number == PARTS:
-                x = push_ballast(0, key, prepared.plan.ballast, self._model.words, self._model.constants)
+                x = push_static(0, key, prepared.plan.static_values, self._model.words, self._model.constants)
             if self._model.templates:
                 x = TEMPLATES.push(x, number)
             _remember(self._coded, known, x)
@@ -250,7 +250,7 @@ class FieldsCodec:
             data = values[slot.index]
             if layout.shape.order == BIG:
                 data = bulk.swapped(data, slot.size)
-            way, parameter, turned = bulk.turn(data, slot.size, slot.real >= 0, self._measure)
+            way, parameter, turned = bulk.transform(data, slot.size, slot.real >= 0, self._measure)
             ways.append((way, parameter))
             parts.append(turned)
         parts += [values[index] for index in layout.long_texts]
@@ -291,14 +291,14 @@ class FieldsCodec:
         values = prepared.blank.copy()
         values[0], values[-1] = header, bytes(tail)
         x, ways = self._pop_live(x, prepared, values)
-        ballast = self._pop_ballast(x, prepared)
+        static_values = self._pop_static(x, prepared)
         big = header[1] == 0
         texts: list[int] = []
         arrays = [
             _Array(slot.index, prepared.plan.items[slot.index][2], slot.size, way, parameter)
             for slot, (way, parameter) in zip(prepared.bulk, ways, strict=True)
         ]
-        for slot, value in zip(prepared.plan.ballast, ballast, strict=True):
+        for slot, value in zip(prepared.plan.static_values, static_values, strict=True):
             index = slot.index
             if slot.kind == STRING:
                 length = value if isinstance(value, int) else len(value)
@@ -358,7 +358,7 @@ class FieldsCodec:
                 ways.append((way, parameter))
         return x, ways
 
-    def _pop_ballast(self, x: int, prepared: Prepared) -> Sequence[Value]:
+    def _pop_static(self, x: int, prepared: Prepared) -> Sequence[Value]:
         known = (prepared.counts, x)
         values = self._values.get(known)
         if values is not None:
@@ -369,7 +369,7 @@ class FieldsCodec:
                 raise DamagedError("damaged message: a template of another shape")
             found = prepared.template_values[number]
         else:
-            rest, found = pop_ballast(rest, prepared.plan.ballast, self._model.words, self._model.constants)
+            rest, found = pop_static(rest, prepared.plan.static_values, self._model.words, self._model.constants)
         if rest:
             raise DamagedError("damaged message: more than was wanted")
         return _remember(self._values, known, tuple(found))
@@ -385,7 +385,7 @@ class FieldsCodec:
         big = values[0][1] == 0
         at = 0
         for array in arrays:
-            data = bulk.turn_back(array.way, array.parameter, raw[at : at + array.length], array.size)
+            data = bulk.inverse_transform(array.way, array.parameter, raw[at : at + array.length], array.size)
             values[array.item] = bulk.swapped(data, array.size) if big else data
             at += array.length
 

@@ -4,8 +4,8 @@ A number is one of: zero; one of the dictionary's constants; a double that carri
 (n / 10**k, k <= 9); the square of one, as variances often are (in matrices); a sign and exponent from the field's
 static model and the fraction as it is; or, failing all these (NaN, infinities, denormals, far-off exponents), its bits.
 
-Laws: exact for all bit patterns, including NaN payloads and -0.0; each number stands for itself, so that one field
-never needs another (quaternions excepted, see there).
+Invariants: exact for all bit patterns, including NaN payloads and -0.0; each number stands for itself, so that one
+field never needs another (quaternions excepted, see there).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from struct import Struct
 
-from gr_ros2.compression.number import MASK, SCALE_BITS, Table, pop_natural, pop_rank, push_natural, push_rank
+from gr_ros2.compression.ans import MASK, SCALE_BITS, Table, pop_natural, pop_rank, push_natural, push_rank
 
 ZERO, CONSTANT, SINGLE, SHORT, SQUARE, VERBATIM, EXPONENTS = range(7)
 """Symbols of a field's model; from EXPONENTS on, sign and exponent: EXPONENTS + 2 * (exponent + 40) + sign."""
@@ -94,7 +94,7 @@ def class_table(letter: str) -> Table:
     return _CLASS_TABLES[letter]
 
 
-class Constants:
+class KnownNumbers:
     """Values of doubles in order of frequency, by their bits."""
 
     def __init__(self, values: Sequence[int]) -> None:
@@ -134,7 +134,7 @@ def _root(value: float) -> tuple[int, int] | None:
     return short if short is not None and short[0].bit_length() <= 24 else None
 
 
-def push_double(x: int, bits: int, value: float, table: Table, constants: Constants) -> int:
+def push_double(x: int, bits: int, value: float, table: Table, constants: KnownNumbers) -> int:
     """Push a double given by its bits and its value."""
     if bits == 0:
         symbol = ZERO
@@ -166,7 +166,7 @@ def push_double(x: int, bits: int, value: float, table: Table, constants: Consta
     return (quotient << SCALE_BITS) + rest + start
 
 
-def pop_double(x: int, table: Table, constants: Constants) -> tuple[int, int]:
+def pop_double(x: int, table: Table, constants: KnownNumbers) -> tuple[int, int]:
     """(x, bits)
 
     :raises IndexError: a constant the dictionary has not
@@ -257,7 +257,7 @@ _LARGEST_MISS = 24
 IDENTITY = (0, 0, 0, bits_of(1.0))
 
 
-def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table: Table, constants: Constants) -> int:
+def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table: Table, constants: KnownNumbers) -> int:
     """Push a unit quaternion: its largest component follows from the others but for a few last bits."""
     if tuple(bits) == IDENTITY:
         return _QUATERNIONS.push(x, _IDENTITY)
@@ -282,7 +282,7 @@ def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table:
     return _QUATERNIONS.push(x, _FREE)
 
 
-def pop_quaternion(x: int, table: Table, constants: Constants) -> tuple[int, list[int]]:
+def pop_quaternion(x: int, table: Table, constants: KnownNumbers) -> tuple[int, list[int]]:
     """(x, the bits of x, y, z, w)"""
     x, symbol = _QUATERNIONS.pop(x)
     if symbol == _IDENTITY:

@@ -1,7 +1,7 @@
 """Bounded loss, where a user asks for it: numbers rounded to so many decimals before they are coded.
 
-Law: a finite x of magnitude below 2**33 steps becomes the double (or float32) nearest to a multiple of the step, so it
-is off by at most step * (1/2 + 2**-20), plus half a unit in the last place of a float32; every other value (NaN,
+Invariant: a finite x of magnitude below 2**33 steps becomes the double (or float32) nearest to a multiple of the step,
+so it is off by at most step * (1/2 + 2**-20), plus half a unit in the last place of a float32; every other value (NaN,
 infinities, larger ones) and every field not named stays as it is, bit for bit. The decoder knows nothing of all this.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gr_ros2.compression.plan import BULK, DOUBLE, MATRIX, QUATERNION, SINGLE, Layout, Slot
+from gr_ros2.compression.layout import BULK, DOUBLE, MATRIX, QUATERNION, SINGLE, Layout, Slot
 from gr_ros2.compression.schema import BIG, Composite, Node, Repeat, Scalar
 from gr_ros2.errors import ConfigError
 
@@ -66,7 +66,7 @@ class Quantizer:
         """The payload with its chosen fields rounded."""
         out = list(values)
         order = layout.shape.order
-        for slot in [*layout.outline.live, *layout.outline.ballast]:
+        for slot in [*layout.outline.live, *layout.outline.static_values]:
             if slot.kind in (DOUBLE, QUATERNION):
                 for place in range(4 if slot.kind == QUATERNION else 1):
                     decimals = self._decimals(slot, "xyzw"[place] if slot.kind == QUATERNION else "")

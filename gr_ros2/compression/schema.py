@@ -1,8 +1,8 @@
 """Message types as trees, and the shape of one serialized message: what the type leaves open, read off its bytes.
 
-Laws: XCDR1 as ROS 2 writes it (alignment counts from behind the 4-byte encapsulation header; an empty sequence has no
-padding before its elements); a payload that is not exactly such a message, up to 3 bytes behind it, has no shape, which
-is no error; nothing here trusts a length before checking it against the bytes at hand.
+Invariants: XCDR1 as ROS 2 writes it (alignment counts from behind the 4-byte encapsulation header; an empty sequence
+has no padding before its elements); a payload that is not exactly such a message, up to 3 bytes behind it, has no
+shape, which is no error; nothing here trusts a length before checking it against the bytes at hand.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Dictionaries learned from messages.
 
-Law: deterministic: the same messages in the same order give the same dictionary, byte for byte.
+Invariant: deterministic: the same messages in the same order give the same dictionary, byte for byte.
 """
 
 from __future__ import annotations
@@ -9,23 +9,23 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from gr_ros2.compression.ballast import Words, numbered
+from gr_ros2.compression.ans import Table
 from gr_ros2.compression.dictionary import OWN, Dictionary, TypeEntry
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.floats import (
     CLASSES,
     DEFAULT_CLASS,
-    Constants,
+    KnownNumbers,
     class_table,
     push_double,
     push_quaternion,
     push_single,
 )
-from gr_ros2.compression.frames import Zstd, train
-from gr_ros2.compression.number import Table
-from gr_ros2.compression.plan import DOUBLE, LONG_TEXT, MATRIX, QUATERNION, SINGLE, STRING, Layout
+from gr_ros2.compression.layout import DOUBLE, LONG_TEXT, MATRIX, QUATERNION, SINGLE, STRING, Layout
 from gr_ros2.compression.prepared import Model
 from gr_ros2.compression.schema import BIG, Composite, Types
+from gr_ros2.compression.static_values import Words, numbered
+from gr_ros2.compression.zstd_frames import Zstd, train
 
 _T = TypeVar("_T")
 
@@ -33,7 +33,7 @@ MAX_SAMPLES = 1000
 """Messages of a type that are looked at, evenly spread."""
 MAX_WORDS, MAX_CONSTANTS, MAX_TEMPLATES = 1000, 250, 15
 _COMMON = 0.02
-"""A constant or ballast is worth a place from this share of a type's messages on."""
+"""A constant or a set of static values is worth a place from this share of a type's messages on."""
 _VALUES_PER_CLASS = 150
 
 
@@ -63,7 +63,7 @@ def learn(
     seen = {type_name: _Seen(types.tree(type_name), payloads) for type_name, payloads in sorted(by_type.items())}
     words = _ranked([item.words for item in seen.values()], base.words if base else (), MAX_WORDS)
     constants = _ranked([item.constants for item in seen.values()], base.constants if base else (), MAX_CONSTANTS)
-    model = Model(Words([word.encode() + b"\0" for word in words]), Constants(constants), {})
+    model = Model(Words([word.encode() + b"\0" for word in words]), KnownNumbers(constants), {})
     entries = {
         type_name: TypeEntry(
             item.classes(model.constants),
@@ -86,7 +86,7 @@ class _Seen:
         self.constants: Counter[int] = Counter()
         self.normalised = list(payloads)
         self._samples: dict[str, tuple[int, list[Any]]] = {}
-        codec = _codec(tree, Model(Words(()), Constants(()), {}))
+        codec = _codec(tree, Model(Words(()), KnownNumbers(()), {}))
         for n, payload in enumerate(payloads):
             found = codec.layout(payload) if codec is not None else None
             if found is not None:
@@ -102,7 +102,7 @@ class _Seen:
         values, reals = layout.unpack(payload), layout.unpack_reals(payload)
         little = layout.shape.order != BIG
         constants: set[int] = set()
-        for slot in layout.outline.ballast:
+        for slot in layout.outline.static_values:
             value = values[slot.index]
             if slot.kind == STRING and 0 < len(value) <= LONG_TEXT and value[-1] == 0:
                 if numbered(value):
@@ -126,7 +126,7 @@ class _Seen:
         for bits in constants - {0}:
             self.constants[bits] += 1
 
-    def classes(self, constants: Constants) -> dict[str, str]:
+    def classes(self, constants: KnownNumbers) -> dict[str, str]:
         """The letter of each field for which the default is not the best."""
         found: dict[str, str] = {}
         for path, (kind, samples) in self._samples.items():
@@ -135,11 +135,11 @@ class _Seen:
         return {path: letter for path, letter in sorted(found.items()) if letter != DEFAULT_CLASS}
 
     def templates(self, model: Model) -> tuple[tuple[tuple[int, ...], int], ...]:
-        """The most frequent ballasts."""
+        """The most frequent sets of static values."""
         codec = _codec(self._tree, model)
         if codec is None:
             return ()
-        counts = Counter(found for payload in self._payloads if (found := codec.ballast(payload)) is not None)
+        counts = Counter(found for payload in self._payloads if (found := codec.static_values(payload)) is not None)
         common = [item for item, count in counts.most_common(MAX_TEMPLATES) if count > _COMMON * len(self._payloads)]
         return tuple(common)
 
@@ -148,7 +148,7 @@ def _codec(tree: Composite | None, model: Model) -> FieldsCodec | None:
     return None if tree is None else FieldsCodec(tree, model, Zstd())
 
 
-def _bits(kind: int, samples: Sequence[Any], table: Table, constants: Constants) -> int:
+def _bits(kind: int, samples: Sequence[Any], table: Table, constants: KnownNumbers) -> int:
     """What the numbers of a field cost with a class, bits."""
     x = 1
     for bits, reals in samples[:: max(1, len(samples) // _VALUES_PER_CLASS)]:

@@ -1,7 +1,7 @@
 """What a dashboard knows of one link: fed by the events of both ends, asked for a snapshot now and then. Sans-IO.
 
-Laws: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock of
-the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
+Invariants: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock
+of the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
 Counts are exact while it runs; once the result is in, every number is the result's.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
-from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
+from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
@@ -29,7 +29,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -65,17 +65,17 @@ class _Topic:
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.age = AgeMeter()
         self.read_position = read_position
-        self.belief = Belief(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
+        self.belief = PathComparison(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
 
     def rows(self) -> dict[str, int]:
         """What the events alone say: who sees both ends asks the ledger instead."""
-        rows = {row: count for row, count in {Row.DELIVERED.value: self.delivered, **self.ended}.items() if count}
+        rows = {row: count for row, count in {LedgerRow.DELIVERED.value: self.delivered, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
-        return {**rows, Row.IN_FLIGHT.value: rest} if rest > 0 else rows
+        return {**rows, LedgerRow.IN_FLIGHT.value: rest} if rest > 0 else rows
 
 
-class _Source:
+class _SourceWindow:
     """One sender."""
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ class DashboardState:
         self._ledger = ledger
         self._history = int(HISTORY_S / tick_s)
         self._start: float | None = None
-        self._sources: dict[int, _Source] = {}
+        self._sources: dict[int, _SourceWindow] = {}
         self._topics: dict[Key, _Topic] = {}
         self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
@@ -131,7 +131,7 @@ class DashboardState:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """What the sender with this source id reports."""
         with self._lock:
-            source = self._sources.setdefault(src_id, _Source())
+            source = self._sources.setdefault(src_id, _SourceWindow())
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
                 self._packets_sent.add(event.now)
@@ -142,7 +142,7 @@ class DashboardState:
             elif isinstance(event, Missed):
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
-                topic.ended[Row.LOST_ON_GRAPH.value] += event.count
+                topic.ended[LedgerRow.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
 
@@ -243,7 +243,9 @@ class DashboardState:
         # What the ledger knows wins: it has heard every event, also those from before there was a state.
         rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
         sent, delivered = (
-            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(Row.DELIVERED, 0))
+            (topic.sent, topic.delivered)
+            if self._ledger is None
+            else (sum(rows.values()), rows.get(LedgerRow.DELIVERED, 0))
         )
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
@@ -314,7 +316,7 @@ class DashboardState:
             topic = self._topics[key] = _Topic(read, self._history)
         return topic
 
-    def _accepted(self, source: _Source, src_id: int, event: Accepted) -> None:
+    def _accepted(self, source: _SourceWindow, src_id: int, event: Accepted) -> None:
         self._begin(event.now)
         topic = self._topic((src_id, event.topic_id))
         topic.sent += 1
@@ -326,7 +328,7 @@ class DashboardState:
             if point is not None:
                 topic.belief.moved(event.now, point)
 
-    def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
+    def _refused(self, source: _SourceWindow, src_id: int, event: Refused) -> None:
         topic = self._topic((src_id, event.topic_id))
         topic.ended[str(event.reason)] += 1
         message = source.messages.get(event.serial)

@@ -1,7 +1,7 @@
 """What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
 
-Law: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever; every
-block of this process is checked against every other when it is made.
+Invariant: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever;
+every block of this process is checked against every other when it is made.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry
 from gr_ros2.wire import BROADCAST

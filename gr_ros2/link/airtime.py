@@ -1,6 +1,6 @@
 """When packets have the air: one after the other, each for its airtime, and when the next may be asked for.
 
-Laws: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
+Invariants: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
 airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air
 is free of all that is here or promised (credits not yet used), and while fewer than ``OUTSTANDING`` packets are. No
 IO, no clock: ``now`` is seconds, monotonic.

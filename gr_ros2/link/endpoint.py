@@ -1,8 +1,8 @@
 """One robot's end of a link: messages and packets in, packets and events out.
 
-An end sends and receives, so that what it hears may change what it sends. Laws: as everywhere in ``link``, time is an
-argument and never goes back; nothing happens but in a call; what the sending half does is told to its observer while
-it happens, what the receiving half does is returned, for the caller to act on before others hear of it.
+An end sends and receives, so that what it hears may change what it sends. Invariants: as everywhere in ``link``, time
+is an argument and never goes back; nothing happens but in a call; what the sending half does is told to its observer
+while it happens, what the receiving half does is returned, for the caller to act on before others hear of it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Protocol
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.receiver import Receiver, ReceiverStats
 from gr_ros2.link.sender import Sender, SenderStats
 from gr_ros2.registry import Registry

@@ -44,9 +44,9 @@ class Delivered:
 class Lost:
     """A message of which at least one fragment came will never be complete.
 
-    ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
-    outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
-    or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
+    ``reason`` is a :class:`gr_ros2.link.ledger_rows.LedgerRow`: ``lost_fragments`` (overtaken, contradicted, or behind
+    an outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or
+    E); or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int

@@ -1,9 +1,9 @@
 """How a message is cut into fragments (the paper, section 5.2), at fixed lengths or to fit what room there is.
 
-Laws: the number of fragments of a message is fixed when its first one is sent, since every entry carries ``total``;
-fragments are taken in order and together are the message. Version 0 gives each entry its own length, so only the
-paper's policy makes them equal (all but the last); a flexible cut may make each as long as the room found, as long as
-what remains can still go in the entries that remain, at most ``cut`` bytes each and at least one.
+Invariants: the number of fragments of a message is fixed when its first one is sent, since every entry carries
+``total``; fragments are taken in order and together are the message. Version 0 gives each entry its own length, so only
+the paper's policy makes them equal (all but the last); a flexible cut may make each as long as the room found, as long
+as what remains can still go in the entries that remain, at most ``cut`` bytes each and at least one.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ room it needs there, of which ``reserve`` bytes stay free for a message of class
 *Cuts.* A fragment takes the room there is. ``total`` is fixed at the first one, so it leaves slack: what remains of a
 message never needs fragments of more than ``cut`` bytes, with ``cut`` below a packet's room by that reserve.
 
-Laws: a message of class latency that waits alone in its class has an entry in the next packet; a topic that always
-has something waiting gets a turn within TURN times the number of topics, and a message needs no more turns than it
-has fragments, at most 1 + ceil(size / cut): nothing starves.
+Invariants: a message of class latency that waits alone in its class has an entry in the next packet; a topic that
+always has something waiting gets a turn within TURN times the number of topics, and a message needs no more turns than
+it has fragments, at most 1 + ceil(size / cut): nothing starves.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Packets the channel loses whole: at random, in bursts, and while the link is unplugged.
 
-Laws: equal seeds give equal losses for the same order of packets; every packet draws the same number of random
+Invariants: equal seeds give equal losses for the same order of packets; every packet draws the same number of random
 values, so that a change of one setting does not shift what the seed does later; each loss is counted under the name
 of the setting that caused it.
 """

@@ -1,9 +1,9 @@
 """Who observes a link, and cannot harm it.
 
-Laws: an observer hears every event in order until its first exception, which ends it alone
+Invariants: an observer hears every event in order until its first exception, which ends it alone
 (:class:`gr_ros2.guard.Guard`): the link and the other observers go on. It is called in the thread of the event: one
 that may be slow gets its events through a bounded queue from who attaches it
-(``gr_ros2.run.watch.Onlookers``).
+(``gr_ros2.run.observers.RunObservers``).
 """
 
 from __future__ import annotations

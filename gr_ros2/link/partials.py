@@ -1,7 +1,7 @@
 """The incomplete messages of all sources: the one place that holds them, knows their order and counts their bytes.
 
-Laws: a message is here from its first fragment until it is completed or taken off, and then nowhere; ``size`` is the
-sum over all that are here; the order is that of their last new fragment, the longest ago first.
+Invariants: a message is here from its first fragment until it is completed or taken off, and then nowhere; ``size`` is
+the sum over all that are here; the order is that of their last new fragment, the longest ago first.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What waits at the source, topic by topic, and which of it is dropped: whole messages, never fragments.
 
-Laws: a message under way stands first and no newer one pushes it out; every message dropped is handed back with the
-ledger row it ends in. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest, when full),
-``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
+Invariants: a message under way stands first and no newer one pushes it out; every message dropped is handed back with
+the ledger row it ends in. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest, when
+full), ``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
 ``abandoned`` (under way, and the same).
 """
 
@@ -15,7 +15,7 @@ from math import inf
 
 from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Dropped:
     """A message that will not be sent: its ledger row, and why in words."""
 
     message: Outgoing
-    row: Row
+    row: LedgerRow
     detail: str
 
 
@@ -65,11 +65,11 @@ class TopicQueue(deque[Outgoing]):
         dropped: list[Dropped] = []
         if self.policy == "latest":
             while self and not self[-1].started:
-                dropped.append(Dropped(self.pop(), Row.SUPERSEDED, "a newer message came before it could start"))
+                dropped.append(Dropped(self.pop(), LedgerRow.SUPERSEDED, "a newer message came before it could start"))
         elif depth and len(self) >= depth:
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
-                dropped.append(Dropped(victim, Row.QUEUE_BOUND, f"{depth} messages were waiting"))
+                dropped.append(Dropped(victim, LedgerRow.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
         self.append(message)
         return dropped
@@ -111,13 +111,13 @@ class TopicQueue(deque[Outgoing]):
     def _expiry(self, message: Outgoing) -> float:
         return message.submitted + self.deadline_s if self.deadline_s else inf
 
-    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[Row, str]:
+    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[LedgerRow, str]:
         limit = f"{self.deadline_s * 1e3:g} ms"
         if message.started:
-            return Row.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
+            return LedgerRow.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:
-            return Row.STALE, f"it waited longer than {limit}"
-        return Row.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
+            return LedgerRow.STALE, f"it waited longer than {limit}"
+        return LedgerRow.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
 def queue_for(

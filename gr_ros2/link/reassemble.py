@@ -15,7 +15,7 @@ paper's) repeats itself soon. What protects a message, besides its id:
   another order, and two messages under one id, are refused.
 - *Reset* (see ``sequence``): a restart or outage seen in the packet numbers ends everything held of the source.
 
-Laws: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
+Invariants: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
 """
 
 from __future__ import annotations

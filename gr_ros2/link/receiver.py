@@ -1,7 +1,7 @@
 """The receiving engine: bytes from the PHY in, messages out.
 
-Laws: nothing but the bytes is trusted; ``receive`` never raises whatever the bytes; everything dropped is counted by
-name; memory is bounded per source and in all; time is an argument and never goes back.
+Invariants: nothing but the bytes is trusted; ``receive`` never raises whatever the bytes; everything dropped is counted
+by name; memory is bounded per source and in all; time is an argument and never goes back.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
@@ -98,7 +98,7 @@ class Receiver:
         """Give up what has waited ``reassembly_timeout`` for its next fragment."""
         events: list[ReceiverEvent] = []
         while (at := self.next_timeout()) is not None and at <= now:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.EXPIRED))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.EXPIRED))
         return events
 
     def next_timeout(self) -> float | None:
@@ -112,8 +112,8 @@ class Receiver:
         source = self._sources.get(event.src_id)
         if source is not None and source.latched.get(event.topic_id) == event.payload:
             del source.latched[event.topic_id]
-        self.stats.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
+        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
         """Whether a sender has a place at present."""
@@ -162,7 +162,7 @@ class Receiver:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 for topic in source.topics.values():
-                    events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in topic.reset()]
+                    events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in topic.reset()]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
@@ -177,20 +177,20 @@ class Receiver:
             message, ended = reassembler.accept(entry, context)
             self.stats.message_loss_est += reassembler.missed_ids - missed
             if ended:
-                events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in ended]
+                events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in ended]
             if message is not None:
                 events += self._deliver(source, packet, entry.topic_id, entry.entry_id, message)
         source.epoch += placed.arrival is Arrival.LATE
         while self._partials.size_of(src_id) > self.config.max_source_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), Row.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), LedgerRow.MEMORY))
         while self._partials.size > self.config.max_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.MEMORY))
 
     def _deliver(
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
-            return [self._undone(packet, topic_id, entry_id, Row.UNSUPPORTED)]
+            return [self._undone(packet, topic_id, entry_id, LedgerRow.UNSUPPORTED)]
         if packet.compressed and self._codec is not None:
             try:
                 payload = self._codec.decode(topic_id, payload)
@@ -204,12 +204,12 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: Row) -> Lost:
+    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
         """Book a message that came whole, but cannot be read here."""
         self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
-    def _given_up(self, partial: Partial, row: Row) -> Lost:
+    def _given_up(self, partial: Partial, row: LedgerRow) -> Lost:
         """Book an incomplete message that is held no longer."""
         self.stats.lost[partial.src_id, partial.topic_id, row.value] += 1
         self.stats.message_loss_est += 1

@@ -1,7 +1,7 @@
 """Which fragments go into the next packet: what a policy is, and the paper's (section 5.2); ``freshness`` is the other.
 
-Law: a scheduler plans, and changes nothing but its own order of topics and the still open cut of waiting messages; the
-sender carries the last plan out or asks for another.
+Invariant: a scheduler plans, and changes nothing but its own order of topics and the still open cut of waiting
+messages; the sender carries the last plan out or asks for another.
 """
 
 from __future__ import annotations

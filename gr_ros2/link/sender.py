@@ -1,6 +1,6 @@
 """The sending engine: messages in, packets out.
 
-Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
+Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
 has them); a message whose first fragment has left is dropped only when its deadline cannot be met any more; packets
 come out only when the pace (rate or credit) allows; a packet is composed when it is asked for, never before; time is
 an argument and never goes back.
@@ -18,10 +18,10 @@ from typing import Any
 from gr_ros2.config import QueuePolicy, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.registry import Registry, Topic
@@ -120,7 +120,7 @@ class Sender:
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
-            self._refuse(serial, topic_id, Row.TOO_LARGE, self._too_large(len(payload)))
+            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
             return
         topic = self.registry[topic_id]
         options = topic.options
@@ -371,7 +371,7 @@ class Sender:
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
         return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
 
-    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))
 

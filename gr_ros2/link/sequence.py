@@ -1,7 +1,7 @@
 """Sequence numbers of one source: their order, their gaps, and the signs that a new sender counts from elsewhere.
 
-Laws: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only a few bits;
-after a reset positions start so far ahead that nothing earlier compares as near.
+Invariants: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only a few
+bits; after a reset positions start so far ahead that nothing earlier compares as near.
 """
 
 from __future__ import annotations

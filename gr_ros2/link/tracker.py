@@ -1,7 +1,7 @@
 """Which delivery is of which message: what a sender reports joined with what comes out at the other end.
 
-Laws: a message is found by its key where the engine's key still means it, otherwise by its bytes; a repeat is of the
-message that it repeats; what is closed is forgotten. Memory holds a digest of each open message, and no payload.
+Invariants: a message is found by its key where the engine's key still means it, otherwise by its bytes; a repeat is of
+the message that it repeats; what is closed is forgotten. Memory holds a digest of each open message, and no payload.
 """
 
 from __future__ import annotations

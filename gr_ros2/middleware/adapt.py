@@ -1,6 +1,7 @@
 """How a subscription adapts to the publishers found (DESIGN, QoS): what DDS matches, and when to join anew.
 
-Law: pure bookkeeping over what discovery reports and what is received; nothing here knows a DDS, a thread or a clock.
+Invariant: pure bookkeeping over what discovery reports and what is received; nothing here knows a DDS, a thread or a
+clock.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """ROS 2 bags (MCAP and sqlite3) as a source and as a sink.
 
-Law: a bag being read is a finite graph of publishers: one thread plays the topics subscribed before ``start()`` in
-recorded order, held back by callbacks that block. A bag being written is a graph of one subscriber that takes all.
+Invariant: a bag being read is a finite graph of publishers: one thread plays the topics subscribed before ``start()``
+in recorded order, held back by callbacks that block. A bag being written is a graph of one subscriber that takes all.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """What stands in a ROS 2 bag, MCAP or sqlite3: a folder with metadata.yaml, or a bare storage file.
 
-Laws: reading changes nothing, and whatever is wrong with a file is a BagError in one line that names it. The files say
-what is in a bag; metadata.yaml says which files, and what was expected in them. A topic is given whole, under its
-absolute name and with one type and definition, or it is left out with the reason; messages are counted, and fewer than
-the file's own index has are an error.
+Invariants: reading changes nothing, and whatever is wrong with a file is a BagError in one line that names it. The
+files say what is in a bag; metadata.yaml says which files, and what was expected in them. A topic is given whole, under
+its absolute name and with one type and definition, or it is left out with the reason; messages are counted, and fewer
+than the file's own index has are an error.
 """
 
 from __future__ import annotations

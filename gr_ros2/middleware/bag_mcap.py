@@ -1,7 +1,8 @@
 """MCAP as ROS 2 bags have it: written with both times of a message, read whatever its index has.
 
-Laws: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags alone
-writes the first one into both. A message is read although no index leads to it; a schema in no language of ROS is none.
+Invariants: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags
+alone writes the first one into both. A message is read although no index leads to it; a schema in no language of ROS is
+none.
 """
 
 from __future__ import annotations

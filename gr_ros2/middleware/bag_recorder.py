@@ -1,8 +1,8 @@
 """Writes one ROS 2 bag.
 
-Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk, or leaves out a message and
-counts it, only when ``BACKLOG`` messages are behind; after an error nothing more is written, what comes is counted,
-and every call tells the error.
+Invariants: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk, or leaves out a
+message and counts it, only when ``BACKLOG`` messages are behind; after an error nothing more is written, what comes is
+counted, and every call tells the error.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The sqlite3 files of ROS 2 bags, of all versions of their schema, and as a crash leaves them.
 
-Laws: reading changes nothing, neither the file nor its folder; what SQLite keeps beside the file (the write-ahead log
-of a writer that never closed) is part of it, and where it cannot be taken into account the file is refused.
+Invariants: reading changes nothing, neither the file nor its folder; what SQLite keeps beside the file (the write-ahead
+log of a writer that never closed) is part of it, and where it cannot be taken into account the file is refused.
 Sources: https://www.sqlite.org/wal.html, sections 5 and 8 (read-only databases, heap memory instead of a -shm file);
 https://www.sqlite.org/lockingv3.html, section 4.2 (hot journals).
 """

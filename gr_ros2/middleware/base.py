@@ -1,6 +1,6 @@
 """The one interface between the adapter and any ROS graph: serialized bytes in, serialized bytes out.
 
-Laws: payloads are whole CDR messages including the 4-byte encapsulation header and are never looked into;
+Invariants: payloads are whole CDR messages including the 4-byte encapsulation header and are never looked into;
 callbacks run in a thread of the back-end and must not block it for long, except that a back-end which plays
 recorded data at link speed is meant to be held back by a blocking callback; ``close`` is idempotent, and no
 callback runs after it has returned.

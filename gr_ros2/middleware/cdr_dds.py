@@ -4,8 +4,9 @@ A topic is declared with a descriptor of one octet. The library keeps what follo
 type passes as opaque bytes, under whatever type name the topic carries. Most functions used are the library's
 documented C API (dds.h); those of the serdata family are not, and the layouts here are those of version 11.0.
 
-Laws: entities are plain integers and every function may be called from any thread; calls release the GIL; whatever
-the library refuses is a DdsError that names call and code. An entity deleted elsewhere makes calls fail, never crash.
+Invariants: entities are plain integers and every function may be called from any thread; calls release the GIL;
+whatever the library refuses is a DdsError that names call and code. An entity deleted elsewhere makes calls fail, never
+crash.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The embedded middleware: a DDS participant of our own, visible to and usable by ROS 2 nodes, without a ROS install.
 
-Laws: one thread per participant receives, discovers and calls back; its tables are guarded by one lock, never held
-while calling back or waiting.
+Invariants: one thread per participant receives, discovers and calls back; its tables are guarded by one lock, never
+held while calling back or waiting.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Which DDS domains this process has open, and whom they look for.
 
-Law: a domain is configured once, by whoever opens it first, and is shared by all participants of the process; one
+Invariant: a domain is configured once, by whoever opens it first, and is shared by all participants of the process; one
 that would need another configuration is refused instead of silently leaving or not leaving the machine.
 Source of what the discovery ranges mean: rmw_cyclonedds and rcl of Jazzy.
 """

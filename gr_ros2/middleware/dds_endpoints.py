@@ -1,9 +1,9 @@
 """Publishers and subscriptions of the embedded DDS.
 
-Laws: a subscription whose reliability or durability is left open asks only for what all publishers found offer, and
-changes readers when that changes: the old reader stays for ``OVERLAP_S`` while the new one is being found, what both
-receive is delivered once, and never a message after a later one of its publisher. A subscription's lock is taken before
-its participant's, never after.
+Invariants: a subscription whose reliability or durability is left open asks only for what all publishers found offer,
+and changes readers when that changes: the old reader stays for ``OVERLAP_S`` while the new one is being found, what
+both receive is delivered once, and never a message after a later one of its publisher. A subscription's lock is taken
+before its participant's, never after.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Where the C library of Cyclone DDS is: inside PyPI's cyclonedds 11.0, or inside our own wheel.
 
-Law: the Python part of that package is not imported. There is none for Python 3.14, while the C library serves every
-Python; for those that PyPI has no cyclonedds for, setup.py puts the library beside this module.
+Invariant: the Python part of that package is not imported. There is none for Python 3.14, while the C library serves
+every Python; for those that PyPI has no cyclonedds for, setup.py puts the library beside this module.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How most back-ends call back: one thread per participant, and a queue of bounded depth per subscription.
 
-Laws: everything that is called back runs in the participant's thread, one step after the other; of a full queue the
-oldest message goes, and is counted; no step begins once ``close`` was called.
+Invariants: everything that is called back runs in the participant's thread, one step after the other; of a full queue
+the oldest message goes, and is counted; no step begins once ``close`` was called.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A ROS graph inside one process: what tests use where a DDS would only add noise.
 
-Laws: participants with the same domain id share a graph and behave as DDS has it: history depth, late joiners of
+Invariants: participants with the same domain id share a graph and behave as DDS has it: history depth, late joiners of
 transient-local publishers, requested against offered QoS; each participant calls back from one thread of its own,
 in the order of publication. Unlike a DDS it counts every message that a subscription's depth pushes out.
 """

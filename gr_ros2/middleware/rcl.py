@@ -1,6 +1,6 @@
 """What rclpy leaves to its environment: how rcl is told a setting, and what its errors become.
 
-Law: nothing here imports rclpy.
+Invariant: nothing here imports rclpy.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A ROS graph through rclpy, for people with a sourced ROS 2 (Humble or later).
 
-Laws: this is the only module of the package that imports rclpy; context, node and executor are our own, so a host
+Invariants: this is the only module of the package that imports rclpy; context, node and executor are our own, so a host
 application keeps its own node, arguments and signal handlers; endpoints are destroyed, and callbacks run, in the
 executor's thread only, hence a subscription is silent once ``close`` has returned; no exception of a callback or of
 rclpy ends that thread, each is counted and its first logged.

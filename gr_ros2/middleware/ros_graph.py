@@ -1,6 +1,6 @@
 """How ROS 2 names appear on DDS, and what a participant says to be listed as a ROS node.
 
-Laws: pure functions of their arguments and, where said, of the environment; nothing here touches a DDS.
+Invariants: pure functions of their arguments and, where said, of the environment; nothing here touches a DDS.
 Sources: the ROS 2 design articles "Topic and Service name mapping to DDS" and "Node to Participant mapping";
 rmw_dds_common/msg/ParticipantEntitiesInfo of Humble (24-byte Gid) and of Iron (16-byte Gid).
 """

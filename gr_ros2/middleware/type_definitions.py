@@ -1,8 +1,8 @@
 """Message definitions, for those places that want more than bytes: bags and type hashes.
 
-Laws: a type that is not known is no error anywhere; it has no definition, and its bytes pass all the same. A definition
-that came with the messages counts, also where ROS ships another one of that name: types grow from one distribution to
-the next.
+Invariants: a type that is not known is no error anywhere; it has no definition, and its bytes pass all the same. A
+definition that came with the messages counts, also where ROS ships another one of that name: types grow from one
+distribution to the next.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A ROS graph through Zenoh, as nodes with rmw_zenoh see it. Experimental until it has met a real rmw_zenoh.
 
-Laws: one thread per participant calls back, in the order of arrival; the tables are guarded by one lock, never held
-while calling back or while calling Zenoh, whose own threads take it; a message beyond a subscription's depth, and one
-whose number never came, is counted.
+Invariants: one thread per participant calls back, in the order of arrival; the tables are guarded by one lock, never
+held while calling back or while calling Zenoh, whose own threads take it; a message beyond a subscription's depth, and
+one whose number never came, is counted.
 
 Zenoh has no incompatible QoS: every publisher matches every subscription, and a subscription that adapts asks for what
 the publishers keep. Like rmw_zenoh it needs a router (``ros2 run rmw_zenoh_cpp rmw_zenohd``, or ``zenohd``).

@@ -1,6 +1,6 @@
 """How a ROS graph appears on Zenoh: the key expressions, attachments and liveliness tokens of rmw_zenoh.
 
-Laws: pure functions of their arguments; what another program wrote and does not parse is None, never an error.
+Invariants: pure functions of their arguments; what another program wrote and does not parse is None, never an error.
 Source: the design document and sources of rmw_zenoh_cpp, as of its releases for Humble, Jazzy and later.
 """
 

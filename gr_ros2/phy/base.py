@@ -2,7 +2,7 @@
 
 A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
 and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
-on the message port itself. Law: one packet takes the same number of samples always (fixed packet_len).
+on the message port itself. Invariant: one packet takes the same number of samples always (fixed packet_len).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Samples = npt.NDArray[np.complex64]
 class PacketTransmitter(Protocol):
     """A GNU Radio block: message port `pdus` in, one complex stream out.
 
-    :class:`gr_ros2.phy.flowgraph.Transmitter` is the base of ours.
+    :class:`gr_ros2.phy.flowgraph.TransmitterBlock` is the base of ours.
     """
 
     @property
@@ -48,7 +48,7 @@ class SymbolSource(Protocol):
 class PacketReceiver(Protocol):
     """A GNU Radio block: one complex stream in, message port `pdus` out.
 
-    :class:`gr_ros2.phy.flowgraph.Receiver` is the base of ours.
+    :class:`gr_ros2.phy.flowgraph.ReceiverBlock` is the base of ours.
     """
 
     @property
@@ -154,10 +154,10 @@ class Phy(ABC):
         """
 
     @abstractmethod
-    def receiver(self, aside: bool = False) -> PacketReceiver:
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
-        :param aside: in a process of its own where it works in Python, which keeps the ROS side free; it takes a
+        :param own_process: in a process of its own where it works in Python, which keeps the ROS side free; it takes a
             second to start, and packets come a moment after the samples have passed
         :raises PhyError: for a PHY without samples
         """

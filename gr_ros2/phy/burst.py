@@ -1,8 +1,8 @@
 """Bursts of fixed length without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
 
-Laws: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet comes
-out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and the
-search goes on right behind its first sample, so that it cannot hide the next one.
+Invariants: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet
+comes out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and
+the search goes on right behind its first sample, so that it cannot hide the next one.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Constants:
+class ModemConstants:
     """What a compiled kernel has to know of a modem.
 
     :param kernel: name of the kernel
@@ -192,7 +192,7 @@ class BurstModem(ABC):
     def read(self, samples: Samples, start: int) -> Reading | None:
         """The burst whose reference sample stands at ``start``, None where there is none after all."""
 
-    def constants(self) -> Constants | None:
+    def constants(self) -> ModemConstants | None:
         """What a compiled kernel has to know to do the same; None where there is no kernel."""
         return None
 

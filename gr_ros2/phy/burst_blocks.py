@@ -1,7 +1,7 @@
 """GNU Radio shells around a burst modem: PDUs in, samples out, and back.
 
-Laws: a PDU that is not one packet of the right length is counted and dropped, never sent; each burst leaves at once,
-its gap behind it; all behaviour is in the modem.
+Invariants: a PDU that is not one packet of the right length is counted and dropped, never sent; each burst leaves at
+once, its gap behind it; all behaviour is in the modem.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.fec import CodeName
-from gr_ros2.phy.flowgraph import Receiver, Transmitter
+from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
+from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
-from gr_ros2.phy.threads import Held
+from gr_ros2.phy.threads import KeptAlive
 
 STOCK = "GNU Radio's blocks"
 """What PHYs of blocks by others run on."""
@@ -78,13 +78,13 @@ class BurstPhy(Phy):
     def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
         # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
         compiled = self.running_modem is not self.modem
-        return BurstSink(self, aside and not compiled and len(os.sched_getaffinity(0)) > 1)
+        return BurstSink(self, own_process and not compiled and len(os.sched_getaffinity(0)) > 1)
 
 
-class BurstTransmitter(Transmitter):
+class BurstTransmitter(TransmitterBlock):
     """Message port `pdus` in, complex stream out."""
 
     def __init__(self, phy: BurstPhy) -> None:
@@ -99,7 +99,7 @@ class BurstTransmitter(Transmitter):
         return self._modulator.refused
 
 
-class TakesPackets(Held):
+class TakesPackets(KeptAlive):
     """Message port `pdus` in of a Python block inside a hier block; stands before GNU Radio's class.
 
     :param packet_len: bytes of a packet; anything else is dropped and counted
@@ -160,12 +160,12 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         return done
 
 
-class BurstSink(Receiver):
+class BurstSink(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
-    def __init__(self, phy: BurstPhy, aside: bool) -> None:
+    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx")
-        self._demodulator = _Demodulator(phy, aside)
+        self._demodulator = _Demodulator(phy, own_process)
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)
         else:
@@ -187,13 +187,13 @@ class BurstSink(Receiver):
         return SymbolTap(self._demodulator.points)
 
 
-class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
+class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Filtered samples in, message port `pdus` out."""
 
-    def __init__(self, phy: BurstPhy, aside: bool) -> None:
+    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
         self._modem = phy.running_modem
-        self._aside = aside
+        self._own_process = own_process
         self._engine: BurstReceiver | ReceiverProcess | None = None
         self._damaged = 0
         self._failed = False
@@ -215,7 +215,7 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         return np.empty(0, np.complex64) if engine is None else engine.points
 
     def start(self) -> bool:
-        self._engine = ReceiverProcess(self._modem, self._publish) if self._aside else BurstReceiver(self._modem)
+        self._engine = ReceiverProcess(self._modem, self._publish) if self._own_process else BurstReceiver(self._modem)
         return super().start()
 
     def stop(self) -> bool:

@@ -1,7 +1,7 @@
 """The simulated channel as GNU Radio blocks: fading, taps, offsets and noise on the samples, losses on the packets.
 
-Laws: noise is set from the mean power of a burst as it arrives, so `snr_db` means the same for every PHY; tags stop
-here (a transmitter's length tag would otherwise overrule the header the receiver parses); equal seeds give equal
+Invariants: noise is set from the mean power of a burst as it arrives, so `snr_db` means the same for every PHY; tags
+stop here (a transmitter's length tag would otherwise overrule the header the receiver parses); equal seeds give equal
 noise, fading and losses; every packet lost here is counted. Fading moves on with the samples, which flow while
 something is on the air.
 """
@@ -19,12 +19,12 @@ from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import ThreadState
 
 _SINUSOIDS = 16
 """Of which a fading tap is the sum; GNU Radio's manual recommends 8 or more."""
 _FADING_SEEDS = 1009
-"""Apart, so that neighbouring seeds share no tap: GNU Radio seeds the taps seed, seed + 1, ..."""
+"""ThreadedObserver, so that neighbouring seeds share no tap: GNU Radio seeds the taps seed, seed + 1, ..."""
 _LARGEST_SEED = 2**31 - 1
 
 
@@ -106,7 +106,7 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         self.epoch = time.monotonic()
         """s, monotonic: when the run began; outages count from here."""
         self.received = 0
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.set_msg_handler(PDUS, self._pass)
@@ -122,11 +122,11 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self.epoch = time.monotonic()
-        self._block_thread.keep()
+        self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def _pass(self, pdu: Any) -> None:

@@ -1,7 +1,7 @@
 """Forward error correction of a frame's bits, by GNU Radio's FEC objects, called without its scheduler.
 
-Laws: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a 1;
-what a code sends is spread over the whole frame, so that a fade takes a little of everything; a code only guesses,
+Invariants: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a
+1; what a code sends is spread over the whole frame, so that a fade takes a little of everything; a code only guesses,
 whether a frame is right its CRC says.
 """
 

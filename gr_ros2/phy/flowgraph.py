@@ -1,6 +1,6 @@
 """Flowgraphs and hier blocks that begin and end cleanly.
 
-Laws: after a flowgraph's ``stop`` none of its threads runs, whatever state it was in; after a hier block's
+Invariants: after a flowgraph's ``stop`` none of its threads runs, whatever state it was in; after a hier block's
 ``release`` nothing holds it, its blocks or their buffers but who made it.
 """
 
@@ -15,7 +15,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import SymbolSource
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.threads import start_flowgraph
 
 _Self = TypeVar("_Self", bound="Flowgraph")
 
@@ -39,7 +39,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
         """
         self._running = True
         try:
-            begin(partial(super().start, max_noutput_items))
+            start_flowgraph(partial(super().start, max_noutput_items))
         except PhyError as error:
             self.stop()
             raise PhyError(f"{self._called}: {error}") from error
@@ -89,7 +89,7 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
         self.disconnect_all()
 
 
-class Transmitter(HierBlock):
+class TransmitterBlock(HierBlock):
     """Message port `pdus` in, complex stream out: as many samples for every packet.
 
     :param name: in GNU Radio's log
@@ -120,7 +120,7 @@ class Transmitter(HierBlock):
             return 0
 
 
-class Receiver(HierBlock):
+class ReceiverBlock(HierBlock):
     """Complex stream in, message port `pdus` out. What it does not tell of packets has no number.
 
     :param name: in GNU Radio's log

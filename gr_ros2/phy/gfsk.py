@@ -1,6 +1,6 @@
 """The `gfsk` PHY: binary frequency-shift keying, Gaussian pulses, modulation index 1/2 (GMSK), constant envelope.
 
-Law: what is sent is what GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher frequency), so a
+Invariant: what is sent is what GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher frequency), so a
 discriminator can receive it too; this receiver does not use one. At modulation index 1/2 the signal is, but for a few
 percent of its energy, a sequence of overlapping pulses whose phase steps by a quarter turn, forwards or back (Laurent,
 IEEE Trans. Commun. 34-2, 1986): it is received coherently, about 4 dB better than by a discriminator behind a filter.

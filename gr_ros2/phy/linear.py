@@ -1,7 +1,7 @@
 """Single-carrier bursts: phase-shift keying with a known preamble, synchronised feed-forward.
 
-Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is one
-only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
+Invariants: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is
+one only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
 preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before.
 """
 
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Frame, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.soft import Points, spread_about
@@ -33,7 +33,7 @@ _ALIKE = 0.28
 """Share of the preamble's power in a single carrier, from which on it is one: a burst that can be read has 0.3, noise
 once in several 10^6 samples."""
 _RISE = 16
-"""Symbols before its summit at which the correlation of a strong burst may pass the threshold."""
+"""Symbols before its parabola_peak at which the correlation of a strong burst may pass the threshold."""
 _CHUNK = 256
 """Symbols between two looks at the timing: clocks may differ by 100 ppm."""
 _BLOCK = 64
@@ -188,7 +188,9 @@ class LinearModem(BurstModem):
             known_at, known = float(symbols[-1]), float(drift[-1])
             if first + count < self.payload_symbols:
                 model = turned * np.exp(-1j * drift) * self.constellation.nearest(straight).conj()
-                late += summit(*(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1)))
+                late += parabola_peak(
+                    *(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1))
+                )
         decided = self.constellation.nearest(points)
         gain, noise = spread_about(points, decided)
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
@@ -208,7 +210,7 @@ class LinearModem(BurstModem):
         before = np.concatenate(([certain], soft[:-1]))
         return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         bits = self.constellation.bits
         before = self.before_payload
         values = {
@@ -235,7 +237,7 @@ class LinearModem(BurstModem):
             "points": self.constellation.points,
             "marks": self.constellation.marks,
         }
-        return Constants("linear", values, self.payload_symbols * bits, self.payload_symbols)
+        return ModemConstants("linear", values, self.payload_symbols * bits, self.payload_symbols)
 
     def _measure(self, samples: Samples, start: int) -> tuple[float, float, float]:
         """Carrier frequency and phase from the preamble, in radians per symbol and radians, and SNR.
@@ -252,7 +254,7 @@ class LinearModem(BurstModem):
         symbols = samples[start : start + PREAMBLE * self.sps : self.sps] * self._known.conj()
         height = np.abs(np.fft.fft(symbols, size))
         peak = int(np.argmax(height))
-        place = peak + summit(height[peak - 1], height[peak], height[(peak + 1) % size])
+        place = peak + parabola_peak(height[peak - 1], height[peak], height[(peak + 1) % size])
         frequency = 2 * np.pi * ((place + size / 2) % size - size / 2) / size
         power = PREAMBLE * float(np.vdot(symbols, symbols).real)
         return _Carrier(symbols, frequency, float(height[peak]) ** 2 / max(power, _TINY))
@@ -276,7 +278,7 @@ class LinearModem(BurstModem):
             abs((samples[at : at + PREAMBLE * self.sps : self.sps] * model).sum())
             for at in (start - 1, start, start + 1)
         )
-        return summit(*(float(height) for height in heights))
+        return parabola_peak(*(float(height) for height in heights))
 
 
 class LinearPhy(BurstPhy):
@@ -322,7 +324,7 @@ def _at(samples: Samples, at: float, step: int, count: int) -> NDArray[np.comple
     return total
 
 
-def summit(before: float, at: float, after: float) -> float:
+def parabola_peak(before: float, at: float, after: float) -> float:
     """Where the parabola through three neighbours is highest, -0.5..0.5 from the middle one."""
     bend = before - 2 * at + after
     return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0 else 0.0

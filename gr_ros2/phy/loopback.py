@@ -1,7 +1,7 @@
 """One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, sink.
 
-Laws: any PHY of the table goes in; one without samples skips transmitter, channel and receiver; no block stands here
-that does nothing, since each Python block costs a packet as much as source or sink do.
+Invariants: any PHY of the table goes in; one without samples skips transmitter, channel and receiver; no block stands
+here that does nothing, since each Python block costs a packet as much as source or sink do.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The `lora` PHY: chirp spread spectrum after LoRa's example, for links far below the noise.
 
-Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame of known length; the
-format is our own (it has LoRa's chirps, Gray code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no
+Invariants: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame of known length;
+the format is our own (it has LoRa's chirps, Gray code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no
 header), so it does not talk to LoRa modems. With `implementation: lora_sdr` all of this is that module's.
 """
 
@@ -17,10 +17,10 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
-from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frame, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
-from gr_ros2.phy.linear import summit
+from gr_ros2.phy.linear import parabola_peak
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 
@@ -85,7 +85,7 @@ class LoraOptions(BurstOptions):
     carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9)] | None = None
 
 
-class _Place(NamedTuple):
+class _ChirpPlace(NamedTuple):
     """Where a burst's payload begins, carrier offset in bins, and SNR."""
 
     begin: float
@@ -190,7 +190,7 @@ class LoraModem(BurstModem):
             begin += pace - _GAIN * late
         return Reading(self._collect(soft), points, snr)
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         values = {
             "chips": self.chips,
             "spreading_factor": self.spreading_factor,
@@ -214,7 +214,7 @@ class LoraModem(BurstModem):
             "tapered": self._tapered,
             "words": self._words,
         }
-        return Constants("lora", values, self.blocks * self.spreading_factor * 4, self.symbols)
+        return ModemConstants("lora", values, self.blocks * self.spreading_factor * 4, self.symbols)
 
     def _soft(self, heights: NDArray[np.float64]) -> Soft:
         """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
@@ -242,7 +242,7 @@ class LoraModem(BurstModem):
         turned = float((part * whole.conj()).imag.sum())
         return float(np.clip(turned * 6 / (np.pi * max(power, _TINY)), -0.5, 0.5))
 
-    def _place(self, samples: Samples, start: int) -> _Place | None:
+    def _place(self, samples: Samples, start: int) -> _ChirpPlace | None:
         """Look closely at a preamble; None where this is no burst."""
         windows = samples[start : start + (_HEAD + 1) * self.chips]
         windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
@@ -266,7 +266,7 @@ class LoraModem(BurstModem):
         rise = self._bin(rises)
         fall = self._bin(self._powers(windows[-_DOWN:], self._up).sum(axis=0))
         snr = self._snr(windows[:_LOOK], float(rises.max()))
-        return _Place(begin + (fall - rise) / 2, (fall + rise) / 2, snr)
+        return _ChirpPlace(begin + (fall - rise) / 2, (fall + rise) / 2, snr)
 
     def _snr(self, chirps: Samples, top: float) -> float:
         """Power of a burst over that of the noise.
@@ -287,7 +287,7 @@ class LoraModem(BurstModem):
     def _bin(self, powers: NDArray[np.float64]) -> float:
         """The strongest place of such a spectrum, in bins either side of 0."""
         top = int(np.argmax(powers))
-        place = (top + summit(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
+        place = (top + parabola_peak(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
         return (place + self.chips / 2) % self.chips - self.chips / 2
 
     def _spread(self, bits: Bits) -> NDArray[np.int64]:
@@ -441,5 +441,5 @@ class LoraPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
-        return super().receiver(aside) if self._sdr is None else SdrReceiver(self._sdr)
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
+        return super().receiver(own_process) if self._sdr is None else SdrReceiver(self._sdr)

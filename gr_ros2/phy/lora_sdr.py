@@ -1,8 +1,8 @@
 """LoRa frames by the out-of-tree module gr-lora_sdr: `implementation: lora_sdr` of the `lora` PHY.
 
-Laws: a frame is that of LoRa modems (explicit header, payload CRC-16), its payload a packet and its CRC-32; what comes
-out has the right CRC-32, so it is what went in; packets pass the module as streams of nibbles and bytes, since its
-message ports make a PMT symbol of each, which stays in memory for ever.
+Invariants: a frame is that of LoRa modems (explicit header, payload CRC-16), its payload a packet and its CRC-32; what
+comes out has the right CRC-32, so it is what went in; packets pass the module as streams of nibbles and bytes, since
+its message ports make a PMT symbol of each, which stays in memory for ever.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from gnuradio.filter import firdes
 from gr_ros2.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
 from gr_ros2.phy.burst_blocks import TakesPackets
-from gr_ros2.phy.flowgraph import Receiver, Transmitter
+from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.pdus import PDUS, pdu_of
-from gr_ros2.phy.threads import Held, keep_messages
+from gr_ros2.phy.threads import KeptAlive, lift_message_limit
 
 MAX_PAYLOAD = 255
 """Bytes; the header has 8 bits for them."""
@@ -140,13 +140,13 @@ def whitening(length: int) -> Octets:
     return out
 
 
-class SdrTransmitter(Transmitter):
+class SdrTransmitter(TransmitterBlock):
     """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
 
     def __init__(self, frame: SdrFrame) -> None:
         super().__init__("gr_ros2_lora_sdr_tx", frame.airtime_samples)
         lora = load()
-        keep_messages()
+        lift_message_limit()
         factor, rate = frame.spreading_factor, frame.coding_rate
         self._framer = _Framer(frame)
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
@@ -180,7 +180,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 
 
-class SdrReceiver(Receiver):
+class SdrReceiver(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: SdrFrame) -> None:
@@ -213,7 +213,7 @@ class SdrReceiver(Receiver):
         return self._collector.damaged
 
 
-class _Collector(Held, gr.sync_block):  # type: ignore[misc]
+class _Collector(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Bytes of frames in, message port `pdus` out."""
 
     def __init__(self, frame: SdrFrame) -> None:

@@ -1,7 +1,7 @@
 """Packets through a simulated channel, without a source, a sink or a clock: the share that arrives.
 
-Laws: what a PHY's own transmitter sends is recorded once and played to its own receiver through any number of channels;
-equal seeds give equal packets and equal noise.
+Invariants: what a PHY's own transmitter sends is recorded once and played to its own receiver through any number of
+channels; equal seeds give equal packets and equal noise.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.pdus import PDUS, pdu_of
-from gr_ros2.phy.threads import begin, finish, run_through
+from gr_ros2.phy.threads import run_flowgraph, start_flowgraph, wait_for_end
 
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
 _BATCH_SAMPLES = 1 << 22
 _BATCH_SEEDS = 7919
-"""Apart, so that no batch has the noise of another scenario's neighbouring seed."""
+"""ThreadedObserver, so that no batch has the noise of another scenario's neighbouring seed."""
 _SEEDS = 2**31 - 1
 _TAIL = 2048
 """Zero samples behind the last packet, for what channel and receiver hold back."""
 
 
-class _Outlet(gr.basic_block):  # type: ignore[misc]
+class _PacketPort(gr.basic_block):  # type: ignore[misc]
     """A message port to send from."""
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class _Outlet(gr.basic_block):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class Recording:
+class SampleRecording:
     """Packets and the samples they became.
 
     :param packets: in the order they were sent
@@ -54,7 +54,7 @@ class Recording:
     samples: npt.NDArray[np.complex64]
 
 
-def record(phy: Phy, count: int, seed: int = 0) -> Recording:
+def record(phy: Phy, count: int, seed: int = 0) -> SampleRecording:
     """Send random packets into the void.
 
     :param count: packets
@@ -64,7 +64,7 @@ def record(phy: Phy, count: int, seed: int = 0) -> Recording:
     return modulated(phy, [source.randbytes(phy.packet_len) for _ in range(count)])
 
 
-def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
+def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
     """The samples a PHY's transmitter makes of packets, one behind the other.
 
     :param packets: of the PHY's packet_len
@@ -72,11 +72,11 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
     """
     top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
     top.connect(transmitter, sink)
-    outlet = _Outlet()
+    outlet = _PacketPort()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
     wanted = len(packets) * phy.airtime_samples()
     try:
-        begin(top.start)
+        start_flowgraph(top.start)
         for packet in packets:
             outlet.message_port_pub(PDUS, pdu_of(packet))
         came, deadline = 0, time.monotonic() + _PATIENCE_S
@@ -88,30 +88,30 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
             time.sleep(_POLL_S)
     finally:
         top.stop()
-        finish(top)
+        wait_for_end(top)
         transmitter.release()
-    return Recording(list(packets), np.array(sink.data(), np.complex64))
+    return SampleRecording(list(packets), np.array(sink.data(), np.complex64))
 
 
-def deliver(phy: Phy, recording: Recording, channel: ChannelConfig) -> list[bytes]:
+def deliver(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> list[bytes]:
     """The packets a receiver makes of a recording behind a channel (``packet_loss`` is not applied)."""
     top, receiver, log = gr.top_block(), phy.receiver(), blocks.message_debug()
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
     top.msg_connect(receiver, "pdus", log, "store")
-    run_through(top)
+    run_flowgraph(top)
     receiver.release()
     vectors = (pmt.cdr(log.get_message(place)) for place in range(log.num_messages()))
     return [bytes(pmt.u8vector_elements(vector)) for vector in vectors]
 
 
-def pdr(phy: Phy, recording: Recording, channel: ChannelConfig) -> float:
+def pdr(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> float:
     """Share of a recording's packets that arrive unaltered, 0..1."""
     arrived = set(deliver(phy, recording, channel))
     return sum(packet in arrived for packet in recording.packets) / len(recording.packets)
 
 
-class Passage:
+class BatchChannel:
     """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
 
     Nothing of one batch is on the air with another; noise and fading of each are their own.

@@ -1,7 +1,7 @@
 """The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, by a modem of our own or by those blocks.
 
-Law: own and stock send the same samples for the same packet, but for the number in the header, and take the same time
-but for the gap (packets of which a CRC-32 would not fit the stock header excepted).
+Invariant: own and stock send the same samples for the same packet, but for the number in the header, and take the same
+time but for the gap (packets of which a CRC-32 would not fit the stock header excepted).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import Frame
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
-from gr_ros2.phy.ofdm_layout import Layout, point_power
+from gr_ros2.phy.ofdm_layout import OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
@@ -75,7 +75,7 @@ class OfdmPhy(BurstPhy):
                 f"phy ofdm: cp_len = {cp_len}: {fft_len // 4} to {fft_len // 2} samples with fft_len = {fft_len}"
             )
         carriers = (chosen.carriers, chosen.pilots)
-        self.layout = layout = Layout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, *carriers)
+        self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, *carriers)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
         if threshold == "stock":
@@ -131,5 +131,5 @@ class OfdmPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
-        return super().receiver(aside) if self._stock is None else StockReceiver(self._stock)
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
+        return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)

@@ -1,7 +1,7 @@
 """The frame of the `ofdm` PHY on the air: carriers, sync words, constellations, as GNU Radio's blocks have them.
 
-Laws: at equal settings every implementation makes the same samples; numpy's global generator, which the stock sync
-words reseed, is left as it was.
+Invariants: at equal settings every implementation makes the same samples; numpy's global generator, which the stock
+sync words reseed, is left as it was.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _HEADER_BITS = 32
 
 
 @dataclass(frozen=True)
-class Layout:
+class OfdmLayout:
     """What transmitter and receiver must agree on.
 
     :param fft_len: carriers, used or not, a power of 2 from 64 on

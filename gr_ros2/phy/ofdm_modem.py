@@ -1,8 +1,8 @@
 """OFDM bursts without GNU Radio's scheduler: found by a repeated half symbol, read with every symbol as reference.
 
-Laws: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a short
-impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the payload
-is decided to be, weighted with how sure that is.
+Invariants: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a
+short impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the
+payload is decided to be, weighted with how sure that is.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
-from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
+from gr_ros2.phy.burst import BurstModem, Frame, ModemConstants, Reading, Samples, Search
+from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
@@ -40,7 +40,7 @@ _DOUBT = 1e-3
 _TINY = 1e-20
 
 
-class _Place(NamedTuple):
+class _FramePlace(NamedTuple):
     """Where a burst is: first sample, radians per sample, and how much of the power is sync words, 0..1."""
 
     begin: int
@@ -48,7 +48,7 @@ class _Place(NamedTuple):
     alike: float
 
 
-class _Clock(NamedTuple):
+class _SymbolClock(NamedTuple):
     """Where a burst's first sample would be, and samples by which each symbol comes later than the one before."""
 
     begin: float
@@ -71,7 +71,7 @@ class OfdmModem(BurstModem):
     :param threshold: of the preamble's metric, 0..1; None = by the share of false alarms
     """
 
-    def __init__(self, frame: Frame, layout: Layout, threshold: float | None) -> None:
+    def __init__(self, frame: Frame, layout: OfdmLayout, threshold: float | None) -> None:
         super().__init__(frame)
         self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
         self._bpsk = Points(np.array([-1, 1], complex), "little")
@@ -183,7 +183,7 @@ class OfdmModem(BurstModem):
 
     def read(self, samples: Samples, start: int) -> Reading:
         begin, frequency, _ = self._place(samples, start)
-        clock = _Clock(float(begin), 0.0)
+        clock = _SymbolClock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
         channel = self._first_estimate(rows[:2])
         snr = self._snr(rows[:2])
@@ -199,10 +199,10 @@ class OfdmModem(BurstModem):
             soft.append(self.constellation.soft(likely))
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
-            clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
+            clock = _SymbolClock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
         return Reading(np.concatenate(soft), np.concatenate(looked), snr)
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         points = -(-self.frame.bits // self.constellation.bits)
         values = {
             "size": self._size,
@@ -248,9 +248,9 @@ class OfdmModem(BurstModem):
             "word_weight": self._word_weight,
             "marks": self.constellation.marks,
         }
-        return Constants("ofdm", values, points * self.constellation.bits, points)
+        return ModemConstants("ofdm", values, points * self.constellation.bits, points)
 
-    def _place(self, samples: Samples, at: int) -> _Place:
+    def _place(self, samples: Samples, at: int) -> _FramePlace:
         """Look closely at a place where the first half of a symbol is repeated."""
         at = max(0, at)
         window = samples[at : at + self._window + self._half]
@@ -259,7 +259,7 @@ class OfdmModem(BurstModem):
         first = max(0, at + self._prefix - self._back)
         part = samples[first : first + self._symbol + self._size]
         if len(part) < self._symbol + self._size:
-            return _Place(at, frequency, 0.0)
+            return _FramePlace(at, frequency, 0.0)
         part = part * np.exp(-1j * frequency * np.arange(len(part)))
         spectra = np.fft.fft(np.stack((part[: self._size], part[self._symbol :])))
         shift = _SHIFTS[int(np.argmax(np.abs(self._turns @ (spectra[0].conj() * spectra[1]))))]
@@ -275,10 +275,10 @@ class OfdmModem(BurstModem):
         power = float(np.vdot(spectra, spectra).real)
         alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
         late = (peak + self._half) % self._size - self._half
-        return _Place(first - self._prefix + late, frequency + turn / self._symbol, alike)
+        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, alike)
 
     def _rows(
-        self, samples: Samples, clock: _Clock, frequency: float, symbol: int, count: int
+        self, samples: Samples, clock: _SymbolClock, frequency: float, symbol: int, count: int
     ) -> NDArray[np.complex64]:
         """Used carriers of some of a burst's symbols."""
         drift = clock.pace * (symbol + np.arange(count))

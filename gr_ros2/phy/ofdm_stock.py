@@ -1,7 +1,7 @@
 """GNU Radio's OFDM blocks as a transmitter and a receiver: `detection_threshold: stock`.
 
-Laws: wired as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, at equal settings with the same samples; every packet is
-followed by ``gap`` zero samples, so that the receiver never sees two frames back to back (its header/payload
+Invariants: wired as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, at equal settings with the same samples; every packet
+is followed by ``gap`` zero samples, so that the receiver never sees two frames back to back (its header/payload
 demultiplexer then swallows a trigger now and then) and the last frame is pushed out of it at once; transmitter and
 receiver use different tag keys, so that a loopback cannot leak a length past the channel; every buffer holds a whole
 frame, since a tagged stream block that cannot get one stalls the flowgraph; frames whose bits do not fill whole points
@@ -20,10 +20,10 @@ from typing import Any
 import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
-from gr_ros2.phy.flowgraph import HierBlock, Receiver, Transmitter
-from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, Layout, constellation
+from gr_ros2.phy.flowgraph import HierBlock, ReceiverBlock, TransmitterBlock
+from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, OfdmLayout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
-from gr_ros2.phy.threads import keep_messages, only_warnings
+from gr_ros2.phy.threads import lift_message_limit, log_warnings_only
 
 STOCK_THRESHOLD = 0.9
 """What GNU Radio's ``ofdm_rx`` uses. A lower one gains decibels and triggers beside a frame now and then."""
@@ -50,7 +50,7 @@ class StockFrame:
     :param gap: zero samples behind each packet
     """
 
-    layout: Layout
+    layout: OfdmLayout
     packet_len: int
     gap: int
 
@@ -111,12 +111,12 @@ def idle_spinning_threads() -> None:
                     found = True
 
 
-class StockTransmitter(Transmitter):
+class StockTransmitter(TransmitterBlock):
     """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
 
     def __init__(self, frame: StockFrame) -> None:
         super().__init__("gr_ros2_ofdm_tx", frame.airtime_samples)
-        keep_messages()
+        lift_message_limit()
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
         modulator = OfdmModulator(frame.layout, _TX_KEY, frame.with_crc32)
         zeros = blocks.vector_source_c([0j] * frame.gap, True, 1, [_length_tag(frame.gap)])
@@ -136,7 +136,7 @@ class StockTransmitter(Transmitter):
         frame.fit_buffers(parts)
 
 
-class StockReceiver(Receiver):
+class StockReceiver(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: StockFrame) -> None:
@@ -144,7 +144,7 @@ class StockReceiver(Receiver):
         self._frame = frame
         self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
         # Header parser and demultiplexer tell of every header lost in noise.
-        only_warnings(self._demodulator.parts)
+        log_warnings_only(self._demodulator.parts)
         self.connect(self, self._demodulator)
         last, key, parts = self._demodulator, _RX_KEY, list(self._demodulator.parts)
         if frame.fill:
@@ -181,7 +181,7 @@ class OfdmModulator(gr.hier_block2):  # type: ignore[misc]
     :param with_crc32: at the end of each frame
     """
 
-    def __init__(self, layout: Layout, key: str, with_crc32: bool) -> None:
+    def __init__(self, layout: OfdmLayout, key: str, with_crc32: bool) -> None:
         super().__init__("gr_ros2_ofdm_mod", gr.io_signature(1, 1, 1), gr.io_signature(1, 1, gr.sizeof_gr_complex))
         self.parts: list[Any] = []
         source: Any = self
@@ -221,7 +221,7 @@ class OfdmDemodulator(HierBlock):
     :param with_crc32: at the end of each frame
     """
 
-    def __init__(self, layout: Layout, packet_key: str, frame_key: str, with_crc32: bool) -> None:
+    def __init__(self, layout: OfdmLayout, packet_key: str, frame_key: str, with_crc32: bool) -> None:
         super().__init__("gr_ros2_ofdm_demod", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(1, 1, 1))
         self.parts: list[Any] = []
         self._layout, self._frame_key = layout, frame_key

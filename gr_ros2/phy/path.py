@@ -1,7 +1,7 @@
 """A packet's way through gate, transmitter, air, receiver and losses: what a simulated link and a radio have in common.
 
-Laws: what is received is impaired and looked at only here; a part that was not built in costs nothing, and what it
-would do cannot be set; packets are counted at every place they pass.
+Invariants: what is received is impaired and looked at only here; a part that was not built in costs nothing, and what
+it would do cannot be set; packets are counted at every place they pass.
 """
 
 from __future__ import annotations
@@ -136,14 +136,14 @@ class PacketPath:
         self._transmitter = self.phy.transmitter()
         return self._follow(packets, self._transmitter)
 
-    def _receive(self, samples: Any, *, faded: bool, shown: bool, aside: bool = True) -> Any:
+    def _receive(self, samples: Any, *, faded: bool, shown: bool, own_process: bool = True) -> Any:
         """Connect channel, receiver and taps behind a block that gives samples; returns what the receiver hears."""
         graph: Any = self
         if faded:
             self._faded = Channel(self.channel, self.phy)
             graph.connect(samples, self._faded)
             samples = self._faded
-        self._receiver = self.phy.receiver(aside)
+        self._receiver = self.phy.receiver(own_process)
         graph.connect(samples, self._receiver)
         if shown:
             self._tap = Tap(_LOOK)

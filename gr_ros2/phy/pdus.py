@@ -1,6 +1,6 @@
 """Bytes to PDUs and back, the fast way.
 
-Law: a PDU is a PMT pair of a dictionary and a u8vector.
+Invariant: a PDU is a PMT pair of a dictionary and a u8vector.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The `psk` PHY: single carrier, BPSK, QPSK or 8-PSK in root-raised-cosine pulses, a preamble before each packet.
 
-Law: the mean power of a burst is 1 whatever the settings.
+Invariant: the mean power of a burst is 1 whatever the settings.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Constellations, and what received points say of the bits that were sent.
 
-Laws: a soft bit is a log-likelihood ratio, above 0 for a 1, of the nearest point with either ("max-log"); its sign is
-the decision of the nearest point.
+Invariants: a soft bit is a log-likelihood ratio, above 0 for a 1, of the nearest point with either ("max-log"); its
+sign is the decision of the nearest point.
 """
 
 from __future__ import annotations

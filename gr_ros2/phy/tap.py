@@ -1,7 +1,7 @@
 """A look at samples that pass by, for people: constellation and spectrum.
 
-Laws: a tap only reads; it exists only in a flowgraph that was built to be looked at, and costs nothing elsewhere; it
-keeps the newest ``size`` samples and nothing else.
+Invariants: a tap only reads; it exists only in a flowgraph that was built to be looked at, and costs nothing elsewhere;
+it keeps the newest ``size`` samples and nothing else.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The curves physical layers are measured against: error rates of ideal receivers in white noise.
 
-Laws: SNR arguments are ratios, not dB; perfect synchronisation is assumed everywhere, so a measured curve lies right
-of these by what synchronisation, pilots and framing cost. Source: Proakis and Salehi, Digital Communications, 5th
+Invariants: SNR arguments are ratios, not dB; perfect synchronisation is assumed everywhere, so a measured curve lies
+right of these by what synchronisation, pilots and framing cost. Source: Proakis and Salehi, Digital Communications, 5th
 edition, sections 4.3 (PSK, QAM) and 4.5 (noncoherent orthogonal signals).
 """
 

@@ -1,7 +1,7 @@
 """What GNU Radio's scheduler needs to be told: quick threads for Python blocks, and message ports that lose nothing.
 
-Laws: a block keeps its thread's state from ``start`` to ``stop``, which GNU Radio calls in the thread that also brings
-its messages; nothing is kept of a thread that has ended.
+Invariants: a block keeps its thread's state from ``start`` to ``stop``, which GNU Radio calls in the thread that also
+brings its messages; nothing is kept of a thread that has ended.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _START_ATTEMPTS = 20
 _log = logging.getLogger(__name__)
 
 
-def quicken_threads() -> None:
+def shorten_switch_interval() -> None:
     """Let Python threads hand over quickly; for the whole process, since there is only one such setting."""
     if sys.getswitchinterval() > SWITCH_INTERVAL_S:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
-def keep_messages() -> None:
+def lift_message_limit() -> None:
     """Let message ports without a handler, such as that of ``pdu_to_tagged_stream``, keep every message.
 
     GNU Radio prunes such a port when it holds more than ``max_messages`` (8192), but counts without a lock: with no
@@ -51,7 +51,7 @@ def keep_messages() -> None:
     os.environ.setdefault(_MAX_MESSAGES, "-1")
 
 
-def begin(start: Callable[[], None]) -> None:
+def start_flowgraph(start: Callable[[], None]) -> None:
     """Start a flowgraph, again and again where GNU Radio could not map a buffer.
 
     Ctrl-C waits until it has started: who calls can stop it then.
@@ -75,7 +75,7 @@ def begin(start: Callable[[], None]) -> None:
     ) from failed
 
 
-def finish(flowgraph: Any) -> None:
+def wait_for_end(flowgraph: Any) -> None:
     """Wait until a flowgraph has come to its end.
 
     KeyboardInterrupt stops it and comes through. GNU Radio's own ``wait`` stops it too, but returns as if all
@@ -93,27 +93,27 @@ def finish(flowgraph: Any) -> None:
         raise
 
 
-def run_through(flowgraph: Any) -> None:
-    """Start a flowgraph and wait until it has come to its end; see :func:`begin` and :func:`finish`.
+def run_flowgraph(flowgraph: Any) -> None:
+    """Start a flowgraph and wait until it has come to its end; see :func:`start_flowgraph` and :func:`wait_for_end`.
 
     Whatever happens it is stopped: one that is let go while it runs waits for its threads with Python's lock held.
     """
     try:
-        begin(flowgraph.start)
-        finish(flowgraph)
+        start_flowgraph(flowgraph.start)
+        wait_for_end(flowgraph)
     except BaseException:
         flowgraph.stop()
         flowgraph.wait()
         raise
 
 
-def only_warnings(blocks: Iterable[Any]) -> None:
+def log_warnings_only(blocks: Iterable[Any]) -> None:
     """Let these blocks log warnings only, not each buffer set on them."""
     for block in blocks:
         block.set_log_level("warn")
 
 
-class BlockThread:
+class ThreadState:
     """Keeps the Python state of the thread in which GNU Radio calls a block.
 
     Otherwise GNU Radio makes a state and ends it again with every message, and Python 3.11 and later map and unmap a
@@ -137,23 +137,23 @@ class BlockThread:
             ctypes.pythonapi.PyGILState_Release(self._state)
 
 
-class KeepsThread:
+class KeepsThreadState:
     """Start and stop of a Python block that has nothing else to do there; stands before GNU Radio's class."""
 
     @cached_property
-    def _block_thread(self) -> BlockThread:
-        return BlockThread()
+    def _thread_state(self) -> ThreadState:
+        return ThreadState()
 
     def start(self) -> bool:
-        self._block_thread.keep()
+        self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
 
-class Held(KeepsThread):
+class KeptAlive(KeepsThreadState):
     """A Python block inside a hier block; stands before GNU Radio's class.
 
     GNU Radio calls Python blocks without holding a reference, so a flowgraph whose maker dropped the hier block around

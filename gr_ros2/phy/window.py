@@ -1,7 +1,7 @@
 """Credits for a flowgraph that runs as fast as it can: a few packets are under way at any time, no more.
 
-Laws: credits given are at most ``window`` ahead of the packets that are through; they come several at a time, since
-each message between blocks costs about as much as a packet does; a full window is looked at now and then, because
+Invariants: credits given are at most ``window`` ahead of the packets that are through; they come several at a time,
+since each message between blocks costs about as much as a packet does; a full window is looked at now and then, because
 progress can only be polled.
 """
 
@@ -15,7 +15,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.pdus import CREDIT
-from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.phy.threads import shorten_switch_interval
 
 WINDOW = 32
 """Packets under way: enough to keep the flowgraph busy between two looks at its progress."""
@@ -45,7 +45,7 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
         self.message_port_register_out(CREDIT)
 
     def start(self) -> bool:
-        quicken_threads()
+        shorten_switch_interval()
         self._stopped.clear()
         self._thread = threading.Thread(target=self._run, name="gr-ros2-window", daemon=True)
         self._thread.start()

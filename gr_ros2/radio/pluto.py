@@ -1,9 +1,10 @@
 """The `pluto` front end: ADALM-Pluto through IIO.
 
 Its transmitter takes whole buffers, so a buffer is exactly one burst and leaves at once; between bursts the converter
-has nothing to send, and each burst ends in zeros. Laws: GNU Radio's blocks go on where the device refuses a setting,
-so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that went well,
-else in the log of debugging, and our line says what went wrong; the connection stays open until the process ends.
+has nothing to send, and each burst ends in zeros. Invariants: GNU Radio's blocks go on where the device refuses a
+setting, so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that
+went well, else in the log of debugging, and our line says what went wrong; the connection stays open until the process
+ends.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
 
-Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
+Invariants: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
 a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); a
 repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; memory holds payload
 digests only of messages whose fate is open, and about 33 bytes of each message besides.
@@ -30,7 +30,7 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
@@ -77,7 +77,7 @@ class TopicLedger:
 
 
 @dataclass(slots=True, eq=False)
-class _Open(Tracked):
+class _OpenMessage(Tracked):
     """A message whose fate is open.
 
     :ivar position: its place in the topic's arrays
@@ -92,11 +92,11 @@ class _Open(Tracked):
 
 
 @dataclass(slots=True)
-class _Source:
+class _SourceBook:
     """One sender: its open messages, and its packets in the air."""
 
     src_id: int
-    messages: Tracker[_Open] = field(default_factory=Tracker)
+    messages: Tracker[_OpenMessage] = field(default_factory=Tracker)
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -111,7 +111,7 @@ class Ledger:
     def __init__(self) -> None:
         self._lock = Lock()
         self._topics: dict[tuple[int, int], TopicLedger] = {}
-        self._sources: dict[int, _Source] = {}
+        self._sources: dict[int, _SourceBook] = {}
         self._unmatched: list[tuple[int, int, bytes, float]] = []
         self._faults: list[str] = []
         self._finished = False
@@ -125,7 +125,7 @@ class Ledger:
         with self._lock:
             if self._finished:
                 return
-            source = self._sources.setdefault(src_id, _Source(src_id))
+            source = self._sources.setdefault(src_id, _SourceBook(src_id))
             if isinstance(event, SentPacket):
                 self._sent(source, event)
             elif isinstance(event, Accepted):
@@ -133,7 +133,7 @@ class Ledger:
             elif isinstance(event, Missed):
                 topic = self._topic(src_id, event.topic_id)
                 topic.sent += event.count
-                topic.rows[Row.LOST_ON_GRAPH.value] += event.count
+                topic.rows[LedgerRow.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, event)
 
@@ -204,7 +204,7 @@ class Ledger:
         """Messages sent and delivered so far."""
         with self._lock:
             topics = self._topics.values()
-            return sum(topic.sent for topic in topics), sum(topic.rows[Row.DELIVERED] for topic in topics)
+            return sum(topic.sent for topic in topics), sum(topic.rows[LedgerRow.DELIVERED] for topic in topics)
 
     def rows(self) -> dict[tuple[int, int], Counter[str]]:
         """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
@@ -223,7 +223,7 @@ class Ledger:
 
     # -- sender -------------------------------------------------------------------------------------------------
 
-    def _new_message(self, source: _Source, event: Accepted | Refused, t: float, size: int) -> TopicLedger:
+    def _new_message(self, source: _SourceBook, event: Accepted | Refused, t: float, size: int) -> TopicLedger:
         serial = event.serial
         if serial < source.closed_serials or serial in source.seen:
             self._faults.append(f"source {source.src_id}: serial {serial} was reported twice")
@@ -240,13 +240,13 @@ class Ledger:
         topic.row.append(_OPEN)
         return topic
 
-    def _accepted(self, source: _Source, event: Accepted) -> None:
+    def _accepted(self, source: _SourceBook, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
-        message = _Open.of(event)
+        message = _OpenMessage.of(event)
         message.position = len(topic.serial) - 1
         source.messages.add(message)
 
-    def _refused(self, source: _Source, event: Refused) -> None:
+    def _refused(self, source: _SourceBook, event: Refused) -> None:
         message = source.messages.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
@@ -254,7 +254,7 @@ class Ledger:
         else:
             self._close(source, message, event.reason)
 
-    def _sent(self, source: _Source, event: SentPacket) -> None:
+    def _sent(self, source: _SourceBook, event: SentPacket) -> None:
         ordinal = source.packets_sent
         source.packets_sent += 1
         for entry in event.entries:
@@ -267,7 +267,7 @@ class Ledger:
         source.in_air.append((ordinal, digest))
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
-    def _retire(self, source: _Source, newer: _Open) -> None:
+    def _retire(self, source: _SourceBook, newer: _OpenMessage) -> None:
         """Settle what had this message's key before and cannot arrive any more: keys have come round since."""
         assert newer.key is not None
         horizon = source.last_received - REORDER_WINDOW
@@ -289,9 +289,9 @@ class Ledger:
         self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
         return None
 
-    def _deliver(self, source: _Source, message: _Open, now: float) -> float:
+    def _deliver(self, source: _SourceBook, message: _OpenMessage, now: float) -> float:
         self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
-        self._close(source, message, Row.DELIVERED)
+        self._close(source, message, LedgerRow.DELIVERED)
         return message.t_sent
 
     def _lost(self, event: Lost) -> None:
@@ -312,7 +312,7 @@ class Ledger:
             self._topics[key] = TopicLedger(src_id, topic_id)
         return self._topics[key]
 
-    def _close(self, source: _Source, message: _Open, row: str) -> None:
+    def _close(self, source: _SourceBook, message: _OpenMessage, row: str) -> None:
         self._topic(source.src_id, message.topic_id).book(message.position, row)
         source.messages.close(message)
 
@@ -331,17 +331,19 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            submitted = topic.sent - topic.rows[Row.LOST_ON_GRAPH.value]
+            submitted = topic.sent - topic.rows[LedgerRow.LOST_ON_GRAPH.value]
             if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
-            if topic.rows[Row.DELIVERED] != delivered:
-                self._faults.append(f"{name}: {topic.rows[Row.DELIVERED]} delivered, {delivered} have a delivery time")
+            if topic.rows[LedgerRow.DELIVERED] != delivered:
+                self._faults.append(
+                    f"{name}: {topic.rows[LedgerRow.DELIVERED]} delivered, {delivered} have a delivery time"
+                )
         if self._faults:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
 
-def _arrived(source: _Source, digest: bytes) -> int:
+def _arrived(source: _SourceBook, digest: bytes) -> int:
     """A packet of this source came in: the first one with these bytes that was sent after the newest received.
 
     :return: its number
@@ -366,14 +368,14 @@ def _arrived(source: _Source, digest: bytes) -> int:
     return ordinal
 
 
-def _final_row(source: _Source, message: _Open, drained: bool) -> str:
+def _final_row(source: _SourceBook, message: _OpenMessage, drained: bool) -> str:
     """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
     the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
     behind the last packet that arrived."""
     if message.reason:
         return message.reason
     if not message.all_sent:
-        return Row.IN_FLIGHT
+        return LedgerRow.IN_FLIGHT
     if message.received >= message.total:
-        return Row.NOT_TAKEN
-    return Row.LOST_FRAGMENTS if drained or message.last_packet < source.last_received else Row.IN_FLIGHT
+        return LedgerRow.NOT_TAKEN
+    return LedgerRow.LOST_FRAGMENTS if drained or message.last_packet < source.last_received else LedgerRow.IN_FLIGHT

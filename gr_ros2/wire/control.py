@@ -1,6 +1,6 @@
 """Entries of version 1 that carry no message: hellos, requests and reports.
 
-Law: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
+Invariant: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
 """
 
 from __future__ import annotations

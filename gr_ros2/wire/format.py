@@ -1,6 +1,6 @@
 """What every version of the wire format can do, and what is the same in all of them.
 
-Laws: a format object has no state; sizes are bytes, and those that a scheduler asks for are exact or promise too
+Invariants: a format object has no state; sizes are bytes, and those that a scheduler asks for are exact or promise too
 little, never too much.
 """
 

@@ -1,7 +1,7 @@
 """Version 0 of the wire format, byte for byte (the paper, section 5 and table 3): packets, arithmetic, codec.
 
-Laws: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for every
-packet that ``encode`` takes; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
+Invariants: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for
+every packet that ``encode`` takes; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ A packet is a header, a body and a trailer. A *source* packet carries entries an
 packet stands at the number of a source packet, told apart from others there by its row: a *repair* combines the bodies
 of source packets, a *control* packet carries hellos, reports and requests.
 
-Laws: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back as the
-same values; a body says nothing of the number of its packet, so that it can be combined with others and recovered.
+Invariants: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back
+as the same values; a body says nothing of the number of its packet, so that it can be combined with others and
+recovered.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 *What leaves.* When a packet is asked for: a hello that cannot wait, then new messages, then what there is to say about
 others' packets, then repair (``link.repair``). Reports ride along where a packet of messages has room for one.
 
-Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason; ``receive``
-never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is sent once, a
-row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
+Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason;
+``receive`` never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is
+sent once, a row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
-from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.events import AirKind, Event, Gone, Met, Rejected, SentPacket, SentPart
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save

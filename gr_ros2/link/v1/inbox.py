@@ -5,8 +5,8 @@ here, or given up: it is not known what those carried. A packet is given up for 
 it is over, or ``hold_s`` after it was missed; and at once while hardly any missing packet comes back. Messages of other
 topics are delivered as they come, and never after a later one.
 
-Laws: nothing is delivered twice, nor after a later message of its topic; every message of which something came ends in
-one Delivered or Lost; memory is bounded.
+Invariants: nothing is delivered twice, nor after a later message of its topic; every message of which something came
+ends in one Delivered or Lost; memory is bounded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from zlib import crc32
 
 from gr_ros2.errors import CodecError, WireError
-from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.events import Announced, Delivered, Key, Lost
 from gr_ros2.link.v1.reassembly import Partial, Reassembly

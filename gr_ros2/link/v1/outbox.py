@@ -11,8 +11,8 @@ what is free, and nothing about it is fixed beforehand.
 with a lifespan, until that is over; otherwise until ``depth`` newer ones have left, or newer ones that fill a repair.
 Where receivers report they say when they have it, and no more than the publishers' depth limits it.
 
-Laws: a topic's messages begin one after the other, each after the one before has left whole; every message ends in
-being sent or in a Refused with its row.
+Invariants: a topic's messages begin one after the other, each after the one before has left whole; every message ends
+in being sent or in a Refused with its row.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from math import inf
 from zlib import crc32
 
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.v1.events import Accepted, Key, Refused, SentPart
 from gr_ros2.link.v1.repair import GROUP, Life

@@ -1,7 +1,7 @@
 """Compiled kernels of the burst modems: search and reading in C++17, an optional part of the package.
 
-Laws: numpy is the reference and the fallback, and finds the same packets; which one runs can be told in one line; the
-C++ has no dependencies, starts no threads and knows neither Python nor GNU Radio.
+Invariants: numpy is the reference and the fallback, and finds the same packets; which one runs can be told in one line;
+the C++ has no dependencies, starts no threads and knows neither Python nor GNU Radio.
 """
 
 from __future__ import annotations

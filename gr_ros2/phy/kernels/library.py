@@ -1,7 +1,7 @@
 """The library of compiled kernels: which variant this processor runs, or why there is none.
 
-Laws: what is missing or does not load is no error, but a reason that can be told; a library is loaded once, and changes
-nothing in the process beside itself.
+Invariants: what is missing or does not load is no error, but a reason that can be told; a library is loaded once, and
+changes nothing in the process beside itself.
 """
 
 from __future__ import annotations

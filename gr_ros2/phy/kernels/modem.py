@@ -1,7 +1,7 @@
 """A burst modem whose samples a compiled kernel searches and reads.
 
-Laws: everything that is no work on samples is the numpy modem's, which stays the reference; a kernel knows nothing but
-the constants that modem tells; calls from several threads do not meet.
+Invariants: everything that is no work on samples is the numpy modem's, which stays the reference; a kernel knows
+nothing but the constants that modem tells; calls from several threads do not meet.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.kernels.library import loaded
 
 _NONE = -(2**63)
@@ -132,7 +132,7 @@ class CompiledModem(BurstModem):
         return Reading(soft, points, snr.value)
 
 
-def _new(functions: Any, constants: Constants) -> int:
+def _new(functions: Any, constants: ModemConstants) -> int:
     """A kernel in the library's memory."""
     number, fields = KERNELS[constants.kernel]
     arrays = []
