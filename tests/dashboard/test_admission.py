@@ -271,7 +271,7 @@ def test_drawing_a_page_again_and_again_is_held_to_the_budget(monkeypatch: pytes
 
     with Dashboard(port=0) as dashboard:
         spent: list[float] = []
-        monkeypatch.setattr(dashboard._room.budget, "spend", lambda processor_s, _now: spent.append(processor_s))
+        monkeypatch.setattr(dashboard._admission.budget, "spend", lambda processor_s, _now: spent.append(processor_s))
         asyncio.run(pull(dashboard, token(get(dashboard.url)[1])))
         assert len(spent) == 4
         assert min(spent) > 0

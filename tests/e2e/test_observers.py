@@ -24,7 +24,7 @@ from gr_ros2.link.events import ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result, read_result
-from gr_ros2.run import watch
+from gr_ros2.run import observers as run_observers
 from gr_ros2.run.observers import LiveRun
 from gr_ros2.run.outcome import DELIVERED_BAG
 from gr_ros2.run.runner import run_scenario
@@ -149,7 +149,7 @@ def test_one_that_raises_when_a_run_begins_and_ends(passing: str) -> None:
 
 
 def test_a_late_one_that_raises_is_left_out_alone() -> None:
-    audience, late = watch.LateObservers(), Fails()
+    audience, late = run_observers.LateObservers(), Fails()
     invited: list[bool] = []
 
     def invite() -> None:
@@ -164,7 +164,7 @@ def test_a_late_one_that_raises_is_left_out_alone() -> None:
 
 
 def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watch, "_PATIENCE_S", 0.2)
+    monkeypatch.setattr(run_observers, "_PATIENCE_S", 0.2)
     gate = threading.Event()
     bad, good = RecordingObserver(gate.wait), RecordingObserver()
     try:
@@ -180,9 +180,9 @@ def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_one_that_is_slow_is_left_behind_within_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watch, "_HELD_BYTES", 200_000)
+    monkeypatch.setattr(run_observers, "_HELD_BYTES", 200_000)
     slow, good = RecordingObserver(lambda: time.sleep(0.01)), RecordingObserver()
-    monkeypatch.setattr(watch, "_PATIENCE_S", 60.0)
+    monkeypatch.setattr(run_observers, "_PATIENCE_S", 60.0)
     result = run_scenario(scenario(1.0), observers=[slow, good]).result
     check_complete(result)
     (line,) = result.incomplete
