@@ -17,6 +17,7 @@ BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
     "endpoint": "bench.endpoint",
+    "hostile": "bench.hostile",
     "port": "bench.port",
     "direct": "bench.runs",
     "fast": "bench.runs",
@@ -33,7 +34,7 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "drive", "sweep")
+LONG = ("half_points", "drive", "sweep", "hostile")
 """Many minutes: only when named."""
 
 

@@ -71,6 +71,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """xdist groups by what it appends to a test's name; pytest 9.2 ignores that, and radios would run side by side."""
+    grouped = [item for item in session.items if item.get_closest_marker("xdist_group")]
+    if session.config.getoption("loadgroup", default=False) and not all("@" in item.nodeid for item in grouped):
+        raise pytest.UsageError(
+            f"pytest-xdist does not group tests with pytest {pytest.__version__}: install requirements-dev.txt"
+        )
+
+
 @pytest.fixture(autouse=True)
 def _domains_of_one_test() -> Iterator[None]:
     """DDS domains are a test's own until it ends."""

@@ -20,6 +20,7 @@ from gr_ros2.radio.config import link_from
 from gr_ros2.run.scenario import load_scenario, scenario_from
 from gr_ros2.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
+from tests.once import once
 
 LINK: dict[str, Any] = {
     "registry": "table4",
@@ -145,9 +146,13 @@ def runnable() -> list[Any]:
 @pytest.fixture(scope="module")
 def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the names that pages use exist: recordings, runs, scenarios."""
-    folder = tmp_path_factory.mktemp("docs")
-    for name in ("clean", "noisy", "results/a", "results/b"):
-        ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", name, folder=folder)
+    return once(tmp_path_factory, "sample-runs", fill)
+
+
+def fill(folder: Path) -> None:
+    ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", "clean", folder=folder)
+    for name in ("noisy", "results/a", "results/b"):
+        shutil.copytree(folder / "clean", folder / name)
     bag = folder / "clean" / "delivered"
     (mcap,) = bag.glob("*.mcap")
     shutil.copy(mcap, folder / "IN.mcap")
@@ -158,7 +163,6 @@ def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
     for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
         shutil.copy(path, folder)
-    return folder
 
 
 def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.CompletedProcess[str]:

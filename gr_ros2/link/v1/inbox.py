@@ -96,7 +96,7 @@ class Inbox:
         self._void: set[int] = set()
         """Packets that their sender has left out of a repair."""
         self._gaps: deque[tuple[float, int]] = deque()
-        """Packets that were missing, and since when."""
+        """Packets that were missing, and since when; none that is not remembered."""
         self._hope = 1.0
         """Share of missing packets that come back in time."""
         self._reassembly = Reassembly(settings.max_source_bytes)
@@ -269,9 +269,11 @@ class Inbox:
             self.counts["missing"] += gone
             self._missed = True
             self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
-            first = max(newest + 1, number - SPAN)
-            self._gaps.extend((now, missing) for missing in range(first, newest + 1 + gone))
         self.decoder.advance(number)
+        gaps, floor = self._gaps, self.decoder.floor
+        gaps.extend((now, missing) for missing in range(max(newest + 1, floor), newest + 1 + gone))
+        while gaps and gaps[0][1] < floor:
+            gaps.popleft()
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found

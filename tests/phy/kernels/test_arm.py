@@ -16,6 +16,7 @@ import numpy as np
 
 from gr_ros2.phy.burst import BurstModem, ModemConstants, Samples
 from gr_ros2.phy.kernels.modem import KERNELS
+from tests.once import once
 from tests.phy.kernels.support import IDS, SETTINGS, make, received
 from tests.phy.test_burst import bursts, noise
 
@@ -38,10 +39,12 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     emulator = shutil.which(EMULATOR) or shutil.which(f"{EMULATOR}-static")
     if shutil.which(COMPILER) is None or emulator is None:
         pytest.skip("needs a compiler for ARM and an emulator: apt install g++-aarch64-linux-gnu qemu-user")
-    path = tmp_path_factory.mktemp("arm") / "replay"
+    return [emulator, str(once(tmp_path_factory, "arm", build) / "replay")]
+
+
+def build(folder: Path) -> None:
     sources = [*sorted((ROOT / "gr_ros2" / "phy" / "kernels").glob("*.cpp")), Path(__file__).parent / "replay.cpp"]
-    subprocess.run([COMPILER, *flags(), "-static", *map(str, sources), "-o", str(path)], check=True)
-    return [emulator, str(path)]
+    subprocess.run([COMPILER, *flags(), "-static", *map(str, sources), "-o", str(folder / "replay")], check=True)
 
 
 def written(path: Path, constants: ModemConstants, samples: Samples) -> None:
