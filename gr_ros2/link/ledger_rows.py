@@ -1,4 +1,4 @@
-"""What can become of a message: the rows of the loss ledger.
+"""The possible fates of a message: the rows of the loss ledger.
 
 Invariant: every message that was sent ends in exactly one row. A row is its name: it counts, compares and is written as
 that text.
@@ -12,9 +12,9 @@ from enum import Enum
 class LedgerRow(str, Enum):
     """A row of the ledger.
 
-    :ivar end: where it is decided: source, sink, or link where both ends have to be joined
-    :ivar colour: of it in figures and on the dashboard
-    :ivar words: how a sentence says it of messages
+    :ivar end: where the fate is known: source, sink, or link where the records of both ends have to be joined
+    :ivar colour: its colour in figures and on the dashboard
+    :ivar words: its description, as a part of a sentence about messages
     """
 
     DELIVERED = "delivered", "sink", "#2a9d5c", "delivered"

@@ -1,6 +1,6 @@
-"""What the engines ask of a message codec: whole messages in, fewer bytes out, and back.
+"""The interface of a message codec: whole messages in, fewer bytes out, and back.
 
-Invariant: every message is coded by itself, so that a lost one damages no other.
+Invariant: every message is coded independently, so that a lost message damages no other.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ class MessageCodec(Protocol):
     byte that names codec and dictionary, 0 = stored as it is."""
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
-        """What ``decode`` makes of the coded message: the payload itself, but for bytes that carry nothing and for
-        loss that was asked for."""
+        """The result of ``decode`` for the coded message: the payload itself, except for bytes without information and
+        for loss that was configured."""
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, its naming byte first; at most one byte longer than the message."""

@@ -1,7 +1,7 @@
 """The receiving engine: bytes from the PHY in, messages out.
 
-Invariants: nothing but the bytes is trusted; ``receive`` never raises whatever the bytes; everything dropped is counted
-by name; memory is bounded per source and in all; time is an argument and never goes back.
+Invariants: ``receive`` trusts no byte and never raises, whatever the bytes; everything dropped is counted by name;
+memory is bounded per source and in total; time is an argument and never goes back.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
-"""A source silent for so long gives its place to a new one when ``max_sources`` are known."""
+"""A source that was silent for this many seconds is replaced by a new one when ``max_sources`` are known."""
 
 
 @dataclass(slots=True)
@@ -33,8 +33,8 @@ class ReceiverStats:
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic;
     ``delivered``, what was given out, by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason);
     ``packet_loss_est`` from gaps in sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given
-    up are estimates; ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known
-    of what was lost.
+    up are estimates; ``unknown_gaps`` counts gaps whose size is unknown, because a sender restarted or was silent for
+    long.
     """
 
     packets: int = 0
@@ -95,7 +95,7 @@ class Receiver:
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Give up what has waited ``reassembly_timeout`` for its next fragment."""
+        """Give up messages that have waited ``reassembly_timeout`` for their next fragment."""
         events: list[ReceiverEvent] = []
         while (at := self.next_timeout()) is not None and at <= now:
             events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.EXPIRED))
@@ -108,7 +108,8 @@ class Receiver:
         return None
 
     def unpublished(self, event: Delivered) -> Lost:
-        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+        """Record a delivered message that could not be published on the ROS graph. A repeat of it is delivered
+        again."""
         source = self._sources.get(event.src_id)
         if source is not None and source.latched.get(event.topic_id) == event.payload:
             del source.latched[event.topic_id]
@@ -125,7 +126,7 @@ class Receiver:
         return self._partials.size
 
     def _admit(self, packet: Packet, now: float) -> _Source | None:
-        """The source of a packet that concerns us."""
+        """The source of a packet, None if the packet is not for this receiver."""
         own = self.config.robot_id
         if own >= 0:
             if packet.src_id == own:
@@ -205,12 +206,12 @@ class Receiver:
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
     def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
-        """Book a message that came whole, but cannot be read here."""
+        """Record a complete message that cannot be decoded here."""
         self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
     def _given_up(self, partial: Partial, row: LedgerRow) -> Lost:
-        """Book an incomplete message that is held no longer."""
+        """Record an incomplete message that is no longer held."""
         self.stats.lost[partial.src_id, partial.topic_id, row.value] += 1
         self.stats.message_loss_est += 1
         return Lost(partial.src_id, partial.topic_id, row, partial.entry_id)

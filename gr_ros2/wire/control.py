@@ -24,7 +24,7 @@ HEARD_LEN = 2 + _heard.size
 
 
 class Hello(NamedTuple):
-    """Who is there.
+    """Announces a robot.
 
     :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
     :param turns: how often the 16-bit packet number has come round, 0..2^32-1

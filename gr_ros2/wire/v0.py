@@ -163,7 +163,7 @@ class FormatV0:
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
     def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """What stands where in a packet, in the order of its bytes."""
+        """The fields of a packet, in the order of its bytes."""
         entries = packet.entries
         pad = packet_len - self.packed_len([len(entry.payload) for entry in entries])
         return [

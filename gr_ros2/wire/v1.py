@@ -66,7 +66,7 @@ _session = Struct(">II")
 
 
 class Header(NamedTuple):
-    """What stands before the body.
+    """The header: the bytes before the body.
 
     :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is no source packet
     :param sealed: the trailer is an 8-byte tag, not a CRC-32
@@ -129,10 +129,10 @@ class Standing(NamedTuple):
 
 
 def session_crc(boot: int, turns: int) -> int:
-    """The CRC-32 of what a packet does not carry but belongs to; ``crc`` goes on from it.
+    """The CRC-32 over the session, which a packet does not carry; ``crc`` continues from it.
 
     :param boot: boot number of the sender
-    :param turns: how often its packet number has come round
+    :param turns: how often its packet number has wrapped around
     """
     return crc32(_session.pack(boot, turns))
 
@@ -229,7 +229,7 @@ def read_standing(data: bytes, start: int, end: int) -> Standing:
 
 
 def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
-    """How much of a message goes into what is free of a body.
+    """How much of a message fits into the free bytes of a body.
 
     :param room: bytes free
     :param remaining: bytes of the message not yet sent
