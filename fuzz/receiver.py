@@ -40,7 +40,7 @@ def _hear(data: bytes) -> None:
         assert engine.held_bytes <= _CONFIG.max_bytes
         timeout = engine.next_timeout()
         assert (timeout is None) == (engine.held_bytes == 0)
-    events += engine.handle_timeout(now + 2 * _CONFIG.reassembly_timeout)
+    events += engine.handle_timeout(now + 2 * _CONFIG.reassembly_timeout_s)
     stats = engine.stats
     assert engine.held_bytes == 0
     assert engine.next_timeout() is None

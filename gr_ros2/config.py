@@ -71,9 +71,9 @@ class TopicOptions:
     :param queue_depth: messages waiting at the source, 0 unbounded, None takes the source's ``queue_depth``
     :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
-        ``queue_depth``), deadline (fifo, and stale after ``deadline_ms``); None follows ``depth`` and the
+        ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); None follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
-    :param deadline_ms: ms from submission to delivery at the other end; a later message is dropped. 0 = no deadline, or
+    :param deadline_s: s from submission to delivery at the other end; a later message is dropped. 0 = no deadline, or
         without ``queue`` the publishers' lifespan
     :param weight: weight of this topic's age relative to other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
@@ -88,7 +88,7 @@ class TopicOptions:
     queue_depth: Count | None = None
     publish_as: TopicForm = ""
     queue: QueuePolicy | None = None
-    deadline_ms: Annotated[float, Field(ge=0, le=3_600_000, allow_inf_nan=False)] = 0.0
+    deadline_s: Annotated[float, Field(ge=0, le=3_600, allow_inf_nan=False)] = 0.0
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     codec: str = "auto"
@@ -96,8 +96,8 @@ class TopicOptions:
 
     @model_validator(mode="after")
     def _deadline(self) -> TopicOptions:
-        if self.queue == "deadline" and not self.deadline_ms:
-            raise ValueError("queue = 'deadline': deadline_ms is missing; set it above 0")
+        if self.queue == "deadline" and not self.deadline_s:
+            raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
         return self
 
 
@@ -117,7 +117,7 @@ class SourceConfig:
     :param packet_len: bytes on the wire, 14..4095
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
-    :param flush_timeout: s a partly filled packet waits for further messages; 0 = it is sent at once
+    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
     :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
     :param hop: initial hop count (TTL) 0..15
     :param packet_rate: packets/s offered to the flowgraph, 0 unpaced
@@ -142,7 +142,7 @@ class SourceConfig:
     packet_len: PacketLen = 220
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
-    flush_timeout: Seconds = 0.0
+    flush_timeout_s: Seconds = 0.0
     subscriber_depth: Count = 10
     hop: Annotated[int, Field(ge=0, le=15)] = 1
     packet_rate: Seconds = 0.0
@@ -198,7 +198,7 @@ class SinkConfig:
     :param packet_len: bytes on the wire, 14..4095, the same on both ends
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
-    :param reassembly_timeout: s an incomplete message is kept
+    :param reassembly_timeout_s: s an incomplete message is kept
     :param robot_id: own id: its packets and those for others are dropped and counted; -1 takes everything
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
@@ -219,7 +219,7 @@ class SinkConfig:
     packet_len: PacketLen = 220
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Count = 10
-    reassembly_timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     robot_id: RobotId = -1
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1)] = 16
     max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000

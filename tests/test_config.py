@@ -39,10 +39,10 @@ def test_defaults_are_valid(cls: type[Any]) -> None:
 
 def test_the_defaults_are_the_designs() -> None:
     source, sink = SourceConfig(), SinkConfig()
-    assert (source.packet_len, source.min_fragment, source.greedy, source.flush_timeout) == (220, 16, False, 0.0)
+    assert (source.packet_len, source.min_fragment, source.greedy, source.flush_timeout_s) == (220, 16, False, 0.0)
     assert (source.robot_id, source.dst_id, source.subscriber_depth, source.hop) == (-1, 255, 10, 1)
     assert (source.packet_rate, source.middleware, source.entry_ids, source.repeat_s) == (0, "dds", "sequential", 10.0)
-    assert (sink.namespace_format, sink.publisher_depth, sink.reassembly_timeout) == ("/rx_robot_{src_id}", 10, 1.0)
+    assert (sink.namespace_format, sink.publisher_depth, sink.reassembly_timeout_s) == ("/rx_robot_{src_id}", 10, 1.0)
     assert (sink.robot_id, sink.max_sources, sink.packet_len) == (-1, 16, 220)
 
 
@@ -69,15 +69,15 @@ def test_an_unknown_key_further_down_is_named_with_its_path() -> None:
         (SourceConfig, "hop", 16),
         (SourceConfig, "hop", -1),
         (SourceConfig, "min_fragment", 0),
-        (SourceConfig, "flush_timeout", -0.1),
-        (SourceConfig, "flush_timeout", float("nan")),
+        (SourceConfig, "flush_timeout_s", -0.1),
+        (SourceConfig, "flush_timeout_s", float("nan")),
         (SourceConfig, "packet_rate", float("inf")),
         (SourceConfig, "queue_depth", -1),
         (SourceConfig, "subscriber_depth", -1),
         (SourceConfig, "entry_ids", "backwards"),
         (SourceConfig, "domain_id", 233),
         (SourceConfig, "greedy", "perhaps"),
-        (SinkConfig, "reassembly_timeout", 0),
+        (SinkConfig, "reassembly_timeout_s", 0),
         (SinkConfig, "max_sources", 0),
         (SinkConfig, "max_source_bytes", 100),
         (SinkConfig, "publisher_depth", 1.5),

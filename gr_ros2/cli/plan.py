@@ -37,10 +37,10 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
     )
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
-    if (needed := planner.reassembly_timeout(forecast)) is not None:
+    if (needed := planner.reassembly_timeout_s(forecast)) is not None:
         console.print(
-            f"Needed: --set ros_sink.reassembly_timeout={needed:g}: up to {forecast.pause_s:.2f} s lie between two "
-            f"fragments of a message, after {planner.scenario.ros_sink.reassembly_timeout:g} s the sink gives it up",
+            f"Needed: --set ros_sink.reassembly_timeout_s={needed:g}: up to {forecast.pause_s:.2f} s lie between two "
+            f"fragments of a message, after {planner.scenario.ros_sink.reassembly_timeout_s:g} s the sink gives it up",
             soft_wrap=True,
         )
     if not no_advice:

@@ -185,10 +185,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
         return {**counted, "topics": {self._name(key): topic for key, topic in topics.items()}}
 
-    def set_reassembly_timeout(self, reassembly_timeout: float) -> None:
+    def set_reassembly_timeout_s(self, reassembly_timeout_s: float) -> None:
         """s an incomplete message is kept (raises ConfigError out of range)."""
         with self._lock:
-            self.config = self._receiver.config = replaced(self.config, reassembly_timeout=reassembly_timeout)
+            self.config = self._receiver.config = replaced(self.config, reassembly_timeout_s=reassembly_timeout_s)
             self._timer_due.notify_all()
 
     def set_debug(self, debug: bool) -> None:

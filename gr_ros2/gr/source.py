@@ -215,9 +215,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """Packets/s offered to the flowgraph, 0 unpaced (raises ConfigError out of range, like all setters)."""
         self._reconfigure(packet_rate=packet_rate)
 
-    def set_flush_timeout(self, flush_timeout: float) -> None:
+    def set_flush_timeout_s(self, flush_timeout_s: float) -> None:
         """s a partly filled packet waits for company."""
-        self._reconfigure(flush_timeout=flush_timeout)
+        self._reconfigure(flush_timeout_s=flush_timeout_s)
 
     def set_greedy(self, greedy: bool) -> None:
         """Several entries of one topic in a packet."""

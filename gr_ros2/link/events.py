@@ -45,7 +45,7 @@ class Lost:
     """A message of which at least one fragment arrived will never be complete.
 
     ``reason`` is a :class:`gr_ros2.link.ledger_rows.LedgerRow`: ``lost_fragments`` (overtaken, contradicted, or behind
-    an outage), ``expired`` (reassembly_timeout), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or
+    an outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or
     E); or the message is complete and its codec reports ``unknown_dictionary`` or ``damaged``.
     """
 

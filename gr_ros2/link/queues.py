@@ -42,7 +42,7 @@ class TopicQueue(deque[Outgoing]):
         self._interval = 1 / max_rate if max_rate else 0.0
         self._opens = float("-inf")
         self.since = inf
-        """When ``flush_timeout`` began to run: with the first message, or when a message started. A drop does not
+        """When ``flush_timeout_s`` began to run: with the first message, or when a message started. A drop does not
         restart it; otherwise a topic faster than the timeout would never be sent."""
 
     def change(self, policy: QueuePolicy, deadline_s: float) -> None:
@@ -134,8 +134,8 @@ def queue_for(
     :param period_s: their deadline: s within which they promise a message, 0 no promise
     """
     if options.queue is not None:
-        return options.queue, options.deadline_ms / 1e3
-    deadline_s = options.deadline_ms / 1e3 or lifespan_s
+        return options.queue, options.deadline_s
+    deadline_s = options.deadline_s or lifespan_s
     if options.depth == 1 or (options.depth is None and (depth == 1 or period_s)):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

@@ -95,7 +95,7 @@ class Receiver:
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Give up messages that have waited ``reassembly_timeout`` for their next fragment."""
+        """Give up messages that have waited ``reassembly_timeout_s`` for their next fragment."""
         events: list[ReceiverEvent] = []
         while (at := self.next_timeout()) is not None and at <= now:
             events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.EXPIRED))
@@ -104,7 +104,7 @@ class Receiver:
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
         for partial in self._partials:
-            return partial.last + self.config.reassembly_timeout
+            return partial.last + self.config.reassembly_timeout_s
         return None
 
     def unpublished(self, event: Delivered) -> Lost:

@@ -28,7 +28,7 @@ from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
-LIVE_SETTINGS = ("packet_rate", "flush_timeout", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
+LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that make sense to change while running."""
 
 _INTERVALS = 15
@@ -301,11 +301,11 @@ class Sender:
         self._busy_since = now if busy else inf
 
     def _departure(self, plan: Plan) -> float:
-        """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout``."""
-        if plan.full or self.config.flush_timeout == 0:
+        """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout_s``."""
+        if plan.full or self.config.flush_timeout_s == 0:
             return -inf
         waits = (min(message.submitted, self._queues[message.topic_id].since) for message in plan.picks)
-        return min(waits) + self.config.flush_timeout
+        return min(waits) + self.config.flush_timeout_s
 
     def _compose(self, plan: Plan, now: float) -> bytes:
         config = self.config

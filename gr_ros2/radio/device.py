@@ -58,8 +58,8 @@ class DeviceOptions(FrontEndOptions):
     :param lead: zero samples before each burst, while the amplifier settles
     :param tail: zero samples behind each burst at least
     :param multiple: samples a burst is filled up to a multiple of, for drivers that send whole transfers only
-    :param half_duplex: receive nothing while sending, and ``turnaround`` s afterwards
-    :param turnaround: s, with ``half_duplex``: from the end of a burst until the device hears again and what it heard
+    :param half_duplex: receive nothing while sending, and ``turnaround_s`` afterwards
+    :param turnaround_s: s, with ``half_duplex``: from the end of a burst until the device hears again and what it heard
         of the burst has come through its buffers; nothing is sent in it either
     """
 
@@ -76,7 +76,7 @@ class DeviceOptions(FrontEndOptions):
     tail: Count = 64
     multiple: Annotated[int, Field(ge=1, le=1 << 22)] = 1
     half_duplex: bool = False
-    turnaround: Seconds = 0.005
+    turnaround_s: Seconds = 0.005
 
     @property
     def receive_frequency(self) -> float:
@@ -105,7 +105,7 @@ class DeviceFrontEnd(FrontEnd):
         self._shaper = BurstShaper(self.layout, scale, phy.sample_rate)
         self._blanker: Blanker | None = None
         if chosen.half_duplex:
-            self._blanker = Blanker(self._shaper.sent, chosen.turnaround, phy.sample_rate)
+            self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
         self._gaps = GapCounter()
         self._given, self._taken = _Progress(), _Progress()
         self._transmitting: Any = None
@@ -147,7 +147,7 @@ class DeviceFrontEnd(FrontEnd):
 
     def _silence(self) -> float:
         """s after each burst in which nothing is sent."""
-        return float(self.options.guard + (self.options.turnaround if self.options.half_duplex else 0.0))
+        return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
     def airtime(self) -> float:
         return self.layout.total / self.phy.sample_rate + self._silence()

@@ -26,10 +26,10 @@ Hertz = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 class FrontEndOptions:
     """What every front end takes.
 
-    :param guard: s of silence after each packet
+    :param guard_s: s of silence after each packet
     """
 
-    guard: Seconds = 0.0
+    guard_s: Seconds = 0.0
 
 
 class FrontEnd(ABC):
@@ -78,7 +78,7 @@ class FrontEnd(ABC):
 
     def airtime(self) -> float:
         """s from the start of one packet to the earliest start of the next."""
-        return self.phy.airtime() + float(self.options.guard)
+        return self.phy.airtime() + float(self.options.guard_s)
 
     def early(self) -> float:
         """s before its airtime is over at which a packet has to come: 0 where samples need no time to pass."""

@@ -79,7 +79,7 @@ class Radio(PacketPath, HierBlock):
         self._follow(last, self)
 
     def _connect_samples(self, record: str, instrumented: bool) -> None:
-        """TransmitterBlock to front end, front end to receiver, where there is either."""
+        """Connect the transmitter to the front end, and the front end to the receiver, where they exist."""
         front_end = self.front_end
         front_end.wire(self)
         if front_end.sink is not None:

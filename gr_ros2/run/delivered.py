@@ -112,7 +112,7 @@ def bag_origin_ns(scenario: Scenario, topics: Collection[str]) -> int:
     :raises ConfigError: when the recording has none of the scenario's topics
     """
     if scenario.bag_path is None:
-        return round(scenario.sim.start_time * 1e9)
+        return round(scenario.sim.start_time_s * 1e9)
     first = next(iter(read_bag(scenario.bag_path, topics)), None)
     if first is None:
         raise ConfigError(f"{scenario.bag_path}: has no messages on {', '.join(topics)}")

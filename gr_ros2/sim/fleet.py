@@ -101,15 +101,15 @@ class Fleet:
         return np.array([self.true_pose(robot_id, float(t))[:2] for t in times]).reshape(-1, 2)
 
     def messages(
-        self, duration_s: float, start_time: float | None = None, topics: Collection[str] | None = None
+        self, duration_s: float, start_time_s: float | None = None, topics: Collection[str] | None = None
     ) -> Iterator[SimMessage]:
         """All messages with 0 <= t < duration_s, in time order, made as they are asked for.
 
         :param duration_s: s, may be infinite
-        :param start_time: stamps are this + t; None takes ``settings.start_time``
+        :param start_time_s: stamps are this + t; None takes ``settings.start_time_s``
         :param topics: absolute names of those wanted, None = all; the others change no byte of them
         """
-        start_ns = round((self.settings.start_time if start_time is None else start_time) * 1e9)
+        start_ns = round((self.settings.start_time_s if start_time_s is None else start_time_s) * 1e9)
         sensors = {i: Sensors(self.settings, self.world, i, self.state(i, 0.0), start_ns) for i in self.robot_ids}
         schedule = [event for i in self.robot_ids for event in self._first_events(i)]
         heapq.heapify(schedule)

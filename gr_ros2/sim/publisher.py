@@ -29,7 +29,7 @@ class SimPublisher:
 
     :param middleware: one graph for all robots, or one per robot id; robots left out do not publish
     :param duration_s: of play, s; may be infinite
-    :param start_time: called at ``start`` for the stamp of t = 0; None takes the fleet's ``start_time`` setting
+    :param start_time: called at ``start`` for the stamp of t = 0; None takes the fleet's ``start_time_s`` setting
     :param clock: monotonic, s
     :ivar published: messages published, per topic
     :ivar worst_lag_s: the longest that a message left after its time

@@ -34,7 +34,7 @@ class SimSettings:
     :param imu_gyro_noise: rad/s
     :param imu_accel_noise: m/s^2
     :param imu_orientation_noise: rad, about each axis
-    :param start_time: stamps are start_time + t, s
+    :param start_time_s: s, what the stamps begin at
     :param prefix_frames: frame ids carry the robot's name (robot_1/odom), for robots that share one graph
     """
 
@@ -58,7 +58,7 @@ class SimSettings:
     imu_gyro_noise: Noise = 0.01
     imu_accel_noise: Noise = 0.1
     imu_orientation_noise: Noise = 0.01
-    start_time: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
+    start_time_s: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
     prefix_frames: bool = False
 
     @model_validator(mode="after")

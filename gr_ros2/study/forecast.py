@@ -32,7 +32,7 @@ OVERHEAD_S = 0.0025
 _WALL_S = 1.7e9
 """s since 1970, of some day: a plan is the same on every day."""
 _MARGIN = 1.5
-"""A proposed ``reassembly_timeout`` beside the longest pause: what a lost packet and a busy computer add."""
+"""A proposed ``reassembly_timeout_s`` beside the longest pause: what a lost packet and a busy computer add."""
 _PARTS = (1, 2, 3)
 """Packets per message that packet lengths are tried for."""
 _BETTER = 0.97
@@ -109,7 +109,7 @@ class Planner:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
         if scenario.time == "real":
             # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
-            scenario = replace(scenario, sim=replaced(scenario.sim, start_time=_WALL_S))
+            scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
         self.scenario = scenario
         self.registry = scenario.load_registry()
         self.phy = make_phy(scenario, self.registry)
@@ -122,10 +122,10 @@ class Planner:
         """The scenario as it is."""
         return self._forecast(self.scenario)
 
-    def reassembly_timeout(self, forecast: Forecast) -> float | None:
-        """The sink's ``reassembly_timeout`` that this traffic needs, s, where the configured one is too short for
+    def reassembly_timeout_s(self, forecast: Forecast) -> float | None:
+        """The sink's ``reassembly_timeout_s`` that this traffic needs, s, where the configured one is too short for
         messages of several fragments to wait for their turns; None where it is not."""
-        if self.scenario.ros_sink.reassembly_timeout > forecast.pause_s:
+        if self.scenario.ros_sink.reassembly_timeout_s > forecast.pause_s:
             return None
         return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
 

@@ -25,9 +25,9 @@ def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixt
 
 
 def test_it_says_what_the_sink_needs(capsys: pytest.CaptureFixture[str]) -> None:
-    short = ["--set", "ros_sink.reassembly_timeout=0.3"]
+    short = ["--set", "ros_sink.reassembly_timeout_s=0.3"]
     assert run(["plan", "six-topics-paced", "--duration", "2", "--no-advice", *short]) == 0
-    assert "Needed: --set ros_sink.reassembly_timeout=1.3: up to 0.81 s lie" in capsys.readouterr().out
+    assert "Needed: --set ros_sink.reassembly_timeout_s=1.3: up to 0.81 s lie" in capsys.readouterr().out
 
 
 def test_without_advice(capsys: pytest.CaptureFixture[str]) -> None:

@@ -217,7 +217,7 @@ def test_grc_refuses_what_the_block_would_refuse(platform: Platform, setting: st
 
 @pytest.mark.parametrize(
     ("setting", "good", "bad"),
-    [("snr_db", "None", "101"), ("snr_db", "-3", "'20'"), ("packet_loss", "0.5", "1.1"), ("guard", "0.001", "-1")],
+    [("snr_db", "None", "101"), ("snr_db", "-3", "'20'"), ("packet_loss", "0.5", "1.1"), ("guard_s", "0.001", "-1")],
 )
 def test_grc_knows_the_range_of_a_radios_settings(platform: Platform, setting: str, good: str, bad: str) -> None:
     assert not complaints(platform, "sim_radio.grc", ["radio"], setting, good)

@@ -143,7 +143,7 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
 
 def test_an_incomplete_message_expires_without_further_packets(rig: Rig) -> None:
     events: list[Any] = []
-    rig.make(reassembly_timeout=0.05, observer=Hears(events.append))
+    rig.make(reassembly_timeout_s=0.05, observer=Hears(events.append))
     rig.start()
     rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
     wait_for(lambda: len(events) == 2)
@@ -287,7 +287,7 @@ def test_a_failing_observer_does_not_end_the_watch_over_timeouts(rig: Rig) -> No
         if isinstance(event, Lost):
             raise ValueError("observer")
 
-    sink = rig.make(reassembly_timeout=0.05, observer=Hears(fail))
+    sink = rig.make(reassembly_timeout_s=0.05, observer=Hears(fail))
     rig.start()
     for count in (1, 3):  # the second packet and what it began
         rig.probe.post(packets((0, stamped(count) + bytes(600)))[0])
@@ -373,15 +373,15 @@ def test_latency_by_simulated_clock(rig: Rig) -> None:
 def test_settings_change_while_running(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     sink = rig.make()
     rig.start()
-    sink.set_reassembly_timeout(0.05)
+    sink.set_reassembly_timeout_s(0.05)
     with caplog.at_level(logging.DEBUG, "gr_ros2.gr.sink"):
         sink.set_debug(True)
         rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
         wait_for(lambda: sink.stats()["topics"])
         assert "rx v0 qos=default" in caplog.text
     sink.set_debug(False)
-    with pytest.raises(ConfigError, match="reassembly_timeout"):
-        sink.set_reassembly_timeout(0.0)
+    with pytest.raises(ConfigError, match="reassembly_timeout_s"):
+        sink.set_reassembly_timeout_s(0.0)
 
 
 def test_stopped_started_and_closed_twice(rig: Rig) -> None:

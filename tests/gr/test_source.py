@@ -251,7 +251,7 @@ def test_settings_change_while_running(rig: Rig) -> None:
     source.set_dst_id(4)
     source.set_hop(2)
     source.set_greedy(True)
-    source.set_flush_timeout(0.0)
+    source.set_flush_timeout_s(0.0)
     source.set_packet_rate(1000.0)
     source.set_queue_depth(5)
     source.set_repeat_s(0.0)

@@ -146,7 +146,7 @@ def test_nothing_starves(sizes: list[int], classes: list[str], weights: list[flo
     cut = min(single - half - 6, 3 * single // 4)
     bounds = [TURN * topics * (1 + -(-size // cut)) for size in sizes]
     last = [0] * topics
-    sink = receiver(topics, packet_len=packet_len, reassembly_timeout=1e6)
+    sink = receiver(topics, packet_len=packet_len, reassembly_timeout_s=1e6)
     for packet in range(min(2 * max(bounds), 1500)):
         now = packet * 0.01
         for topic, size in enumerate(sizes):

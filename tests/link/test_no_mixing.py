@@ -42,7 +42,7 @@ class Link:
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
         self.receiver = Receiver(
-            registry(self.topics), build(SinkConfig, {"packet_len": 64, "reassembly_timeout": self.timeout})
+            registry(self.topics), build(SinkConfig, {"packet_len": 64, "reassembly_timeout_s": self.timeout})
         )
         self.arrived: dict[bytes, int] = {}
         self.complete: set[bytes] = set()

@@ -63,8 +63,8 @@ def test_a_queue_follows_the_depth_of_its_topic() -> None:
         ({}, 0, 0.0, 0.0, ("fifo", 0.0)),
         ({"depth": 5}, 1, 0.0, 0.1, ("fifo", 0.0)),
         ({"queue": "fifo"}, 1, 0.2, 0.1, ("fifo", 0.0)),
-        ({"deadline_ms": 50}, 10, 0.2, 0.0, ("deadline", 0.05)),
-        ({"queue": "latest", "deadline_ms": 50}, 10, 0.2, 0.0, ("latest", 0.05)),
+        ({"deadline_s": 0.05}, 10, 0.2, 0.0, ("deadline", 0.05)),
+        ({"queue": "latest", "deadline_s": 0.05}, 10, 0.2, 0.0, ("latest", 0.05)),
     ],
 )
 def test_a_queue_follows_its_publishers_where_it_is_not_configured(
@@ -90,12 +90,12 @@ def test_a_lifespan_found_late_holds_for_what_waits() -> None:
 
 
 def test_a_deadline_queue_needs_a_deadline() -> None:
-    with pytest.raises(ConfigError, match="deadline_ms is missing"):
+    with pytest.raises(ConfigError, match="deadline_s is missing"):
         build(TopicOptions, {"queue": "deadline"})
 
 
 def test_what_has_waited_too_long_is_stale() -> None:
-    source = engine(queue="deadline", deadline_ms=100)
+    source = engine(queue="deadline", deadline_s=0.1)
     source.submit(0, b"old", 0.0)
     source.submit(0, b"new", 0.06)
     assert [read(data).entries[0].payload for data in drain(source, 0.1)] == [b"new"]
@@ -104,7 +104,7 @@ def test_what_has_waited_too_long_is_stale() -> None:
 
 def test_what_cannot_be_across_in_time_is_not_started() -> None:
     source = sender(
-        topics=1, packet_len=64, packet_rate=10, topic_options={"t0": TopicOptions(queue="deadline", deadline_ms=250)}
+        topics=1, packet_len=64, packet_rate=10, topic_options={"t0": TopicOptions(queue="deadline", deadline_s=0.25)}
     )
     source.submit(0, bytes(3 * 51), 0.0)
     source.submit(0, bytes(2 * 51), 0.0)
@@ -118,7 +118,7 @@ def test_what_cannot_be_across_in_time_is_not_started() -> None:
 
 
 def test_what_has_become_pointless_is_abandoned_and_the_next_arrives() -> None:
-    source = engine(queue="deadline", deadline_ms=100)
+    source = engine(queue="deadline", deadline_s=0.1)
     sink = receiver(topics=1, packet_len=64)
     source.submit(0, b"a" * 100, 0.0)
     first = source.next_packet(0.0)
@@ -182,7 +182,7 @@ def test_a_capped_message_says_when_it_may_go() -> None:
 def test_every_message_ends_once(
     scheduler: str, steps: list[tuple[int, int, float]], policy: str, max_rate: float
 ) -> None:
-    options = build(TopicOptions, {"queue": policy, "deadline_ms": 60, "max_rate": max_rate, "queue_depth": 3})
+    options = build(TopicOptions, {"queue": policy, "deadline_s": 0.06, "max_rate": max_rate, "queue_depth": 3})
     source = sender(
         packet_len=64, scheduler=scheduler, packet_rate=50, topic_options={f"t{number}": options for number in range(3)}
     )

@@ -85,7 +85,7 @@ def test_a_fragment_that_says_other_flags_is_of_another_message() -> None:
 
 
 def test_a_message_that_makes_no_progress_expires() -> None:
-    sink = receiver(packet_len=64, reassembly_timeout=1.0)
+    sink = receiver(packet_len=64, reassembly_timeout_s=1.0)
     take(sink, packet(0, Entry(0, 5, 0, 3, b"a")), 0.0)
     assert sink.next_timeout() == pytest.approx(1.0)
     take(sink, packet(1, Entry(0, 5, 1, 3, b"b")), 0.9)
@@ -96,7 +96,7 @@ def test_a_message_that_makes_no_progress_expires() -> None:
 
 
 def test_a_message_64_ids_behind_is_given_up_whatever_the_timeout() -> None:
-    sink = receiver(packet_len=64, reassembly_timeout=1e9)
+    sink = receiver(packet_len=64, reassembly_timeout_s=1e9)
     take(sink, packet(0, Entry(0, 5, 0, 2, b"a")), 0.0)
     events = []
     for number in range(1, 64):
@@ -106,7 +106,7 @@ def test_a_message_64_ids_behind_is_given_up_whatever_the_timeout() -> None:
 
 
 def test_a_message_is_given_up_when_64_ids_would_have_passed_unseen() -> None:
-    sink = receiver(packet_len=64, reassembly_timeout=1e9)
+    sink = receiver(packet_len=64, reassembly_timeout_s=1e9)
     for number in range(40):
         take(sink, packet(number, Entry(0, number, 0, 1, b"x")), number * 0.1)
     take(sink, packet(40, Entry(0, 40, 0, 2, b"a")), 4.0)
@@ -134,7 +134,7 @@ def test_sources_beyond_the_bound_wait_until_one_has_gone_silent() -> None:
 
 
 def test_memory_is_bounded_oldest_incomplete_first() -> None:
-    sink = receiver(topics=1, packet_len=4095, max_source_bytes=10_000, reassembly_timeout=1e9)
+    sink = receiver(topics=1, packet_len=4095, max_source_bytes=10_000, reassembly_timeout_s=1e9)
     events = []
     for number in range(5):
         events += take(sink, packet(number, Entry(0, number, 0, 2, bytes(4000)), length=4095), 0.0)

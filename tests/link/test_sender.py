@@ -130,7 +130,7 @@ def test_a_full_queue_drops_the_oldest_that_has_not_started_and_counts_it() -> N
 
 
 def test_flush_timeout_waits_for_company_but_not_longer() -> None:
-    engine = sender(packet_len=220, flush_timeout=0.1)
+    engine = sender(packet_len=220, flush_timeout_s=0.1)
     engine.submit(0, bytes(101), 1.0)
     assert engine.next_packet(1.0) is None
     assert engine.next_timeout() == pytest.approx(1.1)
@@ -143,7 +143,7 @@ def test_flush_timeout_waits_for_company_but_not_longer() -> None:
 
 @pytest.mark.parametrize("queue", ["fifo", "latest"])
 def test_a_topic_faster_than_the_wait_for_company_still_leaves(queue: str) -> None:
-    engine = sender(packet_len=220, flush_timeout=1.0, queue_depth=10, topic_options={"t0": {"queue": queue}})
+    engine = sender(packet_len=220, flush_timeout_s=1.0, queue_depth=10, topic_options={"t0": {"queue": queue}})
     left = []
     for step in range(1000):
         now = step * 0.01
@@ -155,7 +155,7 @@ def test_a_topic_faster_than_the_wait_for_company_still_leaves(queue: str) -> No
 
 
 def test_a_full_packet_does_not_wait() -> None:
-    engine = sender(packet_len=220, flush_timeout=10.0)
+    engine = sender(packet_len=220, flush_timeout_s=10.0)
     engine.submit(0, bytes(207), 0.0)
     assert len(drain(engine)) == 1
 
@@ -237,7 +237,7 @@ def test_a_repeat_says_which_message_it_repeats() -> None:
 
 
 def test_a_latched_message_that_was_dropped_is_not_repeated() -> None:
-    options = TopicOptions(durability="transient_local", queue="deadline", deadline_ms=100)
+    options = TopicOptions(durability="transient_local", queue="deadline", deadline_s=0.1)
     engine = sender(packet_len=64, repeat_s=10, topic_options={"t1": options})
     engine.submit(1, b"latched", 0.0)
     assert drain(engine, 0.2) == []

@@ -46,10 +46,10 @@ def test_settings_are_replaced_one_by_one(tmp_path: Path) -> None:
     (tmp_path / "mine.csv").write_text("odom,nav_msgs/Odometry\n")
     path = tmp_path / "mine.yaml"
     path.write_text("{registry: mine.csv, ros_source: {robot_id: 1}, phy: {name: psk, sample_rate: 1e6}}")
-    config = load_link(path, ["front_end.guard=2e-3", "phy.sample_rate=5e5", "front_end.name=sim"])
+    config = load_link(path, ["front_end.guard_s=2e-3", "phy.sample_rate=5e5", "front_end.name=sim"])
     assert (config.name, config.phy.sample_rate) == ("mine", 5e5)
     assert config.registry == str(tmp_path / "mine.csv")
-    assert config.front_end_options == {"guard": 0.002}
+    assert config.front_end_options == {"guard_s": 0.002}
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_a_half_duplex_robot_hardly_hears_itself(driver: Path) -> None:
         "args": "driver=loopback",
         "frequency": 433e6,
         "half_duplex": True,
-        "turnaround": 0.2,
+        "turnaround_s": 0.2,
     }
     result = talk(driver, front_end, {"phy": {"name": "psk", "sample_rate": SLOW}}, count=4, wanted=0)
     assert result["packets"]["out"] >= 16
@@ -268,13 +268,13 @@ def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyP
     for half in ("_open_transmitter", "_open_receiver"):
         monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
     phy = PskPhy(64, RATE)
-    common = {"frequency": 433e6, "lead": 10, "tail": 20, "multiple": 1000, "guard": 0.003}
+    common = {"frequency": 433e6, "lead": 10, "tail": 20, "multiple": 1000, "guard_s": 0.003}
     full = SoapyFrontEnd(phy, **common)
     padded = -(-(phy.airtime_samples() + 30) // 1000) * 1000
     assert full.airtime() == pytest.approx(padded / RATE + 0.003)
     # A packet comes before the one before it is over, but not in the silence that is to follow that.
     assert full.early() == full.airtime()
-    unguarded = SoapyFrontEnd(phy, **{**common, "guard": 0.0})
+    unguarded = SoapyFrontEnd(phy, **{**common, "guard_s": 0.0})
     assert unguarded.early() > unguarded.airtime() == pytest.approx(padded / RATE)
-    half_duplex = SoapyFrontEnd(phy, half_duplex=True, turnaround=0.01, **common)
+    half_duplex = SoapyFrontEnd(phy, half_duplex=True, turnaround_s=0.01, **common)
     assert half_duplex.early() == half_duplex.airtime() == pytest.approx(full.airtime() + 0.01)

@@ -49,7 +49,7 @@ def test_the_channel_is_what_the_configuration_says() -> None:
 
 
 def test_packets_leave_at_the_pace_of_the_air() -> None:
-    with Robot(1, {"name": "sim", "guard": 0.01}) as robot:
+    with Robot(1, {"name": "sim", "guard_s": 0.01}) as robot:
         airtime = robot.link.stats()["phy"]["airtime_s"]
         assert airtime == pytest.approx(robot.link.phy.airtime() + 0.01)
         robot.say(*range(4))
@@ -111,8 +111,8 @@ def test_one_participant_serves_both_blocks_of_one_graph() -> None:
     [
         ({"phy": {"name": "direct"}, "channel": {"snr_db": 3}}, "channel.snr_db"),
         ({"phy": {"name": "psk", "sample_rate": 1e6, "options": {"sp": 3}}}, "unknown key sp"),
-        ({"front_end": {"name": "sim", "gain": 3}}, "front_end sim: unknown key gain; known are guard"),
-        ({"front_end": {"name": "sim", "guard": -1}}, "guard = -1"),
+        ({"front_end": {"name": "sim", "gain": 3}}, "front_end sim: unknown key gain; known are guard_s"),
+        ({"front_end": {"name": "sim", "guard_s": -1}}, "guard_s = -1"),
         ({"ros_sink": {"middleware": "bag"}}, "middleware = 'bag'"),
         ({"ros_sink": {"namespace_format": "/robot_{src_id}"}}, "loop"),
     ],

@@ -355,7 +355,7 @@ def test_the_engines_over_a_bad_link(
     ledger = Ledger()
     source = SourceConfig(robot_id=SRC, packet_len=64, queue_depth=queue_depth, repeat_s=0.5)
     sender = Sender(registry, source, rng=rng, observer=lambda event: ledger.sender_event(SRC, event))
-    receiver = Receiver(registry, SinkConfig(packet_len=64, reassembly_timeout=0.2))
+    receiver = Receiver(registry, SinkConfig(packet_len=64, reassembly_timeout_s=0.2))
     air: list[bytes] = []
     submitted = [0, 0]
     outcome = [0, 0]

@@ -55,7 +55,7 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
     given = ["-p", f"config:={config}", "-p", "ros_source.hop:=3", "-p", "diagnostics.period_s:=0.2"]
     process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy(), stderr=subprocess.PIPE, text=True)
     try:
-        names = ["ros_source.hop", "packet_len", "ros_source.flush_timeout"]
+        names = ["ros_source.hop", "packet_len", "ros_source.flush_timeout_s"]
         values = graph.ask(GetParameters, "get_parameters", GetParameters.Request(names=names)).values
         assert [value.integer_value for value in values[:2]] == [3, 220]
         described = graph.ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
@@ -64,10 +64,10 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
         assert packet_len.read_only
         assert packet_len.description.startswith("bytes on the wire")
         assert graph.set("ros_source.hop", 5) == (True, "")
-        assert graph.set("ros_source.flush_timeout", 0) == (True, "")
+        assert graph.set("ros_source.flush_timeout_s", 0) == (True, "")
         assert not graph.set("ros_source.hop", 50)[0]
         assert not graph.set("packet_len", 64)[0]
-        assert "greater than 0" in graph.set("ros_sink.reassembly_timeout", 0.0)[1]
+        assert "greater than 0" in graph.set("ros_sink.reassembly_timeout_s", 0.0)[1]
 
         heard: list[Header] = []
         counters: list[dict[str, Any]] = []

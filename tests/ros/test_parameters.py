@@ -59,7 +59,10 @@ def test_every_setting_is_a_parameter_with_its_meaning() -> None:
 def test_ranges_and_choices_are_those_of_the_configuration() -> None:
     found = flat(link_from(LINK))
     assert (found["packet_len"].minimum, found["packet_len"].maximum) == (14, 4095)
-    assert (found["ros_sink.reassembly_timeout"].minimum, found["ros_sink.reassembly_timeout"].rule) == (0, "above 0")
+    assert (found["ros_sink.reassembly_timeout_s"].minimum, found["ros_sink.reassembly_timeout_s"].rule) == (
+        0,
+        "above 0",
+    )
     assert found["ros_source.entry_ids"].rule == "one of sequential, random"
     assert (found["channel.snr_db"].minimum, found["channel.snr_db"].maximum) == (-50, 100)
     assert found["ros_source.hop"].strict and not found["channel.snr_db"].strict

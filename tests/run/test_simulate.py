@@ -136,14 +136,14 @@ def test_a_link_that_carries_everything_carries_everything() -> None:
 
 
 def test_messages_abandoned_midway_have_their_own_row_and_the_ledger_adds_up() -> None:
-    deadline = "ros_source.topic_options={odom: {queue: deadline, deadline_ms: 400}}"
+    deadline = "ros_source.topic_options={odom: {queue: deadline, deadline_s: 0.4}}"
     odom = only(run("narrow-ofdm-paced", deadline, "ros_source.compression=false", "ros_sink.compression=false"))
     assert {"cannot_complete", "stale"} & odom.ledger.keys()
     assert sum(odom.ledger.values()) == odom.sent
     # At 41 ms a packet five fit 250 ms; a first message of five begins, and others make it late.
     two = [Offered(0.0, 0, bytes(5 * 51)), Offered(0.001, 0, bytes(51))]
     late = simulate(
-        scenario("narrow-ofdm-paced", deadline.replace("400", "130"), "ros_source.compression=false"),
+        scenario("narrow-ofdm-paced", deadline.replace("0.4", "0.13"), "ros_source.compression=false"),
         messages=iter(two),
     )
     assert late.topics[0].ledger["abandoned"] == 1

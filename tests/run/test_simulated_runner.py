@@ -159,7 +159,7 @@ def test_many_runs_in_one_process_leave_little_shared_memory_behind() -> None:
 
 
 def test_what_is_delivered_is_kept_with_both_times(tmp_path: Path) -> None:
-    settings = ["time=packets", "sim.start_time=1000"]
+    settings = ["time=packets", "sim.start_time_s=1000"]
     outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=2.0), tmp_path / "out")
     bag = tmp_path / "out" / DELIVERED_BAG
     assert [info.topic for info in bag_topics(bag)] == ["/rx_robot_1/odom"]

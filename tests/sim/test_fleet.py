@@ -28,7 +28,7 @@ def fleet() -> Fleet:
 
 @pytest.fixture(scope="module")
 def messages(fleet: Fleet) -> list[SimMessage]:
-    return list(fleet.messages(DURATION, start_time=1000.5))
+    return list(fleet.messages(DURATION, start_time_s=1000.5))
 
 
 def parsed(messages: list[SimMessage], topic: str) -> list[tuple[float, Any]]:
@@ -36,14 +36,14 @@ def parsed(messages: list[SimMessage], topic: str) -> list[tuple[float, Any]]:
 
 
 def test_same_seed_same_bytes(fleet: Fleet, messages: list[SimMessage]) -> None:
-    assert list(fleet.messages(DURATION, start_time=1000.5)) == messages
-    assert list(Fleet(SimSettings(seed=3, start_time=1000.5)).messages(DURATION)) == messages
-    other = list(Fleet(SimSettings(seed=4, start_time=1000.5)).messages(DURATION))
+    assert list(fleet.messages(DURATION, start_time_s=1000.5)) == messages
+    assert list(Fleet(SimSettings(seed=3, start_time_s=1000.5)).messages(DURATION)) == messages
+    other = list(Fleet(SimSettings(seed=4, start_time_s=1000.5)).messages(DURATION))
     assert not {m.payload for m in other if m.topic.endswith("odom")} & {m.payload for m in messages}
 
 
 def test_a_topic_does_not_depend_on_the_others(messages: list[SimMessage]) -> None:
-    changed = Fleet(SimSettings(seed=3, start_time=1000.5, scan_rate=7.0, beams=90, imu_rate=20, map_rate=1.0))
+    changed = Fleet(SimSettings(seed=3, start_time_s=1000.5, scan_rate=7.0, beams=90, imu_rate=20, map_rate=1.0))
     kept = ("odom", "cmd_vel", "clock")
     assert [m for m in changed.messages(DURATION) if m.topic.endswith(kept)] == [
         m for m in messages if m.topic.endswith(kept)

@@ -59,16 +59,16 @@ def test_a_forecast_of_six_topics_is_what_the_flowgraph_does() -> None:
 
 
 def test_a_reassembly_timeout_too_short_for_turns_is_found_and_its_remedy_holds() -> None:
-    assert planner("paper-ofdm-paced", "ros_sink.reassembly_timeout=0.01").forecast().pause_s == 0, "one packet each"
-    short = planner("six-topics-paced", "ros_sink.reassembly_timeout=0.3")
+    assert planner("paper-ofdm-paced", "ros_sink.reassembly_timeout_s=0.01").forecast().pause_s == 0, "one packet each"
+    short = planner("six-topics-paced", "ros_sink.reassembly_timeout_s=0.3")
     forecast = short.forecast()
     assert forecast.pause_s == pytest.approx(TURN * 6 * forecast.airtime_s)
     assert [topic.result.ledger.get("expired", 0) for topic in forecast.topics if topic.topic.endswith("map")] == [1]
-    needed = short.reassembly_timeout(forecast)
+    needed = short.reassembly_timeout_s(forecast)
     assert needed is not None
-    remedied = planner("six-topics-paced", f"ros_sink.reassembly_timeout={needed}")
+    remedied = planner("six-topics-paced", f"ros_sink.reassembly_timeout_s={needed}")
     after = remedied.forecast()
-    assert remedied.reassembly_timeout(after) is None
+    assert remedied.reassembly_timeout_s(after) is None
     assert not any(topic.result.ledger.get("expired") for topic in after.topics)
 
 

@@ -89,7 +89,7 @@ class Lost:
     """A message of which something came will not be delivered.
 
     ``reason`` is a ledger row: ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered first),
-    ``expired`` (no fragment for ``reassembly_timeout``), ``memory``, ``unknown_topic`` (no table tells of its topic),
+    ``expired`` (no fragment for ``reassembly_timeout_s``), ``memory``, ``unknown_topic`` (no table tells of its topic),
     ``restarted`` (its sender did), or what the codec says of it.
     """
 

@@ -179,7 +179,7 @@ class Inbox:
         """Go on without what has been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout):
+        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
             self._lose(partial, "expired")
         return self._given()
 
@@ -190,7 +190,7 @@ class Inbox:
             times.append(self._gaps[0][0] + self._settings.hold_s)
         waiting = self._reassembly.next_timeout()
         if waiting is not None:
-            times.append(waiting + self._settings.reassembly_timeout)
+            times.append(waiting + self._settings.reassembly_timeout_s)
         return min(times) if times else None
 
     def close(self, reason: str) -> Events:

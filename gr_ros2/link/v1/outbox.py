@@ -238,7 +238,7 @@ class Outbox:
                 heappush(heap, (_RANK[following.qos], value, topic_id, position + 1))
         if not picks:
             return None
-        wait = self._settings.flush_timeout
+        wait = self._settings.flush_timeout_s
         if wait and room - used >= self._settings.min_fragment + _ENTRY:
             since = min(min(message.submitted, self._queues[message.topic_id].since) for message, _ in picks)
             if now < since + wait:
@@ -285,7 +285,7 @@ class Outbox:
         self._kept[TABLE_TOPIC] = deque([_Kept(table, False, self.digest)])
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
-        return queue.since + self._settings.flush_timeout if self._settings.flush_timeout else now
+        return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def _bound(self, topic_id: int) -> int:
         depth = None if self._topics is None else self._topics[topic_id].options.queue_depth

@@ -31,11 +31,11 @@ class Settings:
     :param report_every: packets received from one report to the next
     :param repeat_s: s between repeats of latched messages while nobody reports; 0 off
     :param give_up_s: s of silence after which a robot is taken for gone
-    :param reassembly_timeout: s that an incomplete message waits for its next fragment
+    :param reassembly_timeout_s: s that an incomplete message waits for its next fragment
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
     :param min_fragment: bytes of a message below which no fragment begins in a packet that others share
-    :param flush_timeout: s that a partly filled packet waits for company
+    :param flush_timeout_s: s that a partly filled packet waits for company
     :param packet_rate: packets/s, 0 unpaced or paced by credits
     :param queue_depth: messages waiting per topic; 0 unbounded
     :param depth: newer messages after which one of a topic without lifespan is not repaired any more, while nobody
@@ -55,11 +55,11 @@ class Settings:
     report_every: int = 5
     repeat_s: float = 10.0
     give_up_s: float = 10.0
-    reassembly_timeout: float = 60.0
+    reassembly_timeout_s: float = 60.0
     max_source_bytes: int = 32_000_000
     max_sources: int = 16
     min_fragment: int = 16
-    flush_timeout: float = 0.0
+    flush_timeout_s: float = 0.0
     packet_rate: float = 0.0
     queue_depth: int = 100
     depth: int = 16

@@ -236,7 +236,7 @@ def test_a_message_beyond_the_largest_is_refused() -> None:
 
 
 def test_a_lifespan_ends_repair_and_message() -> None:
-    topics = registry(odom=TopicOptions(queue="deadline", deadline_ms=200))
+    topics = registry(odom=TopicOptions(queue="deadline", deadline_s=0.2))
     one, two = Robot(1, topics, hears=False), Robot(2, hears=False)
     air = Air(one, two)
     air.run(2.5)
