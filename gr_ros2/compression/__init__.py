@@ -1,6 +1,7 @@
-"""Message compression inside version 0: fewer bytes per message, each message by itself (the C bit of the header).
+"""Message compression inside version 0: fewer bytes per message, each message coded independently (the C bit of the
+header).
 
-``LinkCodec(registry)`` is what a sender and a receiver take as their message codec;
+``LinkCodec(registry)`` is the message codec of a sender and a receiver;
 ``docs/explanation/compression.md`` has the format.
 """
 

@@ -1,10 +1,10 @@
-"""A message as one big integer: symbols pushed onto it and popped off again, last in, first out.
+"""Entropy coding: a message is one big integer; symbols are pushed onto it and popped off again, last in, first out.
 
 This is asymmetric numeral coding (J. Duda, arXiv:1311.2540) without its renormalisation: Python's integers are as long
 as needed, so that a message of a few dozen symbols costs its information, rounded up to whole bytes once.
 
-Invariants: for every ``push`` there is a ``pop`` that undoes it exactly; integer arithmetic only, so both ends compute
-the same tables on every machine; a pop never fails, whatever the number (0 has infinitely many zeros to give).
+Invariants: for every ``push`` there is a ``pop`` that undoes it exactly; only integer arithmetic is used, so both ends
+compute the same tables on every machine; a pop never fails, whatever the number (0 yields any number of zeros).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MASK = SCALE - 1
 class Table:
     """A static model of one alphabet.
 
-    :param weights: how likely each symbol is, relative to the others; 0 = never, and then it cannot be pushed
+    :param weights: relative probability of each symbol; a symbol with 0 cannot be pushed
     :ivar codes: per symbol (start, share) in units of 1/4096
     :ivar slots: per 12-bit slot (symbol, start, share)
     """
@@ -29,7 +29,7 @@ class Table:
     def __init__(self, weights: Sequence[int]) -> None:
         total = sum(weights)
         shares = [max(1, weight * SCALE // total) if weight else 0 for weight in weights]
-        # Rounding is settled with the likeliest symbols, which it hurts least.
+        # The rounding error is given to the likeliest symbols, where it costs least.
         order = sorted(range(len(shares)), key=lambda symbol: (-shares[symbol], symbol))
         excess = sum(shares) - SCALE
         for symbol in order:
@@ -58,9 +58,9 @@ class Table:
 
 
 _LENGTHS = Table([400, 300, 300, 300, 280, 260, 240, 220, *[160] * 8, *[60] * 16, *[16] * 33])
-"""Bit lengths 0..64: small numbers are likelier."""
+"""Model of bit lengths 0..64: small numbers are likelier."""
 _RANKS = Table([700, 900, 800, 600, 400, 300, 200, 100, 60, 30, 10, 5, 3, 2, 1, 1])
-"""Bit lengths of rank + 1, from 1, for lists in order of frequency."""
+"""Model of the bit lengths of rank + 1, from 1, for lists in order of frequency."""
 
 
 def push_natural(x: int, value: int) -> int:

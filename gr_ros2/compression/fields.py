@@ -1,11 +1,11 @@
-"""The codec ``fields``: a message taken apart by its type, each value coded for what it is.
+"""The codec ``fields``: a message is split by its type, and each value is coded according to its kind.
 
-A message becomes one number (see ``number``). Popped off it come, in order: byte order, options and tail; sequence
-lengths; live values (stamps, numbers); and what is left of the number is the static values (strings, matrices, flags),
-which therefore can be remembered under the number itself. Long arrays and strings follow as a second part.
+A message becomes one number (see ``ans``). Popping it yields, in order: byte order, options and tail; sequence lengths;
+live values (stamps, numbers). The rest of the number is the static values (strings, matrices, flags), so they can be
+cached with that number as the key. Long arrays and strings follow as a second part.
 
-Invariants: exact but for alignment gaps, which become zero; no message needs another; what is remembered only saves
-time; memory is bounded; decoding arbitrary bytes ends in a message or in a DamagedError.
+Invariants: exact except for alignment gaps, which become zero; no message needs another; caches only save time; memory
+is bounded; decoding arbitrary bytes gives a message or a DamagedError.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
 from gr_ros2.errors import DamagedError
 
 MAX_NUMBER = 8192
-"""Bytes of the number part: what MAX_SLOTS values can need; more is damage."""
+"""Bytes of the number part: the most that MAX_SLOTS values can need; a longer number is damage."""
 _REMEMBERED = 128
-"""Things of a kind that are remembered."""
+"""Entries of each cache."""
 _LAYOUTS_TRIED = 4
 
 _HEADERS = [bytes((0, order, 0, options)) for order in (1, 0) for options in range(4)]
@@ -62,7 +62,7 @@ _V = TypeVar("_V")
 
 
 class _Array(NamedTuple):
-    """A piece of the second part: item, bytes, bytes of an element, and how it was turned."""
+    """A piece of the second part: item, bytes, bytes of an element, and its transform."""
 
     item: int
     length: int
@@ -90,7 +90,7 @@ class FieldsCodec:
         self._values: dict[tuple[tuple[int, ...], int], tuple[Value, ...]] = {}
 
     def layout(self, payload: bytes) -> tuple[Layout, tuple[Any, ...]] | None:
-        """The layout of a payload and its values; None where it is no message of the type, or one of too many parts."""
+        """The layout of a payload and its values; None where it is not a message of the type, or has too many parts."""
         recent = self._recent.get(len(payload))
         if recent is not None:
             for layout in recent:
@@ -110,7 +110,7 @@ class FieldsCodec:
         return found, found.unpack(payload)
 
     def encode(self, payload: bytes) -> tuple[bytes, bool] | None:
-        """The coded message, and whether it has a second part; None where the payload cannot be taken apart."""
+        """The coded message, and whether it has a second part; None where the payload cannot be split."""
         found = self.layout(payload)
         if found is None:
             return None
@@ -141,8 +141,8 @@ class FieldsCodec:
     def decode(self, coded: bytes, with_blob: bool, max_size: int) -> bytes:
         """The message.
 
-        :param max_size: bytes; more are not made
-        :raises DamagedError: no such message, or a larger one than is taken
+        :param max_size: most bytes of the message
+        :raises DamagedError: not a coded message, or a message larger than ``max_size``
         """
         try:
             return self._decode(coded, with_blob, max_size)
@@ -152,7 +152,7 @@ class FieldsCodec:
             raise DamagedError(f"damaged message: {' '.join(str(error).split())}") from error
 
     def static_values(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
-        """What a template of this message would be (``Model.templates``); None where it has no use for one."""
+        """The template of this message (``Model.templates``); None where it cannot use one."""
         found = self.layout(payload)
         if found is None or found[0].long_texts or (prepared := self._prepare(found[0].shape.counts)) is None:
             return None
@@ -161,7 +161,7 @@ class FieldsCodec:
             0, values, prepared.plan.static_values, self._model.words, self._model.constants
         )
 
-    # Preparation, remembered
+    # Preparation, cached
 
     def _prepare(self, counts: tuple[int, ...], max_items: int = 4 * MAX_PARTS) -> Prepared | None:
         made = self._prepared.get(counts)
@@ -244,7 +244,7 @@ class FieldsCodec:
     def _blob(
         self, layout: Layout, prepared: Prepared, values: Sequence[Any]
     ) -> tuple[bytes, list[tuple[int, int]], int]:
-        """(second part, way of each array, whether it is compressed)"""
+        """(second part, transform of each array, whether it is compressed)"""
         ways, parts = [], []
         for slot in prepared.bulk:
             data = values[slot.index]
@@ -371,11 +371,11 @@ class FieldsCodec:
         else:
             rest, found = pop_static(rest, prepared.plan.static_values, self._model.words, self._model.constants)
         if rest:
-            raise DamagedError("damaged message: more than was wanted")
+            raise DamagedError("damaged message: more values than its type has")
         return _remember(self._values, known, tuple(found))
 
     def _take_blob(self, blob: bytes, packed: int, arrays: Sequence[_Array], values: list[Any], max_size: int) -> None:
-        """Put the arrays and long strings of the second part into their places."""
+        """Store the arrays and long strings of the second part in their items."""
         size = sum(array.length for array in arrays)
         if size > max_size:
             raise DamagedError(f"damaged message: larger than {max_size} bytes")
@@ -391,7 +391,7 @@ class FieldsCodec:
 
 
 def _remember(memory: dict[_K, _V], key: _K, value: _V) -> _V:
-    """Keep something that can always be made again, and forget what has been kept for longest."""
+    """Cache a value that can always be computed again; drop the oldest entry when the cache is full."""
     if len(memory) >= _REMEMBERED:
         del memory[next(iter(memory))]
     memory[key] = value

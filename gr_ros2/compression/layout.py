@@ -1,10 +1,11 @@
-"""From a shape to a compiled plan: one ``struct`` call takes a message apart, one puts it together.
+"""From a shape to a compiled layout: one ``struct`` call splits a message, one packs it.
 
 An *outline* holds for all messages of a type with the same sequence lengths: which values there are and how each is
 coded. A *layout* adds the lengths of the strings, and thereby every offset.
 
 Invariants: alignment gaps are skipped on the way in and zero on the way out; values are read as bits, never as floats,
-so that every NaN survives; what is coded how depends on the type and on sequence lengths only, which the decoder knows.
+so that every NaN survives; how a value is coded depends only on the type and on sequence lengths, which the decoder
+knows.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 from gr_ros2.compression.schema import HEADER, MAX_PARTS, SIZES, Composite, Node, Repeat, Scalar, Shape, Text
 
 MAX_SLOTS = 640
-"""Values coded one by one; a message with more is not taken apart, which bounds the time of either end."""
+"""Most values that are coded one by one; a message with more is not split, which bounds the time at both ends."""
 MAX_CODED_ITEMS = 5 * MAX_SLOTS
 """No message of MAX_SLOTS values has more items (a quaternion has four)."""
 FEW = 16
@@ -26,21 +27,22 @@ FEW = 16
 LONG_TEXT = 64
 """Strings of more bytes are coded in bulk with the arrays."""
 MATRICES = {9: 3, 36: 6}
-"""Fixed float64 arrays of these lengths are taken as square matrices: length -> side."""
+"""Fixed float64 arrays of these lengths are treated as square matrices: length -> side."""
 
 TIME, QUATERNION, DOUBLE, SINGLE, INTEGER, OCTETS, BULK = range(7)
-"""Live values: in most messages another one."""
+"""Live values: they differ from message to message."""
 STRING, MATRIX, SMALL = range(3)
-"""Ballast: in most messages the same as in the one before, so that the work is remembered (never the bytes sent)."""
+"""Static values: usually the same as in the message before, so that the coded result is cached (the bytes are always
+sent)."""
 
 _BITS = {"d": "Q", "f": "I"}
 _TIME = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 
 
-@dataclass(slots=True)  # not frozen, which would make preparing a message for the first time take a third longer
+@dataclass(slots=True)  # not frozen: frozen instances would make the preparation of a new message a third slower
 class Slot:
-    """One thing to code. Never changed.
+    """One value to code. Never modified.
 
     :param index: of its (first) item
     :param real: of its (first) item among the floats, -1 for none; BULK: 0 for floats
@@ -200,9 +202,9 @@ class Layout:
         self._expected = tuple(expected)
 
     def fits(self, values: tuple[Any, ...]) -> bool:
-        """Whether values unpacked by this layout are of its shape."""
+        """Whether values unpacked by this layout have its shape."""
         return bool(self._picked(values) == self._expected)
 
     def normalised(self, payload: bytes) -> bytes:
-        """The payload with zeros in its alignment gaps."""
+        """The payload with its alignment gaps set to zero."""
         return self.pack(*self.unpack(payload))

@@ -1,13 +1,13 @@
-"""The message codec of a link: for each topic, what its registry row and options ask for.
+"""The message codec of a link: for each topic, the codec that its registry row and options select.
 
 First byte of a coded message: high nibble, the dictionaries used (0 none, 1..14 a shipped set, 15 a user's own, whose
 two-byte id follows); low nibble, the codec (0 stored, 1 zstd, 2 fields, 3 fields with a second part). 0x00 is stored
 as it is.
 
-Invariants: a coded message is at most one byte longer than the message; what comes out is the message that went in, but
-for alignment gaps (zero) and for fields that were asked to be quantised (within their bound); decoding arbitrary bytes
-raises CodecError and nothing else, never makes more than ``max_size`` bytes, and takes time in proportion to the bytes
-decoded (``bounds``); a dictionary that is not held, or is another one, is an UnknownDictionaryError.
+Invariants: a coded message is at most one byte longer than the message; the decoded message equals the original, except
+for alignment gaps (zero) and quantised fields (within their bound); decoding arbitrary bytes raises only CodecError,
+never makes more than ``max_size`` bytes, and takes time proportional to the bytes decoded (``bounds``); a missing or
+different dictionary is an UnknownDictionaryError.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")
-"""Values of a topic's option ``codec``; auto takes fields where the type is known, zstd where not or where shorter."""
+"""Values of a topic's option ``codec``; auto uses fields where the type is known, and zstd where it is not or where
+zstd is shorter."""
 MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in FORMATS.values())
 """Bytes; what a link can carry uncompressed."""
 
@@ -38,8 +39,8 @@ class LinkCodec:
 
     Both ends need the same registry and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
 
-    :param dictionaries: a user's own, or their files; the first that knows a topic's type serves it, otherwise the
-        shipped ones do
+    :param dictionaries: a user's own dictionaries, or their files; the first one with a topic's type is used, otherwise
+        the shipped one
     :param max_size: bytes; larger messages are stored, and nothing larger is decoded
     :raises ConfigError: a file that is no dictionary, two that share an id, a wrong ``codec`` or ``quantize``
     """
@@ -61,9 +62,11 @@ class LinkCodec:
         self._topics = [TopicCodec(topic, sets, max_size) for topic in registry]
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
-        """What the far end gets of a message: its alignment gaps zero, its chosen fields rounded, all else as it is.
+        """The message that the other end gets: alignment gaps are zero, quantised fields are rounded, the rest is
+        unchanged.
 
-        It follows from the type alone, not from what was coded: so it tells a codec that errs from one that does not.
+        It is computed from the type alone, independently of the coded bytes, so that comparing with it detects errors
+        of the codec.
 
         :raises IndexError: a topic id that is not in the registry
         """
@@ -160,7 +163,7 @@ class TopicCodec:
         return coders.fields.decode(body, codec == FIELDS_AND_MORE, max_size)
 
     def canonical(self, payload: bytes) -> bytes:
-        """See LinkCodec. A message that is stored by configuration keeps its gaps."""
+        """See LinkCodec. A message that the configuration stores uncoded keeps its gaps."""
         fields = self._coders.fields
         if fields is None or len(payload) > self._max_size or (self._mode == "none" and self._quantizer is None):
             return payload
@@ -178,9 +181,9 @@ class TopicCodec:
 
 
 class _Coders:
-    """What one set of dictionaries offers for one topic.
+    """The coders of one set of dictionaries for one topic.
 
-    All of it is made at once: what comes from the air never makes a receiver prepare what it could have had ready.
+    All of them are made in advance, so that a received message never causes this work.
 
     :ivar tree: the type, None where it is not known
     :ivar fields: None where the type is not known

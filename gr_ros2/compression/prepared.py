@@ -1,6 +1,6 @@
-"""An outline together with what a dictionary knows about it, ready for use.
+"""An outline together with the models of a dictionary, ready for use.
 
-Invariant: follows from type, sequence lengths and dictionary alone, so both ends prepare the same.
+Invariant: it depends only on type, sequence lengths and dictionary, so both ends prepare the same.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TEMPLATES = Table([1200, 500, 300, 200, *[60] * 11, 1100])
 
 @dataclass(frozen=True)
 class Model:
-    """What a dictionary knows about one type.
+    """The knowledge of a dictionary about one type.
 
     :param classes: letter of each field's float class, by path
     :param templates: sets of static values for given sequence lengths, as coded without templates
@@ -34,7 +34,7 @@ class Model:
 
 
 class Prepared:
-    """An outline with its models and with what was remembered about its messages."""
+    """An outline with its models and with cached results for its messages."""
 
     def __init__(self, plan: Outline, model: Model, counts: tuple[int, ...]) -> None:
         self.plan = plan

@@ -1,6 +1,6 @@
 """Stamps and durations: seconds and nanoseconds in as few bits as their range needs.
 
-Invariant: exact for all pairs of 32-bit numbers, sensible or not.
+Invariant: exact for all pairs of 32-bit numbers, valid or not.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The part of a message that is usually the same in the next one: frame names, covariance matrices, flags.
 
-Coded thoroughly and slowly; the codec remembers the outcome, so that a message costs no more than a look-up unless its
+They are coded compactly and slowly; the codec caches the result, so that a message costs only a look-up unless its
 static values are new.
 
-Invariants: exact for all bytes; depends on nothing but the message and the dictionary; a pop raises IndexError for a
-word or constant that the dictionary has not, and nothing else.
+Invariants: exact for all bytes; the result depends only on the message and the dictionary; a pop raises only
+IndexError, for a word or constant that is not in the dictionary.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Value = bytes | int
 _KNOWN, _NUMBERED, _SPELLED, _OCTETS, _LONG = range(5)
 _TEXTS = Table([2800, 400, 600, 60, 200])
 STEMS = ("robot_", "robot", "r", "tb3_", "tb", "turtle", "turtlebot", "husky", "jackal", "uav", "drone", "ugv", "agent")
-"""Names of robots in front of a number; part of the format, so only ever appended to."""
+"""Names of robots in front of a number; they are part of the format, so new ones are only appended."""
 _NUMBERED_TEXT = re.compile(rb"(/?)([a-z][a-z0-9]*?_?)([0-9]{1,6})([/_])(.+)", re.DOTALL)
 _LETTERS = b"etaoinsrhldcumfpgwybvkxjqz_/0123456789.-~ ABCDEFGHIJKLMNOPQRSTUVWXYZ:,()[]{}<>=+*'\"!?#@%&|\\^$;`"
 _SPELLING = Table([*[300] * 10, *[180] * 10, *[60] * 6, 250, 200, *[80] * 10, *[40] * 4, *[12] * (len(_LETTERS) - 42)])
@@ -47,13 +47,13 @@ class Words:
 
 
 def numbered(text: bytes) -> bool:
-    """Whether a string is a known robot's name and number in front of another."""
+    """Whether a string begins with a known robot's name and number."""
     match = _NUMBERED_TEXT.fullmatch(text)
     return match is not None and match[2].decode() in STEMS
 
 
 def push_static(x: int, values: Sequence[Value], slots: Sequence[Slot], words: Words, constants: KnownNumbers) -> int:
-    """Push all values, so that they come off in order."""
+    """Push all values, so that they are popped in order."""
     last: dict[int, bytes] = {}
     again = []
     for value, slot in zip(values, slots, strict=True):
@@ -130,7 +130,7 @@ def _pop_text(x: int, words: Words) -> tuple[int, Value]:
     if kind == _LONG:
         return x, length
     if length > LONG_TEXT:
-        raise IndexError("a long string where a short one was said")
+        raise IndexError("a long string where a short one was announced")
     if kind == _OCTETS:
         return x >> 8 * length, (x & ((1 << 8 * length) - 1)).to_bytes(length, "big")
     text = bytearray()
@@ -142,7 +142,7 @@ def _pop_text(x: int, words: Words) -> tuple[int, Value]:
 
 @cache
 def _matrix(side: int) -> tuple[Struct, Struct, tuple[int, ...], tuple[int, ...]]:
-    """Its structs as bits and as floats, the places of its diagonal, and of its upper triangle."""
+    """Structs of a matrix as bits and as floats, the indexes of its diagonal, and of its upper triangle."""
     size = side * side
     upper = tuple(side * row + column for row in range(side) for column in range(row, side))
     return Struct(f"<{size}Q"), Struct(f"<{size}d"), tuple(range(0, size, side + 1)), upper

@@ -30,10 +30,10 @@ from gr_ros2.compression.zstd_frames import Zstd, train
 _T = TypeVar("_T")
 
 MAX_SAMPLES = 1000
-"""Messages of a type that are looked at, evenly spread."""
+"""Most messages of a type that are analysed, evenly spread."""
 MAX_WORDS, MAX_CONSTANTS, MAX_TEMPLATES = 1000, 250, 15
 _COMMON = 0.02
-"""A constant or a set of static values is worth a place from this share of a type's messages on."""
+"""A constant or a set of static values enters the dictionary if at least this share of a type's messages has it."""
 _VALUES_PER_CLASS = 150
 
 
@@ -49,8 +49,8 @@ def learn(
     """A dictionary from sample messages.
 
     :param messages: (type name, payload)
-    :param base: its words and constants follow after those that were learned
-    :param definitions: ``.msg`` texts of types that ROS 2 Humble has not; kept in the dictionary
+    :param base: its words and constants follow after the learned ones
+    :param definitions: ``.msg`` texts of types that are not in ROS 2 Humble; kept in the dictionary
     :param zstd_size: bytes of each type's zstd dictionary at most; 0 = none
     """
     types = Types(definitions)
@@ -77,7 +77,7 @@ def learn(
 
 
 class _Seen:
-    """What the samples of one type hold."""
+    """Statistics of the samples of one type."""
 
     def __init__(self, tree: Composite | None, payloads: Sequence[bytes]) -> None:
         self._tree = tree
@@ -106,7 +106,7 @@ class _Seen:
             value = values[slot.index]
             if slot.kind == STRING and 0 < len(value) <= LONG_TEXT and value[-1] == 0:
                 if numbered(value):
-                    continue  # the codec composes the names of numbered robots
+                    continue  # the codec composes the names of numbered robots itself
                 try:
                     self.words[value[:-1].decode()] += 1
                 except UnicodeDecodeError:
@@ -127,7 +127,7 @@ class _Seen:
             self.constants[bits] += 1
 
     def classes(self, constants: KnownNumbers) -> dict[str, str]:
-        """The letter of each field for which the default is not the best."""
+        """The letter of each field for which the default class is not the best."""
         found: dict[str, str] = {}
         for path, (kind, samples) in self._samples.items():
             costs = {letter: _bits(kind, samples, class_table(letter), constants) for letter in CLASSES}
@@ -149,7 +149,7 @@ def _codec(tree: Composite | None, model: Model) -> FieldsCodec | None:
 
 
 def _bits(kind: int, samples: Sequence[Any], table: Table, constants: KnownNumbers) -> int:
-    """What the numbers of a field cost with a class, bits."""
+    """Cost of the numbers of a field with a class, bits."""
     x = 1
     for bits, reals in samples[:: max(1, len(samples) // _VALUES_PER_CLASS)]:
         if kind == QUATERNION:
@@ -162,7 +162,7 @@ def _bits(kind: int, samples: Sequence[Any], table: Table, constants: KnownNumbe
 
 
 def _ranked(counted: Sequence[Counter[_T]], base: Sequence[_T], limit: int) -> list[_T]:
-    """What most types have most of, then the rest of ``base``."""
+    """Values in order of frequency over the types, then the rest of ``base``."""
     total: Counter[_T] = Counter()
     for counter in counted:
         total.update(counter)
@@ -172,7 +172,7 @@ def _ranked(counted: Sequence[Counter[_T]], base: Sequence[_T], limit: int) -> l
 
 
 def _zstd_dictionary(samples: list[bytes], size: int) -> bytes:
-    """A trained dictionary; where samples are too few or too small for that, the samples themselves."""
+    """A trained dictionary; where the samples are too few or too small for training, the samples themselves."""
     if not size:
         return b""
     try:

@@ -1,10 +1,11 @@
-"""zstd without what a link does not need: magic, frame header, checksum and, where one block is all, its header too.
+"""zstd data without the parts that a link does not need: magic, frame header, checksum and, for a single block, its
+header.
 
 Coded form: a varint of 2 * size + (1 where the rest is the content of one compressed block, 0 where it is blocks with
 their headers), then the blocks.
 
-Invariants: the size comes first and is checked against a bound before anything is unpacked, and no more than that is
-ever unpacked, so that a small message cannot become a large one; whatever the bytes, only CodecError comes out.
+Invariants: the size comes first and is checked against a bound before decompression, which never gives more bytes than
+that, so that a small message cannot become a very large one; arbitrary bytes raise only CodecError.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _MAX_BLOCK = 1 << 21
 class Zstd:
     """One compressor and its decompressor.
 
-    :param dictionary: what both ends hold, made by ``train`` or any bytes to refer to; b'' = none
+    :param dictionary: a dictionary that both ends have, made by ``train``, or any bytes to refer to; b'' = none
     """
 
     def __init__(self, dictionary: bytes = b"", level: int = 12) -> None:
@@ -48,8 +49,8 @@ class Zstd:
     def compress(self, data: bytes, sized: bool = True, least: int = 0) -> bytes:
         """The coded form.
 
-        :param sized: false: the varint is only the flag, for a size that both ends know
-        :param least: bytes that the coded form has to have; a shorter one begins with empty blocks
+        :param sized: False: the varint is only the flag, for a size that both ends know
+        :param least: fewest bytes of the coded form; a shorter one is padded with empty blocks at the start
         """
         frame: bytes = self._compressor.compress(data, self._compressor.FLUSH_FRAME)
         descriptor = frame[4]
@@ -67,9 +68,9 @@ class Zstd:
     def decompress(self, coded: bytes, max_size: int, size: int | None = None) -> bytes:
         """The data.
 
-        :param max_size: more is refused
-        :param size: what both ends know it to be, None where the coded form says it
-        :raises DamagedError: no such data, or more than ``max_size``
+        :param max_size: a larger size is refused
+        :param size: size that both ends know, None where the coded form contains it
+        :raises DamagedError: not such data, or more than ``max_size``
         """
         value, start = read_varint(coded, 0)
         if size is None:
@@ -77,11 +78,11 @@ class Zstd:
         elif value > 1:
             raise DamagedError("damaged message: two sizes")
         if size > max_size:
-            raise DamagedError(f"damaged message: says it has {size} bytes, at most {max_size} are taken")
+            raise DamagedError(f"damaged message: claims {size} bytes, at most {max_size} are accepted")
         body = coded[start:]
         if value & 1:
             if len(body) >= _MAX_BLOCK:
-                raise DamagedError("damaged message: a block longer than zstd has")
+                raise DamagedError("damaged message: a block longer than zstd allows")
             body = (len(body) << 3 | _COMPRESSED_BLOCK << 1 | 1).to_bytes(3, "little") + body
         frame = b"".join((_MAGIC, _SINGLE_SEGMENT_WITH_SIZE, size.to_bytes(4, "little"), body))
         decompressor: Any = zstd.ZstdDecompressor(zstd_dict=self._dictionary)
@@ -97,7 +98,7 @@ class Zstd:
 def train(samples: list[bytes], size: int) -> bytes:
     """A zstd dictionary of at most ``size`` bytes from sample messages.
 
-    :raises ValueError: when the samples are too few or too alike to train on
+    :raises ValueError: when the samples are too few or too similar for training
     """
     try:
         content: bytes = zstd.train_dict(samples, size).dict_content
@@ -130,4 +131,4 @@ def read_varint(data: bytes, at: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value, at
-    raise DamagedError("damaged message: a number without end")
+    raise DamagedError("damaged message: a number that does not end")

@@ -1,7 +1,7 @@
-"""The table of ROS graphs, and how one is joined by name.
+"""The table of middlewares, and joining a ROS graph by name.
 
-Invariant: what the rest of the program has to know of a middleware before it is loaded stands in its row; nobody else
-knows one by its name.
+Invariant: the row of a middleware has everything that the rest of the program needs to know before it is loaded; no
+other module mentions a middleware by name.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from gr_ros2.middleware.base import Middleware
 class GraphBackend(Backend):
     """One row of the middleware table.
 
-    :param scope: who is on its graph: ``shared``, other processes and machines too; ``process``, this process alone;
-        ``none``, nobody: it is opened by a path and not by a domain
-    :param meets: other rows whose participants in the same domain it may hear; a source and a sink that can hear each
-        other must not carry the same topics
+    :param scope: who can join its graph: ``shared``, other processes and machines; ``process``, only this process;
+        ``none``, nobody: it is opened by a path instead of a domain
+    :param meets: other rows whose participants in the same domain it may receive from; a source and a sink on such
+        graphs must not carry the same topics
     :param localhost_only: whether its constructor takes ``localhost_only``
     """
 
@@ -47,7 +47,7 @@ MIDDLEWARE = BackendTable(
             "a sourced ROS 2 (Humble or later)",
             "a sourced ROS 2 setup",
             title="rclpy (ROS 2)",
-            meets=("dds", "zenoh"),  # whichever its RMW is
+            meets=("dds", "zenoh"),  # depending on its RMW
             localhost_only=True,
         ),
         "zenoh": GraphBackend(
@@ -71,14 +71,15 @@ MIDDLEWARE = BackendTable(
 
 
 def join_graph(name: str, *, domain_id: int, node_name: str, localhost_only: bool | None = None) -> Middleware:
-    """A participant of one's own on a graph, to be closed by who asked for it.
+    """A new participant on a graph; the caller closes it.
 
     :param name: of the table
     :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID
-    :param node_name: what it is called there
-    :param localhost_only: whether it stays on the loopback interface, where the middleware has a say in that; None
-        takes the environment's
-    :raises ConfigError: for a name that is not in the table, or is a file's; for a setting the middleware refuses
+    :param node_name: its name on the graph
+    :param localhost_only: whether it uses only the loopback interface, where the middleware supports that; None takes
+        the environment's setting
+    :raises ConfigError: for a name that is not in the table or stands for a file; for a setting that the middleware
+        refuses
     :raises BackendMissingError: when its package is not installed
     :raises MiddlewareError: when the graph cannot be joined
     """
@@ -97,12 +98,12 @@ def join_graph(name: str, *, domain_id: int, node_name: str, localhost_only: boo
 
 
 def meet(one: Middleware, other: Middleware) -> bool:
-    """Whether what one participant publishes the other can hear."""
+    """Whether one participant can receive messages of the other."""
     if one is other:
         return True
     return one.domain_id is not None and one.domain_id == other.domain_id and bool(_networks(one) & _networks(other))
 
 
 def _networks(graph: Middleware) -> set[str]:
-    row = MIDDLEWARE.get(graph.name)  # one handed over as an object need not be in the table
+    row = MIDDLEWARE.get(graph.name)  # a middleware passed as an object need not be in the table
     return {graph.name, *(row.meets if row else ())}

@@ -1,4 +1,4 @@
-"""The gate in front of a simulated transmitter: packets pass at the pace of the air, and credits flow back.
+"""The gate in front of a simulated transmitter: packets pass one per airtime, and credits flow back.
 
 Invariants: no packet passes before its airtime is over, or ``early`` before that where a device spends the time
 (`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
@@ -85,7 +85,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 self.message_port_pub(CREDIT, _ONE)
 
     def _step(self) -> tuple[list[Any], int]:
-        """What is due, after waiting for it if nothing is yet."""
+        """What is due; waits until something is due."""
         now = time.monotonic()
         pdus, credits = self._clock.due(now), self._clock.grants(now)
         if not pdus and not credits:

@@ -1,8 +1,9 @@
-"""Bursts of fixed length without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
+"""Bursts of fixed length without GNU Radio: frames, the interface of a modem, and a receiver that finds packets in a
+stream of samples.
 
-Invariants: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet
-comes out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and
-the search goes on right behind its first sample, so that it cannot hide the next one.
+Invariants: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so each output packet equals the packet
+sent; a packet comes out as soon as its last sample is in; samples between bursts are examined once; a damaged frame is
+counted and the search continues right after its first sample, so that it cannot hide the next one.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ Octets = NDArray[np.uint8]
 
 CRC_LEN = 4
 _LOOKED_BACK = 16
-"""Packets whose SNRs make one: a single preamble is short, and says it to a decibel."""
+"""Packets whose SNRs are averaged (median): a single preamble is short, and gives the SNR only to 1 dB."""
 _LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
-"""Beyond these a preamble says nothing: no packet arrives, or what is left is rounding."""
+"""Limits of a measured SNR: below no packet arrives, above only rounding errors remain."""
 _SPARE = 1 << 16
-"""Samples a receiver's memory holds beside one burst; more of it means less moving."""
+"""Samples that a receiver's memory holds in addition to one burst; a larger memory is moved less often."""
 
 
 class Frame:
-    """Packet, filling, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
+    """Packet, fill bytes, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
 
     :param packet_len: bytes per packet
     :param fec: name of the code
     :param order: whether a byte's first bit on the air is its highest or its lowest
-    :param fill: zero bytes behind the packet, within the CRC
-    :param mask: what the bytes are whitened with, that many and four more; None = PN9
+    :param fill: zero bytes after the packet, covered by the CRC
+    :param mask: whitening sequence, one byte for each byte of packet and fill, and four more; None = PN9
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Frame:
         self._code = make_code(fec, 8 * self.length)
 
     def __reduce__(self) -> Any:
-        # Codes hold GNU Radio's objects, which cannot be sent to another process: it makes its own.
+        # Codes hold GNU Radio objects, which cannot be sent to another process: that process makes its own.
         return self._again, ()
 
     @property
@@ -82,7 +83,7 @@ class Frame:
         return self._code.encode(np.unpackbits(np.frombuffer(whole, np.uint8) ^ self._mask, bitorder=self._order))
 
     def unwrap(self, soft: Soft) -> bytes | None:
-        """The packet that soft bits mean, or None where the CRC-32 does not match."""
+        """The packet of these soft bits, or None where the CRC-32 does not match."""
         whole = (np.packbits(self._code.decode(soft[: self.bits]), bitorder=self._order) ^ self._mask).tobytes()
         filled = whole[:-CRC_LEN]
         if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
@@ -92,7 +93,7 @@ class Frame:
 
 @lru_cache
 def whitening(length: int) -> Octets:
-    """PN9 (x^9 + x^5 + 1, all ones at the start), as many bytes as asked for."""
+    """PN9 (x^9 + x^5 + 1, all ones at the start), ``length`` bytes."""
     state, bits = 0x1FF, np.empty(8 * length, np.uint8)
     for i in range(8 * length):
         bits[i] = state & 1
@@ -102,9 +103,9 @@ def whitening(length: int) -> Octets:
 
 @dataclass(frozen=True)
 class Search:
-    """What a modem found in samples: where a burst begins, or how far there is none.
+    """Result of a search: where a burst begins, or how many samples contain none.
 
-    :param searched: samples from the front that need not be looked at again
+    :param searched: samples from the front that need not be examined again
     :param start: index of a burst's reference sample, None where there is none (yet)
     """
 
@@ -114,11 +115,11 @@ class Search:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a burst says.
+    """A demodulated burst.
 
-    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; filling may follow
-    :param points: what they were read from, for people to look at; magnitude about 1
-    :param snr: mean power of the burst over that of the noise in the sampled band, as its preamble shows them
+    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; fill bits may follow
+    :param points: the received constellation points, for display; magnitude about 1
+    :param snr: mean power of the burst over that of the noise in the sampled band, measured on its preamble
     """
 
     soft: Soft
@@ -128,12 +129,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class ModemConstants:
-    """What a compiled kernel has to know of a modem.
+    """The parameters of a modem that a compiled kernel needs.
 
     :param kernel: name of the kernel
-    :param values: its parameters, by the names it has for them
-    :param soft_bits: of a reading
-    :param points: of a reading
+    :param values: the kernel's parameters by name
+    :param soft_bits: number of soft bits of a reading
+    :param points: number of points of a reading
     """
 
     kernel: str
@@ -149,9 +150,9 @@ class BurstModem(ABC):
     """
 
     margin = 0
-    """Samples before a burst's reference sample that ``read`` may look at."""
+    """Samples before a burst's reference sample that ``read`` may use."""
     stretch = 8192
-    """Samples searched at a time beside a preamble: what lies behind a burst is looked at again after it."""
+    """Samples searched at a time in addition to a preamble; the samples after a burst are searched again after it."""
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
@@ -185,15 +186,15 @@ class BurstModem(ABC):
         """Look for the first burst."""
 
     def end(self, samples: Samples, start: int) -> int:  # noqa: ARG002
-        """Index behind the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
+        """Index after the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
         return start + self.span
 
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
-        """The burst whose reference sample stands at ``start``, None where there is none after all."""
+        """The burst whose reference sample is at ``start``, None where the close examination finds no burst."""
 
     def constants(self) -> ModemConstants | None:
-        """What a compiled kernel has to know to do the same; None where there is no kernel."""
+        """The parameters of the compiled kernel of this modem; None where there is no kernel."""
         return None
 
 
@@ -211,7 +212,7 @@ class BurstReceiver:
         self._start: int | None = None
         self._last: int | None = None
         self.points = np.empty(0, np.complex64)
-        """What the newest packet was read from."""
+        """The constellation points of the newest packet."""
         self.damaged = 0
         """Bursts found whose CRC-32 was wrong; noise taken for a preamble counts too."""
         self._snrs: tuple[float, ...] = ()
@@ -251,7 +252,7 @@ class BurstReceiver:
         return len(self._buffer) - self._end
 
     def _finite(self) -> bool:
-        """Whether all samples that the burst can be read from are numbers."""
+        """Whether all samples of the burst are finite numbers."""
         assert self._start is not None
         first, last = self._start - self._modem.margin, self._start + self._modem.burst_samples + self._modem.margin
         burst = self._buffer[max(0, first) : min(last, self._end)]

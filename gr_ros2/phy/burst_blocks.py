@@ -1,7 +1,7 @@
-"""GNU Radio shells around a burst modem: PDUs in, samples out, and back.
+"""GNU Radio blocks around a burst modem: PDUs in, samples out, and back.
 
 Invariants: a PDU that is not one packet of the right length is counted and dropped, never sent; each burst leaves at
-once, its gap behind it; all behaviour is in the modem.
+once, followed by its gap; the modem has all the signal processing.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive
 
 STOCK = "GNU Radio's blocks"
-"""What PHYs of blocks by others run on."""
+"""Text of ``runs_on`` for PHYs made of GNU Radio's own blocks."""
 _log = logging.getLogger(__name__)
 
 
@@ -64,7 +64,7 @@ class BurstPhy(Phy):
 
     @cached_property
     def running_modem(self) -> BurstModem:
-        """The modem as it runs here."""
+        """The modem that runs here: compiled or numpy."""
         return fastest(self.modem, self.kernels)
 
     def runs_on(self) -> str:
@@ -72,14 +72,14 @@ class BurstPhy(Phy):
 
     @property
     def receiver_taps(self) -> Any:
-        """The filter the samples pass before the modem sees them; None = none."""
+        """The filter in front of the modem; None = no filter."""
         return None
 
     def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)
 
     def receiver(self, own_process: bool = False) -> PacketReceiver:
-        # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
+        # Compiled kernels release Python's lock, so that a process of their own would only add a hop.
         compiled = self.running_modem is not self.modem
         return BurstSink(self, own_process and not compiled and len(os.sched_getaffinity(0)) > 1)
 
@@ -100,7 +100,7 @@ class BurstTransmitter(TransmitterBlock):
 
 
 class TakesPackets(KeptAlive):
-    """Message port `pdus` in of a Python block inside a hier block; stands before GNU Radio's class.
+    """Mix-in with message port `pdus` in, for a Python block inside a hier block; list it before GNU Radio's class.
 
     :param packet_len: bytes of a packet; anything else is dropped and counted
     :param args: of GNU Radio's class
@@ -116,7 +116,7 @@ class TakesPackets(KeptAlive):
 
     @abstractmethod
     def take_packet(self, packet: bytes) -> None:
-        """What becomes of a packet."""
+        """Process a packet."""
 
     def _take(self, message: Any) -> None:
         vector = pmt.cdr(message) if pmt.is_pair(message) else message
@@ -132,8 +132,8 @@ class TakesPackets(KeptAlive):
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     """Message port `pdus` in, samples out: each packet's burst and gap.
 
-    One block and not a modulator before ``pdu_to_tagged_stream``: that one asks for room for a whole packet, and where
-    there is none sleeps until the next message comes, or 250 ms.
+    This is one block instead of a modulator before ``pdu_to_tagged_stream``: that block needs buffer space for a whole
+    packet, and without it sleeps until the next message comes, or 250 ms.
     """
 
     def __init__(self, phy: BurstPhy) -> None:
@@ -183,7 +183,7 @@ class BurstSink(ReceiverBlock):
         return self._demodulator.snr_db
 
     def tap_symbols(self) -> SymbolTap:
-        """Let the points that packets are read from be seen."""
+        """Make the received constellation points visible."""
         return SymbolTap(self._demodulator.points)
 
 
@@ -210,7 +210,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return self._snr_db if engine is None else engine.snr_db
 
     def points(self) -> Samples:
-        """What the newest packet was read from; empty before the first."""
+        """The constellation points of the newest packet; empty before the first."""
         engine = self._engine
         return np.empty(0, np.complex64) if engine is None else engine.points
 
@@ -231,10 +231,10 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         assert self._engine is not None
         try:
             return self._engine.feed(samples)
-        except Exception as error:  # noqa: BLE001 - raised in ``work`` it would end the block's thread, and all reception
+        except Exception as error:  # noqa: BLE001 - an exception from ``work`` would end the block's thread, and all reception
             if not self._failed:
                 self._failed = True
-                _log.exception("%s: begins anew after %s", self.name(), error)
+                _log.exception("%s: starts again after %s", self.name(), error)
             self._end_engine()
             self._engine = BurstReceiver(self._modem)
             return []

@@ -28,14 +28,14 @@ _PATIENCE_S = 60.0
 _POLL_S = 0.002
 _BATCH_SAMPLES = 1 << 22
 _BATCH_SEEDS = 7919
-"""ThreadedObserver, so that no batch has the noise of another scenario's neighbouring seed."""
+"""Distance between the seeds of two batches, so that no batch has the noise of a scenario with a neighbouring seed."""
 _SEEDS = 2**31 - 1
 _TAIL = 2048
-"""Zero samples behind the last packet, for what channel and receiver hold back."""
+"""Zero samples after the last packet, so that channel and receiver release everything."""
 
 
 class _PacketPort(gr.basic_block):  # type: ignore[misc]
-    """A message port to send from."""
+    """A block with one message port, from which packets are sent."""
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_outlet", None, None)
@@ -44,7 +44,7 @@ class _PacketPort(gr.basic_block):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class SampleRecording:
-    """Packets and the samples they became.
+    """Packets and their modulated samples.
 
     :param packets: in the order they were sent
     :param samples: of all packets, gaps included
@@ -55,7 +55,7 @@ class SampleRecording:
 
 
 def record(phy: Phy, count: int, seed: int = 0) -> SampleRecording:
-    """Send random packets into the void.
+    """Modulate random packets.
 
     :param count: packets
     :raises PhyError: for a PHY without samples, or when the samples do not come
@@ -65,7 +65,7 @@ def record(phy: Phy, count: int, seed: int = 0) -> SampleRecording:
 
 
 def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
-    """The samples a PHY's transmitter makes of packets, one behind the other.
+    """The samples that a PHY's transmitter makes of packets, one after the other.
 
     :param packets: of the PHY's packet_len
     :raises PhyError: for a PHY without samples, or when the samples do not come
@@ -94,7 +94,7 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
 
 
 def deliver(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> list[bytes]:
-    """The packets a receiver makes of a recording behind a channel (``packet_loss`` is not applied)."""
+    """The packets that a receiver finds in a recording after a channel (``packet_loss`` is not applied)."""
     top, receiver, log = gr.top_block(), phy.receiver(), blocks.message_debug()
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
@@ -114,10 +114,10 @@ def pdr(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> float:
 class BatchChannel:
     """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
 
-    Nothing of one batch is on the air with another; noise and fading of each are their own.
+    The batches do not overlap on the air; each has its own noise and fading.
 
     :param phy: with samples
-    :param channel: what acts on samples of it
+    :param channel: its settings that act on samples
     :raises ConfigError: for a channel this PHY cannot have
     """
 
@@ -130,7 +130,8 @@ class BatchChannel:
         """Packets at most at a time, for their samples to fit in memory."""
 
     def send(self, packets: Sequence[bytes]) -> list[tuple[int, bytes]]:
-        """What a batch becomes: place among the packets sent, and bytes, of each one that arrived, in order."""
+        """Send a batch; returns, for each packet that arrived, its index among the packets sent and its bytes, in
+        order."""
         seed = (self._channel.seed + self._batches * _BATCH_SEEDS) % _SEEDS
         self._batches += 1
         arrived = deliver(self._phy, modulated(self._phy, packets), replaced(self._channel, seed=seed))
@@ -138,9 +139,10 @@ class BatchChannel:
 
 
 def _places(packets: Sequence[bytes], arrived: Sequence[bytes]) -> list[int]:
-    """Which of the packets sent each of those that arrived, in their order, was.
+    """For each packet that arrived, in order, its index among the packets sent.
 
-    One that was not sent like this was altered on the way: it takes the place behind the one that arrived before it.
+    A packet that does not equal any sent one was altered on the way: it gets the index after that of the previous
+    arrival.
     """
     sent: dict[bytes, deque[int]] = {}
     for place, packet in enumerate(packets):

@@ -1,7 +1,7 @@
-"""The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, by a modem of our own or by those blocks.
+"""The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, sent and received by this package's modem or by those blocks.
 
-Invariant: own and stock send the same samples for the same packet, but for the number in the header, and take the same
-time but for the gap (packets of which a CRC-32 would not fit the stock header excepted).
+Invariant: both implementations send the same samples for the same packet, except for the number in the header, and take
+the same time except for the gap (not for packets whose CRC-32 does not fit the stock header).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class OfdmOptions(BurstOptions):
 
 
 class OfdmPhy(BurstPhy):
-    """OFDM against echoes: by default FFT 64, cyclic prefix 16, 48 data carriers, BPSK, CRC-32 per frame.
+    """OFDM, for channels with echoes: by default FFT 64, cyclic prefix 16, 48 data carriers, BPSK, CRC-32 per frame.
 
     Carrier offset up to four carriers, clocks within 100 ppm.
 
@@ -100,7 +100,7 @@ class OfdmPhy(BurstPhy):
         return StockFrame(self.layout, self.packet_len, gap)
 
     def frame_bits(self) -> int:
-        """Payload bits of one frame, CRC-32, filling and coding included."""
+        """Payload bits of one frame, with CRC-32, fill bits and coding."""
         return self.modem.frame.bits if self._stock is None else self._stock.bits
 
     def airtime_samples(self) -> int:

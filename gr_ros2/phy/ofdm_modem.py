@@ -1,8 +1,9 @@
-"""OFDM bursts without GNU Radio's scheduler: found by a repeated half symbol, read with every symbol as reference.
+"""OFDM bursts without GNU Radio's scheduler: detected by a repeated half symbol, demodulated with all symbols as
+reference.
 
-Invariants: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a
-short impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the
-payload is decided to be, weighted with how sure that is.
+Invariants: a detected preamble is a burst only if its two sync words are those of the layout; the channel is a short
+impulse response, so its estimate at one carrier uses all carriers; it is tracked through the payload by the decided
+symbols, weighted with their reliability.
 """
 
 from __future__ import annotations
@@ -20,28 +21,29 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 """Complex numbers of single or double precision."""
 
 _FALSE_ALARM = 1e-3
-"""Share of samples of noise that are looked at closely."""
+"""Share of noise samples that are examined closely."""
 _ALIKE = 0.2
-"""Correlation of the sync words over their power, from which on a burst is one: noise has it once in 10^5 looks."""
+"""Threshold of the normalised correlation of the sync words; noise passes once in 10^5 examinations."""
 _SHIFTS = (-4, -2, 0, 2, 4)
-"""Carriers by which the signal may be off, beside the one that the repeated half symbol tells."""
+"""Carrier offsets that are tried, in addition to the fractional offset that the repeated half symbol gives."""
 _CHUNK = 16
-"""Payload symbols decided together, and between two looks at timing and channel."""
+"""Payload symbols decided together; timing and channel are estimated once for each such group."""
 _PACE_GAIN = 0.5
-"""Of the timing loop, for the speed of its change."""
+"""Gain of the timing loop for the rate of change of the timing."""
 _MEMORY = 32.0
-"""Symbols the channel estimate remembers."""
+"""Symbols over which the channel estimate averages."""
 _RIDGE = 0.001
-"""Noise over signal per carrier that the channel estimate is made for."""
+"""Noise over signal per carrier for which the channel estimate is designed."""
 _TURN = 0.4
-"""Radians per symbol that the carrier offset may still be wrong by after the sync words."""
+"""Largest error of the carrier offset after the sync words, radians per symbol."""
 _DOUBT = 1e-3
-"""Of the power of what was sent: with less doubt about it symbols are not decided again in order to estimate."""
+"""Share of the power sent: with less uncertainty than this, symbols are not decided again for a better estimate."""
 _TINY = 1e-20
 
 
 class _FramePlace(NamedTuple):
-    """Where a burst is: first sample, radians per sample, and how much of the power is sync words, 0..1."""
+    """Position of a burst: first sample, carrier offset in radians per sample, and the share of sync words in the
+    power, 0..1."""
 
     begin: int
     frequency: float
@@ -49,14 +51,14 @@ class _FramePlace(NamedTuple):
 
 
 class _SymbolClock(NamedTuple):
-    """Where a burst's first sample would be, and samples by which each symbol comes later than the one before."""
+    """Position of a burst's first sample, and samples by which each symbol is later than the one before."""
 
     begin: float
     pace: float
 
 
 class _Channel(NamedTuple):
-    """Gain of each used carrier, the weight of what it was estimated from, and the noise on each."""
+    """Gain of each used carrier, the weight of its estimate, and the noise on each carrier."""
 
     gains: NDArray[np.complex128]
     weight: NDArray[np.float64]
@@ -157,7 +159,7 @@ class OfdmModem(BurstModem):
 
     def find(self, samples: Samples) -> Search:
         half, window = self._half, self._window
-        # What a closer look at the last place needs, and as far again for it to be moved.
+        # Samples that the close examination of the last position needs, and the same again because it may move.
         positions = len(samples) - 2 * self._symbol - self._prefix
         if positions <= 0:
             return Search(0)
@@ -171,7 +173,7 @@ class OfdmModem(BurstModem):
         at = 0
         while at < len(above):
             first = int(above[at])
-            if first + self._symbol > positions:  # the highest point may still be to come
+            if first + self._symbol > positions:  # the maximum may still come
                 return Search(first)
             ratio = alike[first : first + self._symbol] / (power[first : first + self._symbol] + _TINY)
             best = first + int(np.argmax(ratio))
@@ -251,7 +253,7 @@ class OfdmModem(BurstModem):
         return ModemConstants("ofdm", values, points * self.constellation.bits, points)
 
     def _place(self, samples: Samples, at: int) -> _FramePlace:
-        """Look closely at a place where the first half of a symbol is repeated."""
+        """Examine a position closely where the first half of a symbol is repeated."""
         at = max(0, at)
         window = samples[at : at + self._window + self._half]
         step = self._repeat * np.vdot(window[: -self._half], window[self._half :])
@@ -266,7 +268,7 @@ class OfdmModem(BurstModem):
         if shift:
             frequency += 2 * np.pi * shift / self._size
             spectra = np.roll(spectra, -shift, axis=1)
-            # A roll leaves what the carriers turn between the two symbols.
+            # A carrier shift leaves the rotation of the carriers between the two symbols.
             spectra[1] *= np.exp(-2j * np.pi * shift * self._symbol / self._size)
         gains = spectra * self._whole
         turn = float(np.angle(np.vdot(gains[0], gains[1])))
@@ -294,7 +296,7 @@ class OfdmModem(BurstModem):
         return np.asarray(spectra, np.complex64)
 
     def _advance(self, samples: Any) -> NDArray[np.complex128]:
-        """What brings carriers forward by a fraction of a sample, or some."""
+        """Factors that advance carriers by a number of samples, fractional or not."""
         return np.asarray(np.exp(2j * np.pi / self._size * self._carriers * samples))
 
     def _first_estimate(self, rows: NDArray[np.complex64]) -> _Channel:
@@ -306,8 +308,8 @@ class OfdmModem(BurstModem):
     def _snr(self, rows: NDArray[np.complex64]) -> float:
         """Mean power of a burst over that of the noise in the sampled band, from both sync words.
 
-        Noise is what stands on carriers that the first word leaves empty, and what both words differ by on the others:
-        unlike the rest of an estimate of the channel it holds nothing of the channel, whatever that is like.
+        The noise is measured on the carriers that the first word leaves empty, and from the difference of both words on
+        the others. So it does not depend on the channel.
         """
         first, second = rows[:, self._twice] * self._crosswise
         alike = abs(complex(np.vdot(first, second)))
@@ -320,12 +322,12 @@ class OfdmModem(BurstModem):
     def _decide(
         self, rows: Complexes, channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
     ) -> tuple[_Channel, NDArray[np.float32], Samples, float]:
-        """Symbols to likelihoods of points, with a channel estimate that they have made better.
+        """Likelihoods of constellation points for some symbols, with a channel estimate improved by these symbols.
 
-        Also tells by how many samples they came late.
+        Also returns the delay of the symbols in samples.
 
-        :param used: symbols by data carriers: which hold a point
-        :param rounds: how often to decide in order to estimate, at most
+        :param used: symbols by data carriers: which of them carry a point
+        :param rounds: most rounds of decision and estimation
         """
         gains, noise = channel.gains, channel.noise
         turn = self._tone(rows[:, self._pilots] @ (gains[self._pilots] * self._known[self._pilots]).conj())
@@ -362,7 +364,7 @@ class OfdmModem(BurstModem):
         return points.weigh(seen, np.tile(noise / power, len(used))[used.reshape(-1)]), seen
 
     def _tone(self, turns: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """What straightens symbols of which each is turned further than the one before by the same angle."""
+        """Factors that remove a constant phase step from symbol to symbol."""
         count = len(turns)
         size = 8 << max(0, (count - 1).bit_length())
         spectrum = np.fft.fft(turns, size)
@@ -380,13 +382,13 @@ class OfdmModem(BurstModem):
         return np.asarray(back * np.exp(-1j * phase), np.complex64)
 
     def _late(self, turns: NDArray[np.complex128]) -> float:
-        """Samples by which symbols come late, from by how little their carriers are turned."""
+        """Delay of symbols in samples, from the phase slope over their carriers."""
         slope = float(self._carriers @ turns.imag) / max(float(self._carriers**2 @ np.abs(turns.real)), _TINY)
         return -slope * self._size / (2 * np.pi)
 
 
 def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:
-    """Values at the places that are used, zeros elsewhere."""
+    """Values at the used places, zeros elsewhere."""
     out = np.zeros(used.shape, values.dtype)
     out[used] = values
     return out

@@ -26,13 +26,14 @@ from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import lift_message_limit, log_warnings_only
 
 STOCK_THRESHOLD = 0.9
-"""What GNU Radio's ``ofdm_rx`` uses. A lower one gains decibels and triggers beside a frame now and then."""
+"""What GNU Radio's ``ofdm_rx`` uses. A lower one gains some dB, but sometimes triggers outside a frame."""
 
 _TX_KEY, _RX_KEY, _RX_FRAME_KEY, _RX_PACKET_KEY = (
     f"gr_ros2_{name}" for name in ("tx_len", "rx_len", "rx_frame", "rx_packet")
 )
 _SPINNING_THREAD = "header_pay"
-"""How the name of the demultiplexer's thread begins: the kernel keeps 15 characters, GNU Radio's block number too."""
+"""First letters of the name of the demultiplexer's thread: the kernel keeps 15 characters, GNU Radio's block number
+included."""
 SPINNING_NICE = 10
 """Added to the nice value of such a thread: a tenth of the weight of the others."""
 _THREADS_WAIT_S = 0.2
@@ -42,7 +43,7 @@ _SMALLEST_BUFFER = 32768
 
 @dataclass(frozen=True)
 class StockFrame:
-    """What is sent for a packet.
+    """The frame of a packet.
 
     A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames go without
     it: the packet's own CRC-16 alone protects them, and damaged ones reach the sink, which refuses and counts them.
@@ -56,28 +57,28 @@ class StockFrame:
 
     @property
     def with_crc32(self) -> bool:
-        """Whether there is room for one."""
+        """Whether the header has room for the length with a CRC-32."""
         return self.layout.fits_header(self.packet_len)
 
     @property
     def fill(self) -> int:
-        """Zero bytes behind the packet."""
+        """Zero bytes after the packet."""
         return self.layout.fill(self.packet_len if self.with_crc32 else self.packet_len - CRC_LEN)
 
     @property
     def bits(self) -> int:
-        """Of the payload."""
+        """Bits of the payload."""
         return 8 * (self.packet_len + self.fill + (CRC_LEN if self.with_crc32 else 0))
 
     @property
     def airtime_samples(self) -> int:
-        """Gap included."""
+        """Samples of a frame, gap included."""
         return self.layout.symbols(self.bits) * self.layout.symbol_samples + self.gap
 
     def fit_buffers(self, parts: list[Any]) -> None:
-        """Give each block room for two frames where GNU Radio's own size would not do.
+        """Give each block buffer space for two frames where GNU Radio's default is too small.
 
-        Only there: larger buffers than needed cost small frames a factor of two to three in throughput.
+        Not elsewhere: larger buffers than needed cost small frames a factor of two to three in throughput.
         """
         for part in parts:
             signature = part.output_signature()
@@ -87,13 +88,13 @@ class StockFrame:
             symbols = self.layout.symbols(self.bits)
             items = symbols if size >= self.layout.fft_len else max(self.airtime_samples, self.bits)
             if 2 * items * size > _SMALLEST_BUFFER:
-                # Port by port: on blocks with any number of outputs the setter for all ports does nothing.
+                # Port by port: on blocks with a variable number of outputs the setter for all ports does nothing.
                 for port in range(max(1, signature.max_streams())):
                     part.set_min_output_buffer(port, 2 * items)
 
 
 def idle_spinning_threads() -> None:
-    """Let the receiver's demultiplexers step back behind all other threads: they spin while waiting for their header.
+    """Lower the priority of the receiver's demultiplexer threads: they spin while waiting for their header.
 
     By a nice value, not by SCHED_IDLE. With time to spare SCHED_IDLE is a little better (single packets of 64 B, p99:
     3 ms, here 6, without 7); but where other programs keep every core busy such a thread hardly runs at all, and
@@ -112,7 +113,7 @@ def idle_spinning_threads() -> None:
 
 
 class StockTransmitter(TransmitterBlock):
-    """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
+    """Message port `pdus` in, complex stream out: each packet is sent at once, followed by its gap."""
 
     def __init__(self, frame: StockFrame) -> None:
         super().__init__("gr_ros2_ofdm_tx", frame.airtime_samples)
@@ -143,12 +144,12 @@ class StockReceiver(ReceiverBlock):
         super().__init__("gr_ros2_ofdm_rx")
         self._frame = frame
         self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
-        # Header parser and demultiplexer tell of every header lost in noise.
+        # Header parser and demultiplexer log every header lost in noise.
         log_warnings_only(self._demodulator.parts)
         self.connect(self, self._demodulator)
         last, key, parts = self._demodulator, _RX_KEY, list(self._demodulator.parts)
         if frame.fill:
-            # Frames come whole or not at all, so counting bytes is enough.
+            # Frames come complete or not at all, so counting bytes is enough.
             key = _RX_PACKET_KEY
             packet = blocks.keep_m_in_n(1, frame.packet_len, frame.packet_len + frame.fill, 0)
             last = blocks.stream_to_tagged_stream(1, 1, frame.packet_len, key)
@@ -160,7 +161,7 @@ class StockReceiver(ReceiverBlock):
         frame.fit_buffers(parts)
 
     def tap_symbols(self) -> Tap:
-        """Let the payload's symbols be seen, equalised and not yet decided. Before the start, once."""
+        """Make the payload's symbols visible, equalised and not yet decided. Call it once, before the start."""
         tap = Tap(SYMBOLS_SHOWN)
         self._frame.fit_buffers(self._demodulator.show_symbols(tap))
         return tap
@@ -261,9 +262,9 @@ class OfdmDemodulator(HierBlock):
         )
 
     def show_symbols(self, sink: Any) -> list[Any]:
-        """Connect a sink to the payload's symbols, equalised and not yet decided; returns the parts that needs.
+        """Connect a sink to the payload's symbols, equalised and not yet decided; returns the blocks that this needs.
 
-        The equaliser of the receiver decides at once, so a second one without that runs beside it.
+        The receiver's equaliser also decides, so a second equaliser without decisions runs in parallel.
         """
         layout = self._layout
         points = constellation(layout.modulation)

@@ -64,7 +64,7 @@ class PskModem(LinearModem):
 
 
 class PskPhy(LinearPhy):
-    """Single carrier for narrow channels without echoes: an echo of a symbol's length is beyond it, take `ofdm` there.
+    """Single carrier for narrow channels without echoes: use `ofdm` where an echo is as long as a symbol.
 
     Carrier offset up to 5 % of the symbol rate, clocks within 100 ppm; packets of 14..4095 B.
 

@@ -1,8 +1,9 @@
-"""A burst receiver in a process of its own: the modem and the ROS side do not wait for each other's Python.
+"""A burst receiver in a process of its own, so that the modem and the ROS side do not share one Python interpreter
+lock.
 
-Invariants: what comes out is what ``BurstReceiver`` makes of the same samples, in the same order; the process ends when
-its samples do, and so also with the process that it works for; where it cannot be started or dies, receiving goes on in
-this process, and the log says so.
+Invariants: the packets are those that ``BurstReceiver`` finds in the same samples, in the same order; the process ends
+when its stream of samples ends, and so also when its parent process ends; where it cannot be started or dies, reception
+continues in this process, and the log says so.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 
 _START_S = 30.0
-"""For Python and its libraries to be loaded, on a small computer that has other things to do."""
+"""Time limit for loading Python and its libraries, on a small and busy computer."""
 _STOP_S = 2.0
 _READ_LEN = 1 << 16
 _SAMPLE_LEN = 8
@@ -32,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Report(NamedTuple):
-    """What the process has to tell: packets since the last report, and how things stand."""
+    """A report of the process: packets since the last report, and the current counters."""
 
     packets: list[bytes]
     damaged: int
@@ -41,7 +42,7 @@ class _Report(NamedTuple):
 
 
 class ReceiverProcess:
-    """A :class:`BurstReceiver` elsewhere.
+    """A :class:`BurstReceiver` in another process.
 
     :param modem: modulation and frame length
     :param deliver: called with each packet, in a thread of its own
@@ -52,7 +53,7 @@ class ReceiverProcess:
         self._deliver = deliver
         self._report = _Report([], 0, np.empty(0, np.complex64), None)
         self._here: BurstReceiver | None = None
-        """Receives instead of the process once that is gone."""
+        """Receives instead of the process after that has ended."""
         self._process: Any = None
         self._thread: threading.Thread | None = None
         reading, writing = os.pipe()
@@ -81,7 +82,7 @@ class ReceiverProcess:
 
     @property
     def points(self) -> Samples:
-        """What the newest packet was read from."""
+        """The constellation points of the newest packet."""
         return self._report.points if self._here is None else self._here.points
 
     @property
@@ -90,7 +91,8 @@ class ReceiverProcess:
         return self._report.snr_db if self._here is None else self._here.snr_db
 
     def feed(self, samples: Samples) -> list[bytes]:
-        """Take the next samples, waiting while the process is behind; returns packets that were completed here."""
+        """Take the next samples, and wait while the process is behind; returns packets that were decoded in this
+        process."""
         if self._here is None:
             try:
                 self._process.stdin.write(np.ascontiguousarray(samples))
@@ -102,9 +104,9 @@ class ReceiverProcess:
         return self._here.feed(samples)
 
     def close(self) -> None:
-        """End the process, once it has made packets of what it was given."""
+        """End the process after it has processed all samples."""
         if self._process is not None:
-            with suppress(BrokenPipeError):  # gone before it read everything
+            with suppress(BrokenPipeError):  # the process ended before it read everything
                 self._process.stdin.close()
             if self._thread is not None:
                 self._thread.join(_STOP_S)
@@ -115,14 +117,14 @@ class ReceiverProcess:
         self._reports.close()
 
     def _continue_in_this_process(self, reason: Exception) -> None:
-        _log.warning("the receiver's own process is gone (%s); receiving goes on in this one", reason)
+        _log.warning("the receiver's own process has ended (%s); reception continues in this one", reason)
         self._here = BurstReceiver(self._modem)
 
     def _listen(self) -> None:
         while True:
             try:
                 report = pickle.load(self._reports)
-            except (EOFError, OSError, pickle.UnpicklingError):  # its end, perhaps in the middle of a report
+            except (EOFError, OSError, pickle.UnpicklingError):  # the process ended, perhaps in the middle of a report
                 return
             self._report = report
             for packet in report.packets:
@@ -136,9 +138,9 @@ def _start(reports: int) -> Any:
         [sys.executable, "-c", code],
         stdin=subprocess.PIPE,
         pass_fds=[reports],
-        # Away from the terminal's Ctrl-C: it has to go on as long as it gets samples.
+        # Ctrl-C of the terminal must not end it: it has to continue as long as it gets samples.
         start_new_session=True,
-        # Its arrays are small: more threads would only take the cores that it is here to leave free.
+        # Its arrays are small: more threads would only occupy cores that other programs need.
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )
 
@@ -148,7 +150,7 @@ def serve(descriptor: int) -> None:
 
     :param descriptor: to write to
     """
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # whoever listened is gone
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the parent process has ended
     samples = os.fdopen(sys.stdin.fileno(), "rb")
     with os.fdopen(descriptor, "wb") as reports:
         receiver = BurstReceiver(pickle.load(samples))

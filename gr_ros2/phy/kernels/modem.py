@@ -1,7 +1,7 @@
-"""A burst modem whose samples a compiled kernel searches and reads.
+"""A burst modem that uses a compiled kernel for search and demodulation.
 
-Invariants: everything that is no work on samples is the numpy modem's, which stays the reference; a kernel knows
-nothing but the constants that modem tells; calls from several threads do not meet.
+Invariants: the numpy modem, which is the reference, does everything except the processing of samples; a kernel knows
+only the constants of that modem; calls from several threads do not share memory.
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         ),
     ),
 }
-"""Number of each kernel, and what it has to be told."""
+"""Number of each kernel, and the names of its parameters."""
 _NUMBERS = {"int32": ctypes.c_int32, "float64": ctypes.c_double}
 
 
 class CompiledModem(BurstModem):
-    """The modem given, with the compiled kernel's search and reading.
+    """The given modem, with search and demodulation of the compiled kernel.
 
-    :param reference: whose constants tell of a kernel
-    :raises MemoryError: where there is not enough
+    :param reference: the numpy modem; its constants name the kernel
+    :raises MemoryError: when memory is short
     """
 
     def __init__(self, reference: BurstModem) -> None:
@@ -153,7 +153,7 @@ def _new(functions: Any, constants: ModemConstants) -> int:
 
 
 def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]  # a third of the time that array.ctypes takes
+    address: int = array.__array_interface__["data"][0]  # three times as fast as array.ctypes
     return address
 
 
