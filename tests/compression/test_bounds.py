@@ -67,7 +67,7 @@ def test_a_large_message_needs_many_bytes(type_name: str) -> None:
     assert coded[0] & 15 == (FIELDS_AND_MORE if type_name.startswith("std") else ZSTD)
     assert bounds.least(len(payload)) <= len(coded) < 300
     assert codec.decode(0, coded) == payload
-    with pytest.raises(DamagedError, match="says it has 1000016 bytes, at most"):
+    with pytest.raises(DamagedError, match="claims 1000016 bytes, at most"):
         codec.decode(0, b"\x01" + Zstd().compress(payload))
 
 

@@ -95,7 +95,7 @@ def test_where_the_process_dies_receiving_goes_on(elsewhere: Elsewhere, caplog: 
     assert elsewhere.receiver.feed(samples) == PACKETS
     assert elsewhere.receiver.feed(samples) == PACKETS
     assert elsewhere.receiver.points.size
-    assert caplog.text.count("receiving goes on in this one") == 1
+    assert caplog.text.count("reception continues in this one") == 1
 
 
 def test_where_it_does_not_start_receiving_is_here(monkeypatch: pytest.MonkeyPatch) -> None:
