@@ -32,8 +32,9 @@ examples: setup-dev
 	tools/compile-examples $(BIN)/python
 
 grc: setup
+	tools/install-system window
 	$(BIN)/gr-ros2 grc-path --install
-	$(BIN)/python $$(command -v gnuradio-companion) gr_ros2/examples/ofdm_loopback.grc
+	gnuradio-companion gr_ros2/examples/ofdm_loopback.grc
 
 setup: $(VENV)/stamp-run
 setup-dev: $(VENV)/stamp-dev

@@ -126,6 +126,7 @@ setup(
         # That of the distribution's GNU Radio: Debian's and Ubuntu's was built for numpy 2 from Python 3.13 on.
         "numpy>=1.21.5,<2; python_version < '3.13'",
         "numpy>=2,<3; python_version >= '3.13'",
+        "packaging>=22",
         "pyarrow>=17,<26; python_version < '3.13'",  # 26 needs numpy 2
         "pyarrow>=17; python_version >= '3.13'",
         "plotext>=5.3,<6",

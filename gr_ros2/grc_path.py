@@ -70,6 +70,55 @@ def install(environ: Mapping[str, str] = os.environ) -> Path:
     return files[0]
 
 
+def uninstall(environ: Mapping[str, str] = os.environ) -> list[Path]:
+    """Take the folder out of the preferences again; what else stands there stays.
+
+    :returns: the files that were changed, or removed because nothing else was in them
+    :raises ConfigError: when a file cannot be read or written
+    """
+    changed = []
+    for file in preference_files(environ):
+        try:
+            before = file.read_text(encoding="utf-8") if file.exists() else ""
+            after = without_blocks_path(before, str(grc_path()))
+            if after == before:
+                continue
+            if after:
+                file.write_text(after, encoding="utf-8")
+            else:
+                file.unlink()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{file}: cannot be changed ({error})") from error
+        changed.append(file)
+    return changed
+
+
+def without_blocks_path(text: str, folder: str) -> str:
+    """The text of a preference file without a folder in `local_blocks_path`, the rest unchanged.
+
+    A setting and a section that then are empty go too.
+    """
+    lines = text.splitlines(keepends=True)
+    headings = [number for number, line in enumerate(lines) if _SECTION.match(line)]
+    for heading, end in zip(headings, [*headings, len(lines)][1:], strict=True):
+        section = _SECTION.match(lines[heading])
+        if section is None or section[1].lower() != "grc":
+            continue
+        for number in range(heading + 1, end):
+            setting = _KEY.match(lines[number])
+            paths = [path for path in setting[1].strip('"').split(os.pathsep) if path] if setting is not None else []
+            if folder not in paths:
+                continue
+            paths.remove(folder)
+            lines[number] = _setting(paths) if paths else ""
+            if not "".join(lines[heading + 1 : end]).strip():
+                # An empty line before it was ours too, where it came last.
+                before = heading - (end == len(lines) and heading > 0 and not lines[heading - 1].strip())
+                del lines[before:end]
+            return "".join(lines)
+    return text
+
+
 def with_blocks_path(text: str, folder: str) -> str:
     """The text of a preference file with a folder in `local_blocks_path`, the rest unchanged."""
     lines = text.splitlines(keepends=True)

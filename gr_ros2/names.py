@@ -19,6 +19,9 @@ MAX_NAMESPACE_LEN = 245
 MAX_NODE_LEN = 255
 """Characters of a node name (``RMW_NODE_NAME_MAX_NAME_LENGTH``)."""
 
+INFRASTRUCTURE = ("/rosout", "/parameter_events")
+"""Topics every ROS node has, which nobody wants on a radio by accident."""
+
 _FIELD = "{src_id}"
 _LONGEST_ID = 255
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")

@@ -34,9 +34,20 @@ def read_settings(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     :param overrides: `key=value` with dotted keys and YAML values (`phy.sample_rate=2e5`), in this order
     :raises ConfigError: when the file cannot be read, has no such registry, or an override is malformed
     """
-    values = {"name": path.stem, **read_yaml(path)}
+    return settled({"name": path.stem, **read_yaml(path)}, path.parent, overrides)
+
+
+def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Settings with their registry found and some of them replaced.
+
+    :param values: as a YAML file has them
+    :param directory: where a relative registry is looked for
+    :param overrides: as :func:`read_settings` takes them
+    :raises ConfigError: when there is no such registry, or an override is malformed
+    """
+    values = dict(values)
     if isinstance(values.get("registry"), str):
-        values["registry"] = find_registry(values["registry"], path.parent)
+        values["registry"] = find_registry(values["registry"], directory)
     for override in overrides:
         keys, value = parse_override(override)
         if keys == ("registry",):
@@ -75,6 +86,12 @@ def find_registry(name: str, directory: Path) -> str:
             return str(candidate.resolve())
     known = ", ".join(sorted(path.stem for path in BUILTIN_DIR.glob("*.csv")))
     raise ConfigError(f"registry = {name!r}: no such file; built in are {known}")
+
+
+def portable_registry(path: str) -> str:
+    """How a file anywhere names a registry: a built-in one by its name, another one by its absolute path."""
+    found = Path(path).resolve()
+    return found.stem if found.parent == BUILTIN_DIR else str(found)
 
 
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:

@@ -1,4 +1,4 @@
-"""YAML as this program reads it: plain values, and every key once.
+"""YAML as this program reads and writes it: plain values, and every key once.
 
 Invariant: all YAML, from a file or the command line, is read here. A duplicate key in one mapping is an error: YAML 1.2
 (section 3.2.1.3) forbids it, and PyYAML would silently use the last one.
@@ -6,6 +6,7 @@ Invariant: all YAML, from a file or the command line, is read here. A duplicate 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import yaml
@@ -44,3 +45,8 @@ def parse_yaml(text: str, where: str, what: str = "") -> Any:
         raise ConfigError(f"{where}: {error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: {what}no YAML ({' '.join(str(error).split())})") from error
+
+
+def yaml_text(values: Mapping[str, Any]) -> str:
+    """A mapping as YAML that :func:`parse_yaml` reads back as it is; keys stay in their order."""
+    return yaml.safe_dump(dict(values), sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)

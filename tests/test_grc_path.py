@@ -32,6 +32,24 @@ def test_the_folder_is_added_and_the_rest_kept(before: str, after: str) -> None:
     assert grc_path.with_blocks_path(after, FOLDER) == after
 
 
+@pytest.mark.parametrize(
+    "before",
+    [
+        "",
+        "[log]\nlevel = info\n",
+        "[grc]\nfont = 8\n",
+        "[GRC]\nlocal_blocks_path = /a:/b\n# end\n",
+        "[x]\nlocal_blocks_path = /a\n",
+        '[grc]\nlocal_blocks_path = "/a b"\n',
+        "[log]\nlevel = info\n\n[grc]\nfont = 8\n\n[x]\ny = 1\n",
+    ],
+)
+def test_the_folder_is_taken_out_again_and_the_rest_kept(before: str) -> None:
+    after = grc_path.with_blocks_path(before, FOLDER)
+    assert grc_path.without_blocks_path(after, FOLDER) == before
+    assert grc_path.without_blocks_path(before, FOLDER) == before
+
+
 def test_which_files(tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path)}
     old = tmp_path / ".gnuradio" / "config.conf"

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from gr_ros2.cli.console import console
 from gr_ros2.compression import Dictionary, LinkCodec, load, shipped
+from gr_ros2.compression.dictionary import SHIPPED
 from gr_ros2.compression.train import learn
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
@@ -86,7 +87,7 @@ def train(*, bag: Path, out: Path, topics: str, size: int) -> None:
 @click.argument("files", metavar="[FILE]…", nargs=-1, type=click.Path(path_type=Path))
 def list_dictionaries(*, files: Sequence[Path]) -> None:
     """The types that the shipped dictionaries, or those in FILEs, know."""
-    for dictionary in [load(path) for path in files] or [shipped()]:
+    for dictionary in [load(path) for path in files] or map(shipped, SHIPPED):
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("type", overflow="fold")
         for heading in ("fields", "templates", "zstd, B"):

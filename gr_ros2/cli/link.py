@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -18,10 +18,16 @@ from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import RowName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.errors import ConfigError
 from gr_ros2.guard import Guard
-from gr_ros2.radio.config import LinkConfig, load_link
+from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.config import LinkConfig, link_from, load_link
+from gr_ros2.radio.one_line import FLAGS, one_line
+from gr_ros2.settings_file import portable_registry, settled
+from gr_ros2.wire import BROADCAST
+from gr_ros2.yaml_text import yaml_text
 
 if TYPE_CHECKING:
     from gr_ros2.radio.link import RobotLink
@@ -30,17 +36,60 @@ if TYPE_CHECKING:
 _SHOW_S = 0.5
 
 
+def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
+    return click.option(f"--{name}", help=f"Without CONFIG: {FLAGS[name].meaning}.", **how)
+
+
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=click.Path(path_type=Path), required=False)
+@click.option("--robot", type=click.IntRange(0, BROADCAST - 1), help="Without CONFIG: number of this robot.")
+@click.option("--radio", type=RowName(FRONT_ENDS), help="Without CONFIG: what carries the packets.")
+@_flag("listen", metavar="ADDRESS")
+@_flag("peer", metavar="ADDRESS", multiple=True)
+@_flag("device", metavar="ARGS")
+@_flag("frequency", type=float, metavar="HZ")
+@_flag("frequency-rx", type=float, metavar="HZ")
+@click.option("--registry", metavar="CSV", help="Without CONFIG: which topics; default the built-in table4.")
+@click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @set_option(LinkConfig)
 @dashboard_option
 @pcap_option
 def link(
-    config: Path, duration: float | None, overrides: tuple[str, ...], dashboard: str | None, pcap: Path | None
+    *,
+    config: Path | None,
+    robot: int | None,
+    radio: str | None,
+    registry: str | None,
+    save: Path | None,
+    duration: float | None,
+    overrides: tuple[str, ...],
+    dashboard: str | None,
+    pcap: Path | None,
+    **flags: Any,
 ) -> int:
-    """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph."""
-    settings = load_link(config, overrides)
+    """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph.
+
+    What the link is stands in the YAML file CONFIG, or follows from --robot and --radio.
+    """
+    given = {name.replace("_", "-"): value for name, value in flags.items() if value not in (None, ())}
+    if config is not None:
+        unused = [
+            f"--{name}"
+            for name, value in {"robot": robot, "radio": radio, "registry": registry}.items()
+            if value is not None
+        ]
+        unused += ["--save"] if save is not None else []
+        if unused or given:
+            named = ", ".join([*unused, *(f"--{name}" for name in given)])
+            raise click.UsageError(f"{named}: {config} says what the link is; change its settings with --set")
+        settings = load_link(config, overrides)
+    elif robot is None or radio is None:
+        raise click.UsageError("give a YAML file, or --robot and --radio")
+    else:
+        with uninterrupted():  # GNU Radio may be loaded
+            values = one_line(robot, radio, registry, given)
+        settings = _in_one_line(values, overrides, save)
     # These need GNU Radio, which a wrong setting must not wait for.
     with uninterrupted():
         from gr_ros2.radio.link import RobotLink
@@ -64,6 +113,21 @@ def link(
         for line in running.incomplete():
             console.print(line, soft_wrap=True)
         return FAILED if running.incomplete() else 0
+
+
+def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path | None) -> LinkConfig:
+    """The settings of a link, which are printed as YAML, and written to ``save``."""
+    values = settled(values, Path(), overrides)
+    settings = link_from(values, values["name"])
+    text = yaml_text({**values, "registry": portable_registry(values["registry"])})
+    where = "a YAML file (--save FILE writes it)" if save is None else save
+    click.echo(f"# The same link as {where}:\n{text}")
+    if save is not None:
+        try:
+            save.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--save {save}: cannot be written ({error.strerror})") from error
+    return settings
 
 
 def _live(running: RobotLink) -> LiveRun:
@@ -92,16 +156,21 @@ def _opening(running: Any) -> str:
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:
-    """Say what runs, then show one status line until the time is over or nothing more can come."""
+    """Say what runs and what it waits for, with one status line until the time is over or nothing more can come."""
+    from gr_ros2.radio.waiting import Waiting
+
     said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     said(say, _opening(running))
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
+    waiting = Waiting(running.source)
     with Status("", console=console) if live else ExitStack() as status:
         shown = time.monotonic()
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
+            if (waits_for := waiting.look()) is not None:
+                said(say, waits_for)
             if isinstance(status, Status):
                 said(status.update, status_line(running.stats()))
             elif time.monotonic() - shown >= LOG_S:
@@ -114,11 +183,12 @@ def status_line(stats: Mapping[str, Any]) -> str:
     source, sink, packets = stats["source"], stats["sink"], stats["packets"]
     taken = sum(topic["submitted"] for topic in source["topics"].values())
     given = sum(topic["delivered"] for topic in sink["topics"].values())
-    parts = [
-        f"{stats['uptime_s']:.0f} s",
-        f"sent {taken} messages in {packets['out']} packets",
-        f"received {given} messages in {packets['in']} packets",
-    ]
+    missing = source["unmatched"]
+    sent = f"sent {taken} messages in {packets['out']} packets"
+    if missing and not taken:
+        sent = f"nothing sent, no publisher on {missing[0]}" + (f" and {len(missing) - 1} more" if missing[1:] else "")
+    received = f"received {given} messages in {packets['in']} packets" if packets["in"] else "nobody heard"
+    parts = [f"{stats['uptime_s']:.0f} s", sent, received]
     if sink["packet_loss_est"]:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
     if stats["phy"]["snr_db"] is not None:

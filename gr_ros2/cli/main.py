@@ -36,6 +36,7 @@ COMMANDS: Commands = {
     "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
     "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
     "link": ("gr_ros2.cli.link:link", "One robot's end of a link, live: its ROS topics to the air and back."),
+    "doctor": ("gr_ros2.cli.doctor:doctor", "What this machine has and lacks for a link, and what mends it."),
     "plan": ("gr_ros2.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
     "replay": ("gr_ros2.cli.replay:replay", "A bag through a link into a bag: what arrives, and when."),
     "losses": ("gr_ros2.cli.losses:losses", "How many packets a radio loses at which SNR, measured."),

@@ -11,8 +11,10 @@ import click
 from gr_ros2.cli.capture import DEFAULT_PACKET_LEN, from_hex, packets_in
 from gr_ros2.config import MAX_PACKET_LEN, MIN_PACKET_LEN
 from gr_ros2.errors import ConfigError, WireError
+from gr_ros2.keys import read_key_file
+from gr_ros2.link.v1.reader import Look, Reader
 from gr_ros2.registry import Registry
-from gr_ros2.wire import BROADCAST, QOS_NAMES, Packet, decode, format_of
+from gr_ros2.wire import BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
 
 _SHOWN = 16
 """Payload bytes printed of an entry."""
@@ -27,30 +29,53 @@ _SHOWN = 16
     f"{DEFAULT_PACKET_LEN} for a file of back-to-back packets.",
 )
 @click.option("--registry", "registry_path", metavar="CSV", help="Show topics by name.")
+@click.option("--key", "key_path", metavar="FILE", help="Open sealed packets with these keys (gr-ros2 key new).")
 @click.pass_context
 def decode_packets(
-    context: click.Context, inputs: tuple[str, ...], packet_len: int | None, registry_path: str | None
+    context: click.Context,
+    inputs: tuple[str, ...],
+    packet_len: int | None,
+    registry_path: str | None,
+    key_path: str | None,
 ) -> None:
-    """Show packets as readable fields.
+    """Show packets as readable fields, of both versions of the wire format.
 
     Each input is a packet in hex digits, or a file: a pcap or pcapng capture, hex text with one packet a line, or
     binary packets back to back. Without inputs, or for -, standard input is read. A packet that is refused is shown
     with the reason, and the exit status is 1.
+
+    A packet of version 1 is checked by a hello of its sender among the inputs; the topics that robots announce there
+    are shown by name. What is encrypted stays hidden without --key.
     """
     registry = Registry.from_csv(registry_path) if registry_path else None
-    number = rejected = 0
-    for number, (data, expected) in enumerate(_packets(inputs or ("-",), packet_len), start=1):
+    keys = read_key_file(key_path) if key_path else ()
+    packets = list(_packets(inputs or ("-",), packet_len))
+    if not packets:
+        raise ConfigError("nothing to decode: the input is empty")
+    # A sender without fixed lengths fills few packets: the longest tells what is the longest on its link.
+    longest = packet_len or max((len(data) for data, _ in packets if _is_version_1(data)), default=0)
+    reader = Reader(longest, keys)
+    for data, _ in packets:
+        if _is_version_1(data):
+            reader.learn(data)
+    rejected = 0
+    for number, (data, expected) in enumerate(packets, start=1):
         try:
-            packet = decode(data, expected)
+            if _is_version_1(data):
+                lines = _looked_at(reader.read(data), data, reader, registry)
+            else:
+                lines = _lines(decode(data, expected), expected, registry)
+            print(f"packet {number}: " + "\n".join(lines))
         except WireError as error:
             rejected += 1
-            print(f"packet {number}: rejected: {error.kind}: {error} ({_preview(data)})")
-        else:
-            print("\n".join(_lines(number, packet, expected, registry)))
-    if not number:
-        raise ConfigError("nothing to decode: the input is empty")
+            unsure = "" if packet_len or not _is_version_1(data) else "; if packets are longer, give --packet-len"
+            print(f"packet {number}: rejected: {error.kind}: {error}{unsure} ({_preview(data)})")
     if rejected:
         context.exit(1)
+
+
+def _is_version_1(data: bytes) -> bool:
+    return data[:1].hex().startswith("1")
 
 
 def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[bytes, int]]:
@@ -71,24 +96,64 @@ def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[
         yield from packets_in(data, packet_len, where)
 
 
-def _lines(number: int, packet: Packet, packet_len: int, registry: Registry | None) -> Iterator[str]:
+def _lines(packet: Packet, packet_len: int, registry: Registry | None) -> Iterator[str]:
     destination = f"{packet.dst_id} (broadcast)" if packet.dst_id == BROADCAST else str(packet.dst_id)
     flags = "".join([", compressed" if packet.compressed else "", ", encrypted" if packet.encrypted else ""])
     pad = sum(span.size for span in format_of(packet.version).layout(packet, packet_len) if span.kind == "pad")
     yield (
-        f"packet {number}: {packet_len} bytes, version {packet.version}, qos {QOS_NAMES[packet.qos]}{flags}, "
+        f"{packet_len} bytes, version {packet.version}, qos {QOS_NAMES[packet.qos]}{flags}, "
         f"src {packet.src_id}, dst {destination}, seq {packet.seq}, hop {packet.hop}, "
         f"{len(packet.entries)} entries, {pad} bytes PAD, CRC ok"
     )
     for index, entry in enumerate(packet.entries):
-        topic = str(entry.topic_id)
-        if registry is not None:
-            known = entry.topic_id < len(registry)
-            topic += f" ({registry[entry.topic_id].name if known else 'not in the registry'})"
-        yield (
-            f"  entry {index}: topic {topic}, {entry.describe()}, "
-            f"payload {len(entry.payload)} bytes: {_preview(entry.payload)}"
-        )
+        yield f"  entry {index}: {_of_topic(entry, _name(entry.topic_id, registry))}"
+
+
+def _looked_at(look: Look, data: bytes, reader: Reader, registry: Registry | None) -> Iterator[str]:
+    """The lines of a packet of version 1."""
+    header, standing = look.header, look.standing
+    addressed = header.dst_id != BROADCAST
+    to = f"dst {header.dst_id}, hop {header.hop}" if addressed else f"dst {header.dst_id} (broadcast)"
+    if standing is None:
+        kind, what = f"source, qos {QOS_NAMES[header.qos]}", f"number {look.number}"
+    elif standing.mask:
+        kind = "repair"
+        count, first = standing.mask.bit_count(), look.number - standing.mask.bit_length() + 1
+        what = f"row {standing.row}, of {count} packets in {first}..{look.number}"
+        what += ", nothing older is worth repairing" if standing.oldest else ""
+    else:
+        kind, what = "control", f"at number {look.number}, row {standing.row}"
+    if look.hidden:
+        content = f"{len(look.hidden)} bytes encrypted: {_preview(look.hidden)}"
+    elif standing is not None and standing.mask:
+        content = f"{len(look.combined)} bytes combined: {_preview(look.combined)}"
+    else:
+        content = f"{len(look.entries)} entries"
+    yield f"{len(data)} bytes, version 1, {kind}, src {header.src_id}, {to}, {what}, {content}, {look.check}"
+    announced = reader.topics.get(header.src_id, {})
+    for index, entry in enumerate(look.entries):
+        message = look.message(index)
+        if message is None:
+            yield f"  entry {index}: {entry.describe()}"
+        else:
+            row = announced.get(message.topic_id)
+            text = _of_topic(message, row.name if row is not None else _name(message.topic_id, registry))
+            yield f"  entry {index}: {text}{', coded' if message.coded else ''}"
+    for row in look.announced:
+        yield f"  announces {row.describe()}"
+
+
+def _name(topic_id: int, registry: Registry | None) -> str | None:
+    """Of a topic by its row in the registry; None without one."""
+    if registry is None:
+        return None
+    return registry[topic_id].name if topic_id < len(registry) else "not in the registry"
+
+
+def _of_topic(entry: Entry, name: str | None) -> str:
+    """A message or a fragment."""
+    topic = f"{entry.topic_id} ({name})" if name is not None else str(entry.topic_id)
+    return f"topic {topic}, {entry.describe()}, payload {len(entry.payload)} bytes: {_preview(entry.payload)}"
 
 
 def _preview(data: bytes) -> str:

@@ -9,6 +9,7 @@ from typing import Any, get_type_hints
 import click
 from click.shell_completion import CompletionItem
 
+from gr_ros2.backends import BackendTable
 from gr_ros2.settings_file import BUILTIN_DIR
 
 
@@ -28,6 +29,27 @@ class ScenarioName(click.ParamType):
 
 
 SCENARIO = ScenarioName()
+
+
+class RowName(click.ParamType):
+    """A name of a table of back-ends; whether there is such a row, the table says when it is loaded."""
+
+    name = "name"
+
+    def __init__(self, table: BackendTable[Any]) -> None:
+        self._table = table
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002 - click's signature
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        return [
+            CompletionItem(name, help=row.summary)
+            for name, row in self._table.own.items()
+            if name.startswith(incomplete)
+        ]
 
 
 class Setting(click.ParamType):

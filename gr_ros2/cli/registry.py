@@ -21,12 +21,10 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
-from gr_ros2.names import checked_namespace, topic_fault
+from gr_ros2.names import INFRASTRUCTURE, checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
 
-_INFRASTRUCTURE = ("/rosout", "/parameter_events")
-"""Topics every ROS node has, which nobody wants on a radio by accident."""
 _NO_MESSAGES = {"srv": "a service", "action": "an action"}
 """Of types: the middle part where it is not ``msg``, and what has such types."""
 _LATCHED = "durability"
@@ -160,7 +158,7 @@ def registry_csv(
     published = {
         info.topic.removeprefix(prefix): info
         for info in sorted(found, key=lambda info: info.topic)
-        if info.publishers and info.topic.startswith(prefix) and info.topic not in (*_INFRASTRUCTURE, *reasons)
+        if info.publishers and info.topic.startswith(prefix) and info.topic not in (*INFRASTRUCTURE, *reasons)
     }
     names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or list(published)
     seen = f"published below {prefix} are {', '.join(published) or 'no topics'}"

@@ -1,8 +1,8 @@
 """Dictionaries: knowledge about the messages of some types that both ends have in advance.
 
 A dictionary is one JSON file: words (frame names and the like), constants (numbers that covariances are made of), and
-for each type the float class of its fields, sets of static values that are frequent, a zstd dictionary, and the
-definition where ROS has none.
+for each type the float class of its fields, frequent sets of static values, a zstd dictionary, and the definition
+where ROS 2 Humble has none or another one.
 
 Invariants: a dictionary never changes; different content is a different dictionary with a different id. The sets
 shipped with gr-ros2 are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A
@@ -28,8 +28,11 @@ from gr_ros2.compression.static_values import Words
 from gr_ros2.errors import ConfigError
 
 FORMAT = 1
-SHIPPED = (1,)
-"""Numbers 1..14 of the shipped sets; senders use the last one."""
+SHIPPED = (1, 2)
+"""Numbers 1..14 of the shipped sets: 1 has the types of ROS 2 Humble, 2 those that are new or another
+since, up to Lyrical. A sender uses the last one with a definition that fits the message."""
+GENERAL = 1
+"""The set whose words and constants serve the types that no set has."""
 OWN = 15
 """Number in the first byte for a user's own dictionary; its id follows."""
 
@@ -41,7 +44,7 @@ class TypeEntry:
     :param classes: float class letter by path of the field
     :param templates: (sequence lengths, coded static values), most frequent first, at most 15
     :param zstd: a zstd dictionary over its payloads, b'' = none
-    :param definition: ``.msg`` text, '' for types of ROS 2 Humble
+    :param definition: ``.msg`` text, '' for types as ROS 2 Humble has them
     """
 
     classes: Mapping[str, str] = field(default_factory=dict)
@@ -130,7 +133,7 @@ def load(path: str | Path, number: int = OWN) -> Dictionary:
 
 
 @cache
-def shipped(number: int = SHIPPED[-1]) -> Dictionary:
+def shipped(number: int = GENERAL) -> Dictionary:
     """A shipped set by its number.
 
     :raises ConfigError: when there is none of that number

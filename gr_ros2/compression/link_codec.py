@@ -12,11 +12,11 @@ different dictionary is an UnknownDictionaryError.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gr_ros2.compression import bounds
-from gr_ros2.compression.dictionary import OWN, SHIPPED, Dictionary, load, shipped
+from gr_ros2.compression.dictionary import GENERAL, OWN, SHIPPED, Dictionary, load, shipped
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Types
@@ -99,39 +99,34 @@ class TopicCodec:
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
         self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders(topic, item) for item in sets}
-        self._coders = next(
-            (
-                self._held[item.number.to_bytes(1, "big") + item.prefix]
-                for item in sets
-                if topic.type_name in item.types
-            ),
-            self._held[SHIPPED[-1].to_bytes(1, "big")],
-        )
+        self._choices: list[_Coders] = []
+        """For sending, the preferred first: of every definition of the type one."""
+        for item, coders in zip(sets, self._held.values(), strict=True):
+            if topic.type_name in item.types and all(coders.tree != other.tree for other in self._choices):
+                self._choices.append(coders)
+        if not self._choices:
+            self._choices = [self._held[GENERAL.to_bytes(1, "big")]]
         self._plain = Zstd()
         self._max_size = max_size
-        steps = parse_steps(topic.options.quantize)
-        self._quantizer: Quantizer | None = None
-        if steps:
-            if self._coders.tree is None:
-                raise ConfigError(f"quantize: the type {topic.type_name} of topic {topic.name!r} is not known")
-            self._quantizer = Quantizer(self._coders.tree, steps)
+        if steps := parse_steps(topic.options.quantize):
+            self._quantize(steps, topic)
 
     def encode(self, payload: bytes) -> bytes:
         """See LinkCodec."""
         payload = self.canonical(payload)
         if self._mode == "none" or len(payload) > self._max_size:
             return b"\0" + payload
-        coders = self._coders
+        coders = self._fitting(payload)
         coded = None
         if self._mode != "zstd" and coders.fields is not None:
             found = coders.fields.encode(payload)
             if found is not None:
                 coded = coders.heads[FIELDS_AND_MORE if found[1] else FIELDS] + found[0]
                 if self._mode == "auto" and found[1]:
-                    other = self._zstd(payload)
+                    other = self._zstd(coders, payload)
                     coded = other if len(other) < len(coded) else coded
         if coded is None:
-            coded = self._zstd(payload)
+            coded = self._zstd(coders, payload)
         return coded if len(coded) <= len(payload) else b"\0" + payload
 
     def decode(self, coded: bytes) -> bytes:
@@ -164,16 +159,39 @@ class TopicCodec:
 
     def canonical(self, payload: bytes) -> bytes:
         """See LinkCodec. A message that the configuration stores uncoded keeps its gaps."""
-        fields = self._coders.fields
-        if fields is None or len(payload) > self._max_size or (self._mode == "none" and self._quantizer is None):
+        if len(payload) > self._max_size:
             return payload
-        found = fields.layout(payload)
+        coders = self._fitting(payload)
+        if coders.fields is None or (self._mode == "none" and coders.quantizer is None):
+            return payload
+        found = coders.fields.layout(payload)
         if found is None:
             return payload
-        return found[0].pack(*found[1]) if self._quantizer is None else self._quantizer(*found)
+        return found[0].pack(*found[1]) if coders.quantizer is None else coders.quantizer(*found)
 
-    def _zstd(self, payload: bytes) -> bytes:
-        coders = self._coders
+    def _fitting(self, payload: bytes) -> _Coders:
+        """Those with the first definition that fits the message, which is the first of all where none does."""
+        if len(self._choices) > 1:
+            for coders in self._choices:
+                if coders.fields is not None and coders.fields.layout(payload) is not None:
+                    return coders
+        return self._choices[0]
+
+    def _quantize(self, steps: Mapping[str, int], topic: Topic) -> None:
+        """Have messages quantised by every definition that has these fields; at least one must."""
+        errors: list[ConfigError] = []
+        for coders in self._choices:
+            try:
+                if coders.tree is not None:
+                    coders.quantizer = Quantizer(coders.tree, steps)
+            except ConfigError as error:
+                errors.append(error)
+        if all(coders.tree is None for coders in self._choices):
+            raise ConfigError(f"quantize: the type {topic.type_name} of topic {topic.name!r} is not known")
+        if all(coders.quantizer is None for coders in self._choices):
+            raise errors[0]
+
+    def _zstd(self, coders: _Coders, payload: bytes) -> bytes:
         least = bounds.least(len(payload))
         if coders.zstd is None:
             return b"\x01" + self._plain.compress(payload, least=least)
@@ -188,6 +206,7 @@ class _Coders:
     :ivar tree: the type, None where it is not known
     :ivar fields: None where the type is not known
     :ivar zstd: None where the set has no dictionary for the type
+    :ivar quantizer: None where nothing is to be quantised
     """
 
     def __init__(self, topic: Topic, dictionary: Dictionary) -> None:
@@ -196,6 +215,7 @@ class _Coders:
         own = {name: entry.definition for name, entry in dictionary.types.items() if entry.definition}
         self.tree = Types(own).tree(topic.type_name)
         self.fields: FieldsCodec | None = None
+        self.quantizer: Quantizer | None = None
         if self.tree is not None:
             self.fields = FieldsCodec(self.tree, dictionary.model(self.type_name), Zstd())
         entry = dictionary.types.get(topic.type_name)

@@ -14,6 +14,7 @@ from struct import Struct
 from typing import Any
 
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -71,56 +72,60 @@ def is_open(node: Node) -> bool:
 
 
 class Types:
-    """Message definitions: those of ROS 2 Humble, and the user's own.
+    """Message definitions: those given, and those of ROS 2 Humble for all other types.
 
     :param definitions: ``.msg`` texts by ``package/msg/Type``; one that cannot be read is left out
+    :ivar definitions: those given that say something else than Humble's
     """
 
     def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
-        self._store = _humble()
-        self.definitions = {
-            name: text for name, text in (definitions or {}).items() if name not in self._store.fielddefs
-        }
-        if self.definitions:
-            self._store = get_typestore(Stores.ROS2_HUMBLE)
-            for name, text in self.definitions.items():
-                try:
-                    found = get_types_from_msg(text, name)
-                    self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
-                except TypesysError:
-                    continue
+        humble = _humble().fielddefs
+        self.definitions: dict[str, str] = {}
+        self._own: dict[str, Typesdict] = {}
+        for name, text in (definitions or {}).items():
+            try:
+                found = get_types_from_msg(text, name)
+            except TypesysError:
+                continue
+            if any(kind not in humble or humble[kind][1] != members for kind, (_, members) in found.items()):
+                self.definitions[name], self._own[name] = text, found
+        self._shared = {kind: fields for found in self._own.values() for kind, fields in found.items()} | humble
         self._trees: dict[str, Composite | None] = {}
 
     def tree(self, type_name: str) -> Composite | None:
         """The tree of a type; None where it is unknown, or has a wstring or an array of no elements."""
         if type_name not in self._trees:
             try:
-                self._trees[type_name] = self._composite(type_name, ())
+                # What a text brings along counts for its own type only.
+                types = self._shared | self._own.get(type_name, {})
+                self._trees[type_name] = _composite(types, type_name, ())
             except KeyError:
                 self._trees[type_name] = None
         return self._trees[type_name]
 
-    def _composite(self, type_name: str, above: tuple[str, ...]) -> Composite:
-        if type_name in above:
-            raise KeyError(type_name)  # a type that contains itself has no tree
-        _, members = self._store.fielddefs[type_name]
-        if not members:
-            raise KeyError(type_name)
-        above = (*above, type_name)
-        nodes = tuple((name, self._node(kind, above)) for name, kind in members)
-        return Composite(type_name, nodes, any(is_open(node) for _, node in nodes))
 
-    def _node(self, kind: Any, above: tuple[str, ...]) -> Node:
-        node_type, detail = kind
-        if node_type is Nodetype.BASE:
-            return Text() if detail[0] == "string" else Scalar(_CODES[detail[0]])
-        if node_type is Nodetype.NAME:
-            return self._composite(detail, above)
-        element, length = detail
-        if node_type is Nodetype.ARRAY and not length:
-            raise KeyError("an array of no elements")  # any number of them would take 0 bytes
-        node, count = self._node(element, above), length if node_type is Nodetype.ARRAY else None
-        return Repeat(node, count, count is None or is_open(node))
+def _composite(types: Typesdict, type_name: str, above: tuple[str, ...]) -> Composite:
+    if type_name in above:
+        raise KeyError(type_name)  # a type that contains itself has no tree
+    _, members = types[type_name]
+    if not members:
+        raise KeyError(type_name)
+    above = (*above, type_name)
+    nodes = tuple((name, _node(types, kind, above)) for name, kind in members)
+    return Composite(type_name, nodes, any(is_open(node) for _, node in nodes))
+
+
+def _node(types: Typesdict, kind: Any, above: tuple[str, ...]) -> Node:
+    node_type, detail = kind
+    if node_type is Nodetype.BASE:
+        return Text() if detail[0] == "string" else Scalar(_CODES[detail[0]])
+    if node_type is Nodetype.NAME:
+        return _composite(types, detail, above)
+    element, length = detail
+    if node_type is Nodetype.ARRAY and not length:
+        raise KeyError("an array of no elements")  # any number of them would take 0 bytes
+    node, count = _node(types, element, above), length if node_type is Nodetype.ARRAY else None
+    return Repeat(node, count, count is None or is_open(node))
 
 
 @cache

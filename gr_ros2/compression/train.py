@@ -50,7 +50,7 @@ def learn(
 
     :param messages: (type name, payload)
     :param base: its words and constants follow after the learned ones
-    :param definitions: ``.msg`` texts of types that are not in ROS 2 Humble; kept in the dictionary
+    :param definitions: ``.msg`` texts of types; kept in the dictionary where ROS 2 Humble has none or another one
     :param zstd_size: bytes of each type's zstd dictionary at most; 0 = none
     """
     types = Types(definitions)
@@ -106,7 +106,7 @@ class _Seen:
             value = values[slot.index]
             if slot.kind == STRING and 0 < len(value) <= LONG_TEXT and value[-1] == 0:
                 if numbered(value):
-                    continue  # the codec composes the names of numbered robots itself
+                    continue  # the codec composes the names of numbered robots itself itself
                 try:
                     self.words[value[:-1].decode()] += 1
                 except UnicodeDecodeError:

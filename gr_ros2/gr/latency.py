@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from functools import lru_cache
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from rosbags.typesys import Stores, get_typestore
+from gr_ros2.middleware.type_definitions import typestores
 
 WINDOW = 10_000
 """Newest values the percentiles are taken over."""
@@ -27,8 +26,10 @@ _LITTLE_ENDIAN = 1
 
 def has_header(type_name: str) -> bool:
     """Whether messages of a type begin with a std_msgs/Header; False where the type is not known."""
-    _, members = _fields().get(type_name, ([], []))
-    return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
+    for store in typestores(type_name)[:1]:  # no type of ROS ever got or lost its header
+        _, members = store.fielddefs[type_name]
+        return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
+    return False
 
 
 def leading_time(payload: bytes) -> float | None:
@@ -82,8 +83,3 @@ class LatencyWindow:
             return LatencySummary(None, None, None, None, 0, 0)
         p50, p95, p99 = (values[-(-len(values) * percent // 100) - 1] for percent in (50, 95, 99))
         return LatencySummary(p50, p95, p99, values[-1], self._count, self._negative)
-
-
-@lru_cache(maxsize=1)
-def _fields() -> dict[str, Any]:
-    return dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)

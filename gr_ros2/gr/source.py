@@ -135,7 +135,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return all(subscription.matched() for subscription in self._subscriptions.values())
+        return not self.unmatched
+
+    @property
+    def unmatched(self) -> list[str]:
+        """Topics, by their names on the ROS graph, that nobody publishes yet."""
+        subscriptions = dict(self._subscriptions)
+        names = {topic.topic_id: name for name, topic in self.subscribed.items()}
+        return [names[number] for number, subscription in subscriptions.items() if not subscription.matched()]
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -207,6 +214,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "repeats": stats.repeats,
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
+                "unmatched": self.unmatched,
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }

@@ -20,17 +20,22 @@ from gr_ros2.middleware.ros_graph import DiscoveryOptions
 _LOOPBACK = '<NetworkInterface address="127.0.0.1"/>'
 _UNICAST_ONLY = '<NetworkInterface autodetermine="true" multicast="false" priority="3"/>'
 """Cyclone DDS looks for peers through the interface of the highest priority only; the loopback interface has 2."""
-_SPDP_INTERVAL = "<SPDPInterval>250ms</SPDPInterval>"
+_OFTEN = "<SPDPInterval>250ms</SPDPInterval>"
 """A node on another interface is not received on the loopback interface; it finds this participant when this
 participant announces itself. Cyclone DDS does that every 8 s by default. On the loopback interface a short interval
 costs nothing."""
+_ASK_AGAIN = "<SPDPInterval>2s</SPDPInterval>"
+_NEVER_FORGET = 'PruneDelay="inf"'
+"""By itself Cyclone DDS 11 asks a peer in the first moment and drops its address after 30 s, before it would ask again.
+A peer that starts a second later would never be found. Asking is a packet of 0.3 kB to each of 100 ports."""
 
 
 def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
     """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence; '' = the library's default."""
     if options.range == "SYSTEM_DEFAULT":
         return ""
-    peers = options.peers
+    peers = "".join(f"<Peer Address={quoteattr(peer)} {_NEVER_FORGET}/>" for peer in options.peers)
+    interval = _ASK_AGAIN if peers else ""
     if options.range == "OFF":
         general = "<AllowMulticast>false</AllowMulticast>"
         # Only participants with an equal tag find each other.
@@ -38,13 +43,13 @@ def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os
     elif options.range == "LOCALHOST":
         # Multicast stays on: without it Fast DDS may never match. Peers need another interface, without multicast.
         general = f"<Interfaces>{_LOOPBACK}{_UNICAST_ONLY if peers else ''}</Interfaces>"
-        discovery = f"<ParticipantIndex>auto</ParticipantIndex>{'' if peers else _SPDP_INTERVAL}"
-        peers = ("127.0.0.1", *peers)
+        discovery = "<ParticipantIndex>auto</ParticipantIndex>"
+        interval = interval or _OFTEN
+        peers = f'<Peer Address="127.0.0.1"/>{peers}'
     else:
         general = "<AllowMulticast>spdp</AllowMulticast>"
         discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # sets the ports at which peers look for us
-    if peers:
-        discovery += f"<Peers>{''.join(f'<Peer address={quoteattr(peer)}/>' for peer in peers)}</Peers>"
+    discovery += f"{interval}<Peers>{peers}</Peers>"
     domain = f'<Domain Id="any"><General>{general}</General><Discovery>{discovery}</Discovery></Domain>'
     return f"<CycloneDDS>{domain}</CycloneDDS>,{environment.get('CYCLONEDDS_URI', '')}"
 

@@ -43,8 +43,21 @@ def typestore() -> Typestore:
 
 
 def known(type_name: str) -> bool:
-    """Whether ROS ships ``package/msg/Type``."""
-    return type_name in typestore().fielddefs
+    """Whether a distribution of ROS ships ``package/msg/Type``."""
+    return bool(typestores(type_name))
+
+
+@cache
+def typestores(type_name: str) -> tuple[Typestore, ...]:
+    """The types of one distribution for every definition that ``package/msg/Type`` ever had in ROS.
+
+    That of :func:`typestore` comes first, then the oldest. () where ROS has none.
+    """
+    found: dict[str, Typestore] = {}
+    for store in (typestore(), *_distributions()):
+        if type_name in store.fielddefs:
+            found.setdefault(_hash(store, type_name), store)
+    return tuple(found.values())
 
 
 def definition(type_name: str, text: str | None = None) -> Definition:
@@ -53,7 +66,7 @@ def definition(type_name: str, text: str | None = None) -> Definition:
     :param text: of the type, None = as ROS ships it; one that cannot be read is as good as none
     """
     if text is None and known(type_name):
-        return Definition(typestore().generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name))
+        return Definition(typestores(type_name)[0].generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name))
     digest = text_hash(type_name, text) if text is not None else ""
     return Definition(text, digest) if text is not None and digest else _unknown(type_name)
 
@@ -68,9 +81,9 @@ def recorded_definition(type_name: str, text: str, digest: str) -> Definition:
         return Definition(text, digest or text_hash(type_name, text) or _unknown(type_name).digest)
     if known(type_name) and digest in ("", type_hash(type_name)):
         return definition(type_name)
-    distribution = _distribution_of(type_name, digest)
-    if distribution is not None:
-        return Definition(distribution.generate_msgdef(type_name, ros_version=2)[0], digest)
+    for store in typestores(type_name):
+        if _hash(store, type_name) == digest:
+            return Definition(store.generate_msgdef(type_name, ros_version=2)[0], digest)
     unknown = _unknown(type_name)
     return Definition(unknown.text, digest or unknown.digest)
 
@@ -82,7 +95,7 @@ def same_type(type_name: str, text: str, other: str) -> bool:
 
 def type_hash(type_name: str) -> str:
     """RIHS01 hash of a type ROS ships, '' for others."""
-    return str(_as_hashed().hash_rihs01(type_name)) if known(type_name) else ""
+    return _hash(typestores(type_name)[0], type_name) if known(type_name) else ""
 
 
 def text_hash(type_name: str, text: str) -> str:
@@ -90,18 +103,22 @@ def text_hash(type_name: str, text: str) -> str:
     store = Typestore()
     try:
         own = get_types_from_idl(text) if text.startswith(_IDL) else _without_char(get_types_from_msg(text, type_name))
-        store.fielddefs = {**_as_hashed().fielddefs, **own}
+        store.fielddefs = {**_as_hashed(typestore()).fielddefs, **own}
         return str(store.hash_rihs01(type_name))
     except (TypesysError, KeyError, RecursionError):  # the last of a type within itself
         return ""
 
 
+def _hash(store: Typestore, type_name: str) -> str:
+    return str(_as_hashed(store).hash_rihs01(type_name))
+
+
 @cache
-def _as_hashed() -> Typestore:
-    """The types of ROS as their hashes are made."""
-    store = Typestore()
-    store.fielddefs = _without_char(typestore().fielddefs)
-    return store
+def _as_hashed(store: Typestore) -> Typestore:
+    """Types as their hashes are made."""
+    hashed = Typestore()
+    hashed.fielddefs = _without_char(store.fielddefs)
+    return hashed
 
 
 def _without_char(types: Typesdict) -> Typesdict:
@@ -125,16 +142,9 @@ def _uint8_for_char(kind: FieldDesc) -> FieldDesc:
 
 
 @cache
-def _distribution_of(type_name: str, digest: str) -> Typestore | None:
-    """The types of a distribution in which a type has this hash, the oldest first."""
-    for store in Stores:
-        if not store.name.startswith("ROS2_"):
-            continue
-        found, hashed = get_typestore(store), Typestore()
-        hashed.fielddefs = _without_char(found.fielddefs)
-        if type_name in found.fielddefs and hashed.hash_rihs01(type_name) == digest:
-            return found
-    return None
+def _distributions() -> tuple[Typestore, ...]:
+    """The types of every distribution of ROS 2, the oldest first."""
+    return tuple(get_typestore(store) for store in Stores if store.name.startswith("ROS2_"))
 
 
 def _unknown(type_name: str) -> Definition:

@@ -89,7 +89,9 @@ def cyclone_uri(peer: str, interface: str) -> str:
         f"<MaxMessageSize>{largest}B</MaxMessageSize><MaxRexmitMessageSize>{largest}B</MaxRexmitMessageSize>"
         f"<FragmentSize>{largest - 128}B</FragmentSize></General>"
         "<Discovery><ParticipantIndex>0</ParticipantIndex><MaxAutoParticipantIndex>0</MaxAutoParticipantIndex>"
-        f'<Peers AddLocalhost="false"><Peer address="{peer}"/></Peers></Discovery>'
+        # By itself it asks a peer that is not there yet, or whose packet is lost, in the first moment only.
+        f'<SPDPInterval>8s</SPDPInterval><Peers AddLocalhost="false"><Peer Address="{peer}" PruneDelay="inf"/></Peers>'
+        "</Discovery>"
         "</Domain></CycloneDDS>"
     )
 

@@ -2,42 +2,61 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from gr_ros2.backends import Backend, BackendTable
+
+
+@dataclass(frozen=True)
+class FrontEndBackend(Backend):
+    """One row of the front end table.
+
+    :param sample_rate: samples/s of a link whose user names no rate: one that all its devices can have
+    """
+
+    sample_rate: float = 1e6
+
 
 FRONT_ENDS = BackendTable(
     "front_end",
     {
-        "sim": Backend(
+        "sim": FrontEndBackend(
             "gr_ros2.radio.sim",
             "SimFrontEnd",
             "channel model: what a robot sends comes back to it",
             title="Simulated Radio",
         ),
-        "zmq": Backend(
+        "zmq": FrontEndBackend(
             "gr_ros2.radio.zmq",
             "ZmqFrontEnd",
             "samples over ZeroMQ: processes or machines without radios",
             "pyzmq",
             title="ZeroMQ Radio",
         ),
-        "file": Backend(
+        "file": FrontEndBackend(
             "gr_ros2.radio.file", "FileFrontEnd", "SigMF recordings, written and replayed", title="SigMF File Radio"
         ),
-        "soapy": Backend(
+        "soapy": FrontEndBackend(
             "gr_ros2.radio.soapy",
             "SoapyFrontEnd",
             "any SoapySDR device",
             "gr-soapy, part of GNU Radio 3.10",
             title="SoapySDR Radio",
+            sample_rate=2e6,
         ),
-        "uhd": Backend(
+        "uhd": FrontEndBackend(
             "gr_ros2.radio.uhd", "UhdFrontEnd", "USRPs", "gr-uhd, part of GNU Radio 3.10", title="USRP Radio"
         ),
-        "pluto": Backend(
-            "gr_ros2.radio.pluto", "PlutoFrontEnd", "ADALM-Pluto", "gr-iio, part of GNU Radio 3.10", title="Pluto Radio"
+        "pluto": FrontEndBackend(
+            "gr_ros2.radio.pluto",
+            "PlutoFrontEnd",
+            "ADALM-Pluto",
+            "gr-iio, part of GNU Radio 3.10",
+            title="Pluto Radio",
+            sample_rate=2.5e6,
         ),
     },
-    Backend,
+    FrontEndBackend,
 )
 
-__all__ = ["FRONT_ENDS"]
+__all__ = ["FRONT_ENDS", "FrontEndBackend"]

@@ -54,21 +54,37 @@ def _with_port(address: str) -> str:
     return address
 
 
-Address = Annotated[str, Field(min_length=1), AfterValidator(_with_port)]
-"""As ZeroMQ writes them."""
+def _with_transport(address: str) -> str:
+    return address if "://" in address else f"tcp://{address}"
+
+
+def _any_interface(address: str) -> str:
+    return f"*:{address.removeprefix(':')}" if address.removeprefix(":").isdecimal() else address
+
+
+Address = Annotated[str, Field(min_length=1), AfterValidator(_with_transport), AfterValidator(_with_port)]
+"""As ZeroMQ writes them; what names no transport is TCP."""
+OwnAddress = Annotated[
+    str,
+    Field(min_length=1),
+    AfterValidator(_any_interface),
+    AfterValidator(_with_transport),
+    AfterValidator(_with_port),
+]
+"""The same; a port alone is on all interfaces."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ZmqOptions(FrontEndOptions):
     """Settings of this front end.
 
-    :param bind: address to publish at: ``tcp://*:5555`` (all interfaces), ``tcp://10.0.0.1:5555``, ``ipc:///tmp/a``.
-        Whoever can reach it can listen; there is no encryption
-    :param connect: addresses of the other robots, ``tcp://10.0.0.2:5555``
+    :param bind: address to publish at: ``5555`` or ``tcp://*:5555`` (all interfaces), ``10.0.0.1:5555``,
+        ``ipc:///tmp/a``. Whoever can reach it can listen; there is no encryption
+    :param connect: addresses of the other robots, ``10.0.0.2:5555``
     :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
     """
 
-    bind: Address
+    bind: OwnAddress
     connect: Annotated[tuple[Address, ...], Field(min_length=1)]
     queue: Annotated[int, Field(ge=1, le=10_000)] = 300
 

@@ -25,6 +25,7 @@ from rclpy.utilities import remove_ros_args
 from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.radio.config import load_link
 from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.waiting import Waiting
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 
 CONFIG = "config"
@@ -175,9 +176,12 @@ def main(args: Sequence[str] | None = None) -> None:
         node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {phy.name}{runs_on}")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        waiting = Waiting(node.link.source)
         while not (asked or node.link.finished):
             executor.spin_once(timeout_sec=_LOOK_S)
             node.link.check()
+            if (waits_for := waiting.look()) is not None:
+                node.get_logger().info(waits_for)
     except ExternalShutdownException:
         pass
     except GrRos2Error as error:

@@ -39,6 +39,15 @@ class Hello(NamedTuple):
     digest: int
     marks: tuple[tuple[int, int], ...] = ()
 
+    def describe(self) -> str:
+        """What it says, in words."""
+        words = [f"hello, boot {self.boot}, turns {self.turns}"]
+        words += ["hears and reports"] * (self.capabilities & CAN_HEAR != 0)
+        words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
+        words += [f"table {self.digest:08x}"] * (self.digest != 0)
+        words += [f"keeps topic {topic_id} {mark:08x}" for topic_id, mark in self.marks]
+        return ", ".join(words)
+
 
 CAN_HEAR = 1
 """The robot receives too, and reports what it hears."""
@@ -55,6 +64,10 @@ class Ask(NamedTuple):
 
     src_id: int
     topic_ids: bytes
+
+    def describe(self) -> str:
+        """What it says, in words."""
+        return f"ask, of robot {self.src_id} topics {' '.join(map(str, self.topic_ids))}"
 
 
 class Report(NamedTuple):
@@ -75,6 +88,14 @@ class Report(NamedTuple):
     settled: bool
     loss: int
 
+    def describe(self) -> str:
+        """What it says, in words."""
+        older = ", nothing older wanted" if self.settled else ""
+        return (
+            f"report, of robot {self.src_id} (boot ends in {self.boot:04x}), number {self.number}, "
+            f"arrived {self.arrived:016x}{older}, loss {self.loss / 128:.0%}"
+        )
+
 
 class Heard(NamedTuple):
     """The sender has heard a start of another robot. To that robot it proves that the packet is no replay of an
@@ -86,6 +107,10 @@ class Heard(NamedTuple):
 
     src_id: int
     boot: int
+
+    def describe(self) -> str:
+        """What it says, in words."""
+        return f"heard, robot {self.src_id}, boot {self.boot}"
 
 
 Control = Hello | Ask | Report | Heard

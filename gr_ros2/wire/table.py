@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
+from gr_ros2.wire.format import QOS_NAMES
 
 _FORMAT = 1
 _QOS, _RELIABLE, _LATCHED = 3, 4, 8
@@ -37,6 +38,13 @@ class Row(NamedTuple):
     latched: bool = False
     depth: int = 0
     codec: str = ""
+
+    def describe(self) -> str:
+        """What it says, in words."""
+        words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
+        words += ["reliable"] * self.reliable + ["latched"] * self.latched
+        words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
+        return ", ".join(words)
 
 
 def write_table(rows: Iterable[Row]) -> bytes:

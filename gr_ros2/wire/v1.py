@@ -107,6 +107,25 @@ class Part(NamedTuple):
     last: bool = True
     coded: bool = False
 
+    @property
+    def name(self) -> int:
+        """``back``: with its packet's number, what names the message."""
+        return self.back
+
+    @property
+    def label(self) -> str:
+        """``[whole]``, or ``-back[offset..end)`` and ``]`` where the message ends."""
+        if self.last and not self.offset:
+            return "[whole]"
+        return f"-{self.back}[{self.offset}..{self.offset + len(self.payload)}{']' if self.last else ')'}"
+
+    def describe(self) -> str:
+        """The same in words."""
+        if self.last and not self.offset:
+            return "whole"
+        end = ", its last" if self.last else ""
+        return f"began {self.back} packets ago, bytes from {self.offset} on{end}"
+
 
 Entry = Part | Control
 

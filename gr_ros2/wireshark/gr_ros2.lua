@@ -1,15 +1,21 @@
--- Wireshark dissector for gr-ros2 packets, version 0 of the wire format (docs/reference/wire-format.md).
+-- Wireshark dissector for gr-ros2 packets, versions 0 and 1 of the wire format (docs/reference/wire-format.md).
 --
 -- Captures made by `gr-ros2 run --pcap` and `gr-ros2 link --pcap` (link type USER0) are recognised by themselves; for
 -- packets carried in UDP use "Decode As". Install it with `gr-ros2 wireshark --install`, or try it with
 -- `tshark -X lua_script:gr_ros2.lua -r FILE`.
 --
 -- Everything a receiver would refuse is an expert item of severity "error", named as the receiver's counter names it.
+-- A packet of version 1 is checked from the first hello of its sender on. Tags are not checked and nothing is decrypted:
+-- `gr-ros2 packet decode --key FILE` does both.
 
 local xor = (bit or bit32).bxor
-local proto = Proto("gr_ros2", "gr-ros2: ROS 2 topics in packets of fixed length")
+local proto = Proto("gr_ros2", "gr-ros2: ROS 2 topics over any radio")
 
 local QOS = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "default (11)" }
+local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a standing packet" }
+local KINDS = { [0] = "source", [1] = "repair", [2] = "control" }
+local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fragment", [3] = "last fragment" }
+local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard" }
 local BROADCAST = 255
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
 
@@ -33,11 +39,60 @@ local f = {
     payload = ProtoField.bytes("gr_ros2.payload", "Payload"),
     pad = ProtoField.bytes("gr_ros2.pad", "PAD"),
     crc = ProtoField.uint16("gr_ros2.crc", "CRC-16", base.HEX),
+    -- Version 1.
+    kind = ProtoField.uint8("gr_ros2.kind", "Kind", base.DEC, KINDS),
+    sealed = ProtoField.bool("gr_ros2.sealed", "Sealed (S)", 8, nil, 0x08),
+    addressed = ProtoField.bool("gr_ros2.addressed", "Addressed (A)", 8, nil, 0x04),
+    qos_bits = ProtoField.uint8("gr_ros2.qos_bits", "QoS", base.DEC, QOS_V1, 0x03),
+    number = ProtoField.uint16("gr_ros2.number", "Number, low 16 bits"),
+    packet_number = ProtoField.uint32("gr_ros2.packet_number", "Packet number"),
+    hop_count = ProtoField.uint8("gr_ros2.hop_count", "Hop count"),
+    window = ProtoField.uint8("gr_ros2.window", "Window", base.DEC, nil, 0x7F),
+    masked = ProtoField.bool("gr_ros2.masked", "M: a mask follows, or not encrypted", 8, nil, 0x80),
+    row = ProtoField.uint8("gr_ros2.row", "Row", base.DEC, nil, 0x7F),
+    oldest = ProtoField.bool("gr_ros2.oldest", "Nothing older is worth repairing (O)", 8, nil, 0x80),
+    mask = ProtoField.bytes("gr_ros2.mask", "Mask"),
+    combined = ProtoField.bytes("gr_ros2.combined", "Combined bodies"),
+    ciphertext = ProtoField.bytes("gr_ros2.ciphertext", "Encrypted body"),
+    crc32 = ProtoField.uint32("gr_ros2.crc32", "CRC-32", base.HEX),
+    tag = ProtoField.bytes("gr_ros2.tag", "Tag"),
+    place = ProtoField.uint8("gr_ros2.place", "Place", base.DEC, PLACES, 0xC0),
+    coded = ProtoField.bool("gr_ros2.coded", "Coded (C)", 8, nil, 0x20),
+    fills = ProtoField.bool("gr_ros2.fills", "Ends where the longest body ends (F)", 8, nil, 0x10),
+    back = ProtoField.uint32("gr_ros2.back", "Packets since the message began"),
+    offset = ProtoField.uint32("gr_ros2.offset", "Offset in the message"),
+    control = ProtoField.uint8("gr_ros2.control", "Control entry", base.HEX, CONTROLS),
+    hello_boot = ProtoField.uint32("gr_ros2.hello.boot", "Boot number"),
+    hello_turns = ProtoField.uint32("gr_ros2.hello.turns", "Turns of the packet number"),
+    hello_hears = ProtoField.bool("gr_ros2.hello.hears", "Hears and reports", 8, nil, 0x01),
+    hello_encrypts = ProtoField.bool("gr_ros2.hello.encrypts", "Encrypts", 8, nil, 0x02),
+    hello_digest = ProtoField.uint32("gr_ros2.hello.digest", "CRC-32 of the table of topics", base.HEX),
+    hello_topic_id = ProtoField.uint8("gr_ros2.hello.topic_id", "Kept for late joiners, topic id"),
+    hello_mark = ProtoField.uint32("gr_ros2.hello.mark", "CRC-32 of that message", base.HEX),
+    ask_src_id = ProtoField.uint8("gr_ros2.ask.src_id", "Asks robot"),
+    ask_topic_id = ProtoField.uint8("gr_ros2.ask.topic_id", "For topic id"),
+    report_src_id = ProtoField.uint8("gr_ros2.report.src_id", "Tells of the packets of robot"),
+    report_boot = ProtoField.uint16("gr_ros2.report.boot", "Low 16 bits of its boot number"),
+    report_number = ProtoField.uint16("gr_ros2.report.number", "Newest number of the map"),
+    report_arrived = ProtoField.uint64("gr_ros2.report.arrived", "Map of what arrived", base.HEX),
+    report_settled = ProtoField.bool("gr_ros2.report.settled", "Nothing older is wanted", 8, nil, 0x80),
+    report_loss = ProtoField.uint8("gr_ros2.report.loss", "Packets lost lately, of 128", base.DEC, nil, 0x7F),
+    heard_src_id = ProtoField.uint8("gr_ros2.heard.src_id", "Has heard robot"),
+    heard_boot = ProtoField.uint32("gr_ros2.heard.boot", "Of this boot number"),
+    table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
+    table_name = ProtoField.string("gr_ros2.table.name", "Name"),
+    table_type = ProtoField.string("gr_ros2.table.type", "Type"),
+    table_codec = ProtoField.string("gr_ros2.table.codec", "Codec"),
+    table_qos = ProtoField.uint8("gr_ros2.table.qos", "QoS class", base.DEC, QOS),
+    table_reliable = ProtoField.bool("gr_ros2.table.reliable", "Reliable"),
+    table_latched = ProtoField.bool("gr_ros2.table.latched", "Kept for late joiners"),
+    table_depth = ProtoField.uint8("gr_ros2.table.depth", "Depth"),
 }
-proto.fields = {
-    f.version, f.qos, f.compressed, f.encrypted, f.src_id, f.dst_id, f.seq, f.hop, f.entries, f.topic_id, f.topic,
-    f.type_name, f.entry_id, f.index, f.total, f.payload_len, f.payload, f.pad, f.crc,
-}
+local fields = {}
+for _, field in pairs(f) do
+    fields[#fields + 1] = field
+end
+proto.fields = fields
 
 local function refusal(name, text)
     return ProtoExpert.new("gr_ros2.refused." .. name, text, expert.group.MALFORMED, expert.severity.ERROR)
@@ -52,12 +107,18 @@ local refused = {
     pad = refusal("pad", "PAD is not zero"),
     total = refusal("total", "total = 0"),
     index = refusal("index", "index >= total"),
+    window = refusal("window", "Window and mask contradict each other"),
+    kind = refusal("entry_kind", "Flags or a fragment that cannot be"),
+    varint = refusal("varint", "A number that is too long, too large, or longer than needed"),
 }
-proto.experts = {
-    refused.length, refused.crc, refused.version, refused.empty, refused.overrun, refused.pad, refused.total,
-    refused.index,
-}
+local experts = {}
+for _, expert in pairs(refused) do
+    experts[#experts + 1] = expert
+end
+proto.experts = experts
 
+proto.prefs.packet_len = Pref.uint(
+    "Bytes of the longest packet", 0, "packet_len of the link; 0: as long as the longest packet so far (version 1)")
 proto.prefs.registry = Pref.string("Registry CSV", "", "The registry both ends use; shows topics by name")
 
 -- Topics of the registry by id, read when the preference changes: rows `name,type`, as in docs/reference/wire-format.md.
@@ -85,8 +146,12 @@ function proto.prefs_changed()
     read_registry(proto.prefs.registry)
 end
 
+-- What was heard so far of the senders of version 1, filled as the packets are read for the first time.
+local starts, frames, tables, announced, longest = {}, {}, {}, {}, 0
+
 function proto.init()
     read_registry(proto.prefs.registry)
+    starts, frames, tables, announced, longest = {}, {}, {}, {}, 0
 end
 
 -- CRC-16, polynomial 0x1021, init 0, not reflected, no final xor.
@@ -179,9 +244,7 @@ local function dissect_pad(buffer, tree, at, limit)
     end
 end
 
-function proto.dissector(buffer, pinfo, root)
-    pinfo.cols.protocol = "gr-ros2"
-    local tree = root:add(proto, buffer())
+local function dissect_v0(buffer, pinfo, tree)
     if buffer:len() < HEADER_LEN + CRC_LEN then
         tree:add_proto_expert_info(refused.length)
         return buffer:len()
@@ -224,6 +287,442 @@ function proto.dissector(buffer, pinfo, root)
     pinfo.cols.info = string.format(
         "seq %d%s  %s", buffer(3, 1):uint(), intact and "" or " CRC mismatch", table.concat(summary, " "))
     return buffer:len()
+end
+
+-- Version 1 -----------------------------------------------------------------------------------------------------------
+
+local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
+local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 13, 5, 14, 5
+
+-- CRC-32 of IEEE 802.3.
+local CRC32_TABLE = {}
+for byte = 0, 255 do
+    local crc = byte
+    for _ = 1, 8 do
+        local half = math.floor(crc / 2)
+        crc = crc % 2 == 1 and xor(half, 0xEDB88320) % 0x100000000 or half
+    end
+    CRC32_TABLE[byte] = crc
+end
+
+local function crc32(crc, bytes)
+    for place = 0, bytes:len() - 1 do
+        local byte = bytes:get_index(place)
+        crc = xor(math.floor(crc / 256), CRC32_TABLE[xor(crc % 256, byte)]) % 0x100000000
+    end
+    return crc
+end
+
+local function expected_crc32(boot, turns, buffer)
+    local session = ByteArray.new(string.format("%08x%08x", boot, turns))
+    return 0xFFFFFFFF - crc32(crc32(0xFFFFFFFF, session), buffer:bytes())
+end
+
+-- The full number nearest to the newest one that is known.
+local function full_number(newest, low)
+    local number = newest + (low - newest + 0x8000) % 0x10000 - 0x8000
+    return number < 0 and low or number
+end
+
+local function name_of(src, id)
+    local row = announced[src] and announced[src][id] or topics[id]
+    return row and row.name or (id == TABLE_TOPIC and "table of topics" or "topic " .. id), row
+end
+
+local function varint(buffer, at, limit)
+    local value, scale = 0, 1
+    for place = 1, 4 do
+        if at >= limit then
+            return nil, refused.overrun
+        end
+        local byte = buffer(at, 1):uint()
+        at = at + 1
+        value = value + byte % 128 * scale
+        scale = scale * 128
+        if byte < 128 then
+            if byte == 0 and place > 1 then
+                return nil, refused.varint
+            end
+            return value, at
+        end
+    end
+    return nil, refused.varint
+end
+
+local function dissect_hello(buffer, tree, at, size)
+    tree:add(f.hello_boot, buffer(at, 4))
+    tree:add(f.hello_turns, buffer(at + 4, 4))
+    tree:add(f.hello_hears, buffer(at + 8, 1))
+    tree:add(f.hello_encrypts, buffer(at + 8, 1))
+    tree:add(f.hello_digest, buffer(at + 9, 4))
+    for mark = at + HELLO_LEN, at + size - 1, MARK_LEN do
+        tree:add(f.hello_topic_id, buffer(mark, 1))
+        tree:add(f.hello_mark, buffer(mark + 1, 4))
+    end
+end
+
+local function dissect_control(buffer, tree, at, limit)
+    if at + 2 > limit or at + 2 + buffer(at + 1, 1):uint() > limit then
+        tree:add_proto_expert_info(refused.overrun)
+        return nil
+    end
+    local kind, size = buffer(at, 1):uint(), buffer(at + 1, 1):uint()
+    local item = tree:add(f.control, buffer(at, 1))
+    local name = CONTROLS[kind] or string.format("unknown 0x%02x", kind)
+    local start = at + 2
+    local sizes = {
+        hello = size >= HELLO_LEN and (size - HELLO_LEN) % MARK_LEN == 0,
+        ask = size >= 2,
+        report = size == REPORT_LEN,
+        heard = size == HEARD_LEN,
+    }
+    if sizes[name] == false then
+        item:add_proto_expert_info(refused.overrun)
+        return nil
+    elseif name == "hello" then
+        dissect_hello(buffer, item, start, size)
+    elseif name == "ask" then
+        item:add(f.ask_src_id, buffer(start, 1))
+        for topic = start + 1, start + size - 1 do
+            item:add(f.ask_topic_id, buffer(topic, 1))
+        end
+    elseif name == "report" then
+        item:add(f.report_src_id, buffer(start, 1))
+        item:add(f.report_boot, buffer(start + 1, 2))
+        item:add(f.report_number, buffer(start + 3, 2))
+        item:add(f.report_arrived, buffer(start + 5, 8))
+        item:add(f.report_settled, buffer(start + 13, 1))
+        item:add(f.report_loss, buffer(start + 13, 1))
+    elseif name == "heard" then
+        item:add(f.heard_src_id, buffer(start, 1))
+        item:add(f.heard_boot, buffer(start + 1, 4))
+    end
+    return start + size, name
+end
+
+-- The rows of a table of topics; nil where it is none.
+local function read_table(bytes)
+    local rows, at = {}, 1
+    if bytes:len() == 0 or bytes:get_index(0) ~= 1 then
+        return nil
+    end
+    while at < bytes:len() do
+        if at + 4 > bytes:len() then
+            return nil
+        end
+        local flags = bytes:get_index(at + 1)
+        local row = { id = bytes:get_index(at), flags = flags, depth = bytes:get_index(at + 2) }
+        at = at + 3
+        for _, text in ipairs({ "name", "kind", "codec" }) do
+            if at >= bytes:len() or at + 1 + bytes:get_index(at) > bytes:len() then
+                return nil
+            end
+            local length = bytes:get_index(at)
+            row[text] = length > 0 and bytes:subset(at + 1, length):raw() or ""
+            at = at + 1 + length
+        end
+        rows[#rows + 1] = row
+    end
+    return rows
+end
+
+-- Keep a fragment of a robot's table of topics; its rows once all fragments are here.
+local function keep_fragment(src, begin, offset, last, bytes)
+    tables[src] = tables[src] or {}
+    local parts = tables[src][begin] or {}
+    tables[src][begin] = parts
+    parts[offset] = bytes
+    parts.total = last and offset + bytes:len() or parts.total
+    local whole, at = ByteArray.new(), 0
+    while parts[at] and parts[at]:len() > 0 do
+        whole:append(parts[at])
+        at = at + parts[at]:len()
+    end
+    if at ~= parts.total then
+        return nil
+    end
+    tables[src][begin] = nil
+    return read_table(whole)
+end
+
+local function show_table(tree, range, rows)
+    for _, row in ipairs(rows) do
+        local item = tree:add(f.table_topic_id, range, row.id)
+        item:append_text(string.format(": %s, %s", row.name, row.kind))
+        item:add(f.table_name, range, row.name):set_generated()
+        item:add(f.table_type, range, row.kind):set_generated()
+        item:add(f.table_codec, range, row.codec):set_generated()
+        item:add(f.table_qos, range, row.flags % 4):set_generated()
+        item:add(f.table_reliable, range, math.floor(row.flags / 4) % 2 == 1):set_generated()
+        item:add(f.table_latched, range, math.floor(row.flags / 8) % 2 == 1):set_generated()
+        item:add(f.table_depth, range, row.depth):set_generated()
+    end
+end
+
+-- One message or fragment; returns the place behind it, or nil where it cannot be one.
+local function dissect_part(buffer, tree, packet, at, limit)
+    local id = buffer(at, 1):uint() - 1
+    local name, row = name_of(packet.src, id)
+    local entry = tree:add(proto, buffer(at, limit - at), name)
+    local function refuse(expert)
+        entry:add_proto_expert_info(expert)
+        return nil
+    end
+    entry:add(f.topic_id, buffer(at, 1), id)
+    if row then
+        entry:add(f.topic, buffer(at, 1), row.name):set_generated()
+        entry:add(f.type_name, buffer(at, 1), row.kind):set_generated()
+    end
+    if at + 2 > limit then
+        return refuse(refused.overrun)
+    end
+    local begin, flags = at, buffer(at + 1, 1):uint()
+    local place, fills = math.floor(flags / 64), math.floor(flags / 16) % 2 == 1
+    entry:add(f.place, buffer(at + 1, 1))
+    entry:add(f.coded, buffer(at + 1, 1))
+    entry:add(f.fills, buffer(at + 1, 1))
+    at = at + 2
+    local length, back, offset = nil, 0, 0
+    if fills and (flags % 16 ~= 0 or packet.short) then
+        return refuse(refused.kind)
+    elseif not fills then
+        if at >= limit then
+            return refuse(refused.overrun)
+        end
+        length = flags % 16 * 256 + buffer(at, 1):uint()
+        entry:add(f.payload_len, buffer(at - 1, 2), length)
+        at = at + 1
+    end
+    if place >= 2 then
+        local next_at
+        back, next_at = varint(buffer, at, limit)
+        if not back then
+            return refuse(next_at)
+        end
+        entry:add(f.back, buffer(at, next_at - at), back)
+        at = next_at
+        offset, next_at = varint(buffer, at, limit)
+        if not offset then
+            return refuse(next_at)
+        end
+        entry:add(f.offset, buffer(at, next_at - at), offset)
+        at = next_at
+        if offset == 0 then
+            return refuse(refused.kind)
+        end
+    end
+    local after = length and at + length or packet.filled
+    if after > limit or after < at then
+        return refuse(refused.overrun)
+    elseif place > 0 and after == at then
+        return refuse(refused.kind)
+    elseif back > MAX_BACK or offset + after - at > MAX_MESSAGE then
+        return refuse(refused.varint)
+    end
+    entry:set_len(after - begin)
+    entry:append_text(string.format(", %s, %d bytes", PLACES[place], after - at))
+    if after > at then
+        entry:add(f.payload, buffer(at, after - at))
+    end
+    if id == TABLE_TOPIC and packet.first_time and after > at then
+        packet.frame.rows = keep_fragment(
+            packet.src, packet.number - back, offset, place % 3 == 0, buffer(at, after - at):bytes())
+        if packet.frame.rows then
+            announced[packet.src] = {}
+            for _, found in ipairs(packet.frame.rows) do
+                announced[packet.src][found.id] = found
+            end
+        end
+    end
+    if id == TABLE_TOPIC and packet.frame.rows then
+        show_table(entry, buffer(begin, after - begin), packet.frame.rows)
+    end
+    return after, string.format("%s[%s]", name, PLACES[place]:match("^%w+"))
+end
+
+-- The entries of a body from `at` on, and the zeros behind them; what is to be said of them in a line.
+local function dissect_body(buffer, tree, packet, at, limit)
+    local summary = {}
+    while at < limit and buffer(at, 1):uint() ~= 0 do
+        local control = buffer(at, 1):uint() > TABLE_TOPIC + 1
+        local after, text
+        if control then
+            after, text = dissect_control(buffer, tree, at, limit)
+        else
+            after, text = dissect_part(buffer, tree, packet, at, limit)
+        end
+        if not after then
+            return summary
+        end
+        at, summary[#summary + 1] = after, text
+    end
+    dissect_pad(buffer, tree, at, limit)
+    return summary
+end
+
+-- Window, row and mask; returns the place behind them and the window, or nil.
+local function dissect_standing(buffer, tree, at, limit)
+    if at + 2 > limit then
+        tree:add_proto_expert_info(refused.overrun)
+        return nil
+    end
+    local window, masked = buffer(at, 1):uint() % 128, buffer(at, 1):uint() > 127
+    local item = tree:add(f.window, buffer(at, 1))
+    tree:add(f.masked, buffer(at, 1))
+    tree:add(f.row, buffer(at + 1, 1))
+    local oldest = tree:add(f.oldest, buffer(at + 1, 1))
+    if window == 0 and buffer(at + 1, 1):uint() > 127 then
+        oldest:add_proto_expert_info(refused.window)
+        return nil
+    end
+    at = at + 2
+    if window > 0 and masked then
+        local size = math.ceil(window / 8)
+        if at + size > limit then
+            item:add_proto_expert_info(refused.overrun)
+            return nil
+        end
+        local mask, ones, top = tree:add(f.mask, buffer(at, size)), 0, -1
+        for bit_number = 0, size * 8 - 1 do
+            if math.floor(buffer(at + math.floor(bit_number / 8), 1):uint() / 2 ^ (bit_number % 8)) % 2 == 1 then
+                ones, top = ones + 1, bit_number
+            end
+        end
+        if buffer(at, 1):uint() % 2 == 0 or top ~= window - 1 or ones == window then
+            mask:add_proto_expert_info(refused.window)
+            return nil
+        end
+        at = at + size
+    end
+    return at, window, masked
+end
+
+-- Take the start of a robot that a hello tells of.
+local function meet(buffer, packet, at)
+    local boot, turns = buffer(at, 4):uint(), buffer(at + 4, 4):uint()
+    local number = turns * 0x10000 + packet.low
+    local known = starts[packet.src] or {}
+    starts[packet.src] = known
+    for place, start in ipairs(known) do
+        if start.boot == boot then
+            table.remove(known, place)
+            break
+        end
+    end
+    known[#known + 1] = { boot = boot, newest = number, encrypts = buffer(at + 8, 1):bitfield(6, 1) == 1 }
+end
+
+-- Which start of its sender a packet belongs to, found when it is read for the first time: by its CRC, or the newest.
+local function look_up(buffer, packet, limit)
+    local known = starts[packet.src] or {}
+    for place = #known, 1, -1 do
+        local start = known[place]
+        local number = full_number(start.newest, packet.low)
+        local crc = not packet.sealed
+            and expected_crc32(start.boot, math.floor(number / 0x10000), buffer(0, limit)) or nil
+        if not packet.frame.number or crc == buffer(limit, 4):uint() then
+            packet.frame.number, packet.frame.crc, packet.frame.encrypts = number, crc, start.encrypts
+        end
+        if packet.sealed or crc == buffer(limit, 4):uint() then
+            start.newest = math.max(start.newest, number)
+            return
+        end
+    end
+end
+
+local function dissect_v1(buffer, pinfo, tree)
+    local first = buffer(0, 1):uint()
+    local sealed, addressed = math.floor(first / 8) % 2 == 1, math.floor(first / 4) % 2 == 1
+    local header, trailer = addressed and 6 or 4, sealed and 8 or 4
+    if buffer:len() < header + trailer then
+        tree:add_proto_expert_info(refused.length)
+        return buffer:len()
+    end
+    local limit = buffer:len() - trailer
+    tree:add(f.version, buffer(0, 1))
+    tree:add(f.sealed, buffer(0, 1))
+    tree:add(f.addressed, buffer(0, 1))
+    tree:add(f.qos_bits, buffer(0, 1))
+    tree:add(f.src_id, buffer(1, 1))
+    tree:add(f.number, buffer(2, 2))
+    if addressed then
+        tree:add(f.dst_id, buffer(4, 1))
+        tree:add(f.hop_count, buffer(5, 1))
+    end
+    local frame = frames[pinfo.number]
+    local first_time = not frame
+    frame = frame or {}
+    frames[pinfo.number] = frame
+    longest = math.max(longest, buffer:len())
+    local packet = {
+        src = buffer(1, 1):uint(), low = buffer(2, 2):uint(), sealed = sealed, frame = frame, first_time = first_time,
+    }
+    local standing = first % 4 == 3
+    local at, window, clear = header, nil, false
+    if standing then
+        at, window, clear = dissect_standing(buffer, tree, header, limit)
+        clear = window == 0 and clear
+    end
+    if first_time then
+        local hello = clear and at + 2 + HELLO_LEN <= limit and CONTROLS[buffer(at, 1):uint()] == "hello"
+        if hello then
+            meet(buffer, packet, at + 2)
+        end
+        look_up(buffer, packet, limit)
+    end
+    packet.number = frame.number or packet.low
+    tree:add(f.packet_number, buffer(2, 2), packet.number):set_generated()
+    local kind = not standing and 0 or (window or 0) > 0 and 1 or 2
+    tree:add(f.kind, buffer(0, 1), kind):set_generated()
+    local intact = true
+    if sealed then
+        tree:add(f.tag, buffer(limit, trailer)):append_text(" (not checked: see gr-ros2 packet decode --key)")
+    else
+        local crc = tree:add(f.crc32, buffer(limit, trailer))
+        if not frame.crc then
+            crc:append_text(" (not checked: no hello of this robot before)")
+        elseif frame.crc == buffer(limit, trailer):uint() then
+            crc:append_text(" (correct)")
+        else
+            intact = false
+            crc:append_text(string.format(" (should be 0x%08x)", frame.crc))
+            crc:add_proto_expert_info(refused.crc)
+        end
+    end
+    local summary = {}
+    if not at then
+        summary = { "refused" }
+    elseif sealed and not clear and frame.encrypts ~= false then
+        tree:add(f.ciphertext, buffer(at, limit - at))
+        summary = { "encrypted" }
+    elseif kind == 1 then
+        tree:add(f.combined, buffer(at, limit - at))
+        summary = { string.format("of %d..%d", packet.number - window + 1, packet.number) }
+    elseif at < limit then
+        local packet_len = math.max(proto.prefs.packet_len, longest)
+        local room = packet_len - header - 2 - trailer
+        -- Where all packets are as long as this one, the longest body ends 2 bytes before the trailer; where a sender
+        -- sends only what is needed, it ends with the longest packet's.
+        if packet_len == buffer:len() and buffer(limit - 2, 2):uint() ~= 0 then
+            room = limit - at
+        end
+        packet.short, packet.filled = limit - at < room, at + room
+        summary = dissect_body(buffer, tree, packet, at, limit)
+    end
+    pinfo.cols.src = "robot " .. packet.src
+    pinfo.cols.dst = addressed and "robot " .. buffer(4, 1):uint() or "broadcast"
+    pinfo.cols.info = string.format(
+        "%s %d%s  %s", KINDS[kind], packet.number, intact and "" or " CRC mismatch", table.concat(summary, " "))
+    return buffer:len()
+end
+
+function proto.dissector(buffer, pinfo, root)
+    pinfo.cols.protocol = "gr-ros2"
+    local tree = root:add(proto, buffer())
+    if buffer:len() > 0 and buffer(0, 1):bitfield(0, 4) == 1 then
+        return dissect_v1(buffer, pinfo, tree)
+    end
+    return dissect_v0(buffer, pinfo, tree)
 end
 
 DissectorTable.get("wtap_encap"):add(wtap.USER0, proto)

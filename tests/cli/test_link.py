@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
+import pytest
+
+from gr_ros2.cli.ending import BAD_INPUT
 from gr_ros2.cli.link import status_line
+from gr_ros2.cli.main import run
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.dds import DdsMiddleware
+from tests.domains import free_domains
+from tests.waiting import PATIENCE_S, wait_for
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def stats(
@@ -13,7 +28,8 @@ def stats(
     return {
         "uptime_s": 12.4,
         "source": {
-            "topics": {"/odom": {"submitted": 7, "lost_on_graph": lost}, "/scan": {"submitted": 1, "lost_on_graph": 0}}
+            "unmatched": [],
+            "topics": {"/odom": {"submitted": 7, "lost_on_graph": lost}, "/scan": {"submitted": 1, "lost_on_graph": 0}},
         },
         "sink": {
             "topics": {"/rx_robot_2/odom": {"delivered": 5}},
@@ -24,6 +40,84 @@ def stats(
         "phy": {"snr_db": snr_db},
         "front_end": {"name": "uhd", "bursts_out": 90, "overflows": 0},
     }
+
+
+def test_a_link_that_sends_nothing_says_what_it_waits_for() -> None:
+    silent = stats(None)
+    silent["source"]["topics"] = {"/odom": {"submitted": 0, "lost_on_graph": 0}}
+    silent["source"]["unmatched"] = ["/odom", "/scan"]
+    silent["packets"] |= {"out": 0, "in": 0}
+    assert status_line(silent) == "12 s; nothing sent, no publisher on /odom and 1 more; nobody heard"
+    silent["source"]["unmatched"] = []
+    assert status_line(silent).startswith("12 s; sent 0 messages in 0 packets")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "give a YAML file, or --robot and --radio"),
+        (("--robot", "1"), "give a YAML file, or --robot and --radio"),
+        (("mine.yaml", "--robot", "0"), "--robot: mine.yaml says what the link is; change its settings with --set"),
+        (("mine.yaml", "--listen", "1", "--peer", "2"), "--listen, --peer: mine.yaml says"),
+        (("--robot", "255", "--radio", "sim"), "--robot"),
+        (("--robot", "1", "--radio", "nope"), "no 'nope'; known are sim, zmq"),
+    ],
+)
+def test_half_a_line_is_refused(arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["link", *arguments]) == BAD_INPUT
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_two_robots_in_one_line_each(tmp_path: Path) -> None:
+    """No file: a message crosses, each says what it waits for, and what is saved starts the same link again."""
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    pytest.importorskip("zmq", reason="needs pyzmq")
+    domains = free_domains()
+    addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
+    running: list[tuple[subprocess.Popen[str], Path]] = []
+
+    def start(robot: int, *options: str) -> Path:
+        log = tmp_path / f"{robot}-{len(running)}.log"
+        command = [sys.executable, "-m", "gr_ros2.cli", "link", *options]
+        environ = {**os.environ, "ROS_DOMAIN_ID": str(domains[robot - 1]), "PYTHONPATH": str(ROOT)}
+        with log.open("w") as file:
+            running.append((subprocess.Popen(command, env=environ, stdout=file, stderr=file, text=True), log))
+        return log
+
+    def line(robot: int) -> tuple[str, ...]:
+        own, other = addresses[robot - 1], addresses[2 - robot]
+        return "--robot", str(robot), "--radio", "zmq", "--listen", own, "--peer", other
+
+    try:
+        saved = tmp_path / "robot2.yaml"
+        first = start(1, *line(1))
+        start(2, *line(2), "--save", str(saved))
+        wait_for(lambda: "no publisher on /robot_1/scan" in first.read_text(), "what robot 1 waits for")
+        assert "front_end:" in first.read_text()
+        heard: list[bytes] = []
+        with DdsMiddleware(domain_id=domains[0]) as one, DdsMiddleware(domain_id=domains[1]) as two:
+            publisher = one.advertise("/robot_1/cmd_vel", "geometry_msgs/Twist", Qos(depth=10))
+            two.subscribe("/rx_robot_1/cmd_vel", "geometry_msgs/Twist", Qos(depth=10), heard.append)
+            said = b"\0\1\0\0" + bytes(48)
+
+            def crossed() -> bool:
+                publisher.publish(said)
+                return bool(heard)
+
+            wait_for(crossed, "a message on the other side")
+            assert heard[0] == said
+            process, _ = running[1]
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE_S) == 0
+            heard.clear()
+            start(2, str(saved))
+            wait_for(crossed, "a message, from the saved file")
+    finally:
+        for process, _ in running:
+            process.send_signal(signal.SIGINT)
+        for process, _ in running:
+            process.wait(PATIENCE_S)
 
 
 def test_what_passes_is_told_always_and_the_rest_where_there_is_any() -> None:

@@ -17,9 +17,14 @@ from hypothesis import strategies as st
 from gr_ros2.cli.capture import packets_in
 from gr_ros2.cli.main import run
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.v1.sealing import Keys, SealMode
+from gr_ros2.wire.control import Hello
 from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.wire.v1 import Header, Standing, write_body, write_header, write_standing
+from tests.link.v1.air import Robot, registry
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
+V1 = json.loads((Path(__file__).parent.parent / "vectors" / "v1.json").read_text())
 PACKETS = [
     V0.encode(Packet(1, 255, seq, 1, (Entry(1, seq, 0, 1, b"payload %d" % seq), Entry(2, 9, 3, 8, b""))), 64)
     for seq in range(3)
@@ -145,3 +150,112 @@ def test_any_bytes_are_packets_or_a_config_error(data: bytes, start: bytes) -> N
     with suppress(ConfigError):
         found.extend(packets_in(start + data, None, "file"))
     assert sum(len(packet) for packet, _ in found) <= len(start + data)
+
+
+# -- version 1 ----------------------------------------------------------------------------------------------------
+
+
+def hello(vector: dict[str, Any], key: bytes = b"") -> str:
+    """What tells how the packet of a vector is read: a hello of its sender's, which stands at its number."""
+    mode: SealMode = "none" if not key else "encrypt" if vector["encrypts"] else "authenticate"
+    keys = Keys((key,) if key else (), mode)
+    src_id, turns = bytes.fromhex(vector["hex"])[1], vector["newest"] >> 16
+    clear = write_header(Header(3, bool(key), src_id, vector["newest"] & 0xFFFF))
+    clear += write_standing(Standing(99, clear=True))
+    body = write_body([Hello(vector["boot"], turns, 1 | 2 * keys.encrypts, 0)], 50)
+    return keys.own(src_id, vector["boot"]).close(clear, body, vector["newest"], 99, plain=True).hex()
+
+
+def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
+    assert len(lines) == len(vector["entries"])
+    for line, entry in zip(lines, vector["entries"], strict=True):
+        if "topic_id" in entry:
+            payload = entry["payload"]
+            assert f": topic {entry['topic_id']}, " in line
+            assert f"payload {len(payload) // 2} bytes: {payload[:32]}" in line
+            assert line.endswith(", coded") == entry["coded"]
+            if entry["offset"]:
+                assert f"began {entry['back']} packets ago, bytes from {entry['offset']} on" in line
+        else:
+            (kind,) = {"hello", "ask", "report", "heard"} & entry.keys()
+            assert f": {kind}, " in line
+            assert str(entry.get("number", entry[kind])) in line
+
+
+@pytest.mark.parametrize("vector", V1["packets"], ids=lambda vector: vector["name"])
+def test_the_vectors_of_version_1(vector: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["packet", "decode", "--packet-len", "64", hello(vector), vector["hex"]]) == 0
+    first, *entries = capsys.readouterr().out.split("packet 2: ")[1].splitlines()
+    assert first.endswith("CRC ok")
+    assert f"src {vector['header']['src_id']}, dst {vector['header']['dst_id']}" in first
+    assert f"number {vector['number']}, " in first
+    check_entries(vector, entries)
+
+
+@pytest.mark.parametrize("vector", V1["repairs"], ids=lambda vector: vector["name"])
+def test_repairs(vector: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        run(
+            [
+                "packet",
+                "decode",
+                "--packet-len",
+                "64",
+                hello(vector | {"hex": vector["repairs"][0]}),
+                *vector["repairs"],
+            ]
+        )
+        == 0
+    )
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert len(lines) == len(vector["repairs"])
+    members = vector["members"]
+    assert all(f"of {len(members)} packets in {min(members)}..{max(members)}, " in line for line in lines)
+    assert all("version 1, repair, " in line and line.endswith("CRC ok") for line in lines)
+
+
+@pytest.mark.parametrize("vector", V1["sealed"], ids=lambda vector: vector["name"])
+def test_sealed_packets_with_and_without_the_key(
+    vector: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key = tmp_path / "key"
+    key.write_text(vector["key"] + "\n")
+    key.chmod(0o600)
+    packets = [hello(vector, bytes.fromhex(vector["key"])), vector["hex"]]
+    assert run(["packet", "decode", "--packet-len", "64", "--key", str(key), *packets]) == 0
+    first, *entries = capsys.readouterr().out.split("packet 2: ")[1].splitlines()
+    assert first.endswith("tag ok")
+    check_entries(vector, entries)
+    assert run(["packet", "decode", "--packet-len", "64", *packets]) == 0
+    first, *entries = capsys.readouterr().out.split("packet 2: ")[1].splitlines()
+    assert first.endswith("tag not checked: no key")
+    if vector["encrypts"] and "a hello" not in vector["name"]:
+        assert " bytes encrypted: " in first
+        assert not entries
+    else:
+        check_entries(vector, entries)
+    key.write_text("00" * 32 + "\n")
+    assert run(["packet", "decode", "--packet-len", "64", "--key", str(key), *packets]) == 1
+    assert "packet 1: rejected: wrong_key: " in capsys.readouterr().out
+
+
+def test_announced_topics_have_names_and_packets_as_long_as_needed_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = Robot(1, registry(), fixed=False)
+    now, packets = 0.0, []
+    for number in range(40):
+        one.end.submit(number % 3, bytes(10 * number), now)
+        for _ in range(8):
+            now += 1 / 75
+            data = one.slot(now)
+            packets += [data] if data is not None else []
+    path = tmp_path / "sent.pcapng"
+    path.write_bytes(pcapng(packets))
+    assert run(["packet", "decode", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "  announces topic 1: scan std_msgs/msg/String, default" in out
+    assert "topic 1 (scan), whole, " in out
+    assert out.count("CRC ok") == len(packets) > 100
+    assert run(["packet", "decode", "--packet-len", "64", str(path)]) == 0
+    assert capsys.readouterr().out == out

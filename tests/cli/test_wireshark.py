@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -17,10 +18,16 @@ from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.errors import ConfigError, WireError
 from gr_ros2.link.events import Received, SentPacket
+from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.wire.v0 import V0, Packet
+from gr_ros2.wire.v1 import Header, crc, session_crc, write_header
+from gr_ros2.wire.v1 import decode as read
+from tests.cli.test_packet import hello
+from tests.link.v1.test_reader import talk
 
+V1 = json.loads((Path(__file__).parent.parent / "vectors" / "v1.json").read_text())
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 FIELDS = ("src_id", "dst_id", "seq", "hop", "qos", "compressed", "encrypted", "entries", "crc")
 
@@ -131,6 +138,138 @@ def test_topics_have_names_with_the_registry_and_times_and_directions_are_kept(r
     assert all("odom" in row[0].split(",") for row in rows)
     assert [row[1] for row in rows] == ["sent", "received"] * 2
     assert [float(row[2]) for row in rows] == pytest.approx([0, 0.25, 0.5, 0.75], abs=1e-6)
+
+
+@needs_tshark
+def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
+    vectors = V1["packets"] + V1["sealed"]
+    packets = []
+    for vector in vectors:
+        packets += [bytes.fromhex(hello(vector, bytes.fromhex(vector.get("key", "")))), bytes.fromhex(vector["hex"])]
+    path = capture(tmp_path / "v1.pcapng", packets)
+    shown = dissected(path)[2::4]
+    for vector, layers in zip(vectors, shown, strict=True):
+        tree, entries = layers["gr_ros2"], vector["entries"]
+        data = bytes.fromhex(vector["hex"])
+        sealed = "key" in vector
+
+        def numbers(name: str, tree: Any = tree) -> list[int]:
+            return [int(one, 0) for one in values(tree, f"gr_ros2.{name}")]
+
+        assert numbers("version") == [1]
+        assert numbers("src_id") == [data[1]]
+        assert numbers("packet_number") == [vector["number"]], vector["name"]
+        assert numbers("row") == ([data[5] & 127] if data[0] & 3 == 3 else [])
+        assert numbers("sealed") == [sealed]
+        assert values(tree, "gr_ros2.tag") == ([data[-8:].hex(":")] if sealed else [])
+        assert numbers("crc32") == ([] if sealed else [int.from_bytes(data[-4:], "big")])
+        if sealed and vector["encrypts"] and "a hello" not in vector["name"]:
+            (hidden,) = values(tree, "gr_ros2.ciphertext")
+            assert bytes.fromhex(hidden.replace(":", "")) in data[:-8]
+            continue
+        parts = [entry for entry in entries if "topic_id" in entry]
+        assert numbers("topic_id") == [entry["topic_id"] for entry in parts]
+        assert [one.replace(":", "") for one in values(tree, "gr_ros2.payload")] == [
+            entry["payload"] for entry in parts if entry["payload"]
+        ]
+        assert numbers("offset") == [entry["offset"] for entry in parts if entry["offset"]]
+        assert numbers("back") == [entry["back"] for entry in parts if entry["offset"]]
+        assert numbers("coded") == [entry["coded"] for entry in parts]
+        for name, of_kind in CONTROLS.items():
+            said = [entry for entry in entries if name in entry]
+            assert numbers(f"{name}.{of_kind[name]}") == [entry[name] for entry in said], vector["name"]
+            for field, key in of_kind.items():
+                if field != name:
+                    assert numbers(f"{name}.{key}") == [entry[field] for entry in said]
+    assert not tshark(path, "-Y", "_ws.expert")
+    assert tshark(path, "-V").count("(correct)") == 4 * len(V1["packets"])
+
+
+CONTROLS = {
+    "hello": {"hello": "boot", "turns": "turns", "digest": "digest"},
+    "ask": {"ask": "src_id"},
+    "report": {"report": "src_id", "boot": "boot", "number": "number", "arrived": "arrived", "loss": "loss"},
+    "heard": {"heard": "src_id", "boot": "boot"},
+}
+"""Names of values in the vectors, and of the dissector's fields."""
+
+
+@needs_tshark
+def test_repairs_are_shown(tmp_path: Path) -> None:
+    for vector in V1["repairs"]:
+        packets = [bytes.fromhex(hello(vector | {"hex": vector["repairs"][0]})), *map(bytes.fromhex, vector["repairs"])]
+        path = capture(tmp_path / "repairs.pcapng", packets)
+        members = vector["members"]
+        for layers in dissected(path)[2::2]:
+            tree = layers["gr_ros2"]
+            assert values(tree, "gr_ros2.kind") == ["1"]
+            assert values(tree, "gr_ros2.packet_number") == [str(max(members))]
+            assert values(tree, "gr_ros2.window") == [str(max(members) - min(members) + 1)]
+            for text in values(tree, "gr_ros2.mask"):
+                mask = int.from_bytes(bytes.fromhex(text.replace(":", "")), "little")
+                assert mask == sum(1 << max(members) - number for number in members)
+        assert not tshark(path, "-Y", "_ws.expert")
+
+
+@needs_tshark
+def test_what_a_receiver_of_version_1_refuses_is_marked_by_the_same_name(tmp_path: Path) -> None:
+    boot, first = 7, {"boot": 7, "newest": 0, "hex": "1001"}
+    packets, kinds = [bytes.fromhex(hello(first))], [""]
+
+    def add(clear: bytes, body: bytes, kind: str) -> None:
+        packets.append(clear + body + crc(clear + body, session_crc(boot, 0)))
+        kinds.append(kind)
+
+    for number, vector in enumerate(V1["refused_bodies"], 1):
+        add(write_header(Header(0, False, 1, number)), bytes.fromhex(vector["hex"]), vector["error"])
+    standing = write_header(Header(3, False, 1, 1))
+    for text in ("0080", "850003", "850012", "85001f"):
+        add(standing, bytes.fromhex(text), "window")
+    for text in ("00", "8900ff"):
+        add(standing, bytes.fromhex(text), "entry_bounds")
+    packets.append(packets[0][:-1] + bytes((packets[0][-1] ^ 1,)))
+    kinds.append("crc")
+    packets.append(b"\x10\x01\x00\x01" + bytes(3))
+    kinds.append("length")
+    path = capture(tmp_path / "refused.pcapng", packets)
+    preference = ("-o", "gr_ros2.packet_len:50")  # a body of 40 bytes
+    for kind in set(kinds) - {""}:
+        marked = tshark(path, *preference, "-Y", f"gr_ros2.refused.{kind}", "-T", "fields", "-e", "frame.number")
+        wanted = [number for number, one in enumerate(kinds) if one == kind]
+        assert [int(line) for line in marked.split()][::2] == [2 * number + 1 for number in wanted], kind
+        for number in wanted:
+            with pytest.raises(WireError) as refusal:
+                read(packets[number], 50, boot)
+            assert refusal.value.kind == kind
+
+
+@needs_tshark
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_a_conversation_is_read_with_the_topics_that_it_announces(mode: SealMode, tmp_path: Path) -> None:
+    packets = talk(mode)
+    path = tmp_path / "talk.pcapng"
+    with PacketCapture(path, clock=lambda: 0.0) as writing:
+        for number, data in enumerate(packets):
+            writing.receiver_event(Received(data, NOTHING), number / 75)
+    assert not tshark(path, "-Y", "_ws.expert")
+    hidden = tshark(path, "-Y", "gr_ros2.ciphertext").count("\n")
+    named = tshark(path, "-Y", 'gr_ros2.topic == "scan"').count("\n")
+    if mode == "none":
+        assert tshark(path, "-V").count("(correct)") == len(packets)
+        assert named == 10
+        assert tshark(path, "-Y", 'gr_ros2.table.name == "map"').count("\n") >= 1
+        assert not hidden
+    else:
+        assert 0 < hidden < len(packets)
+        assert not named
+
+
+def test_the_documentation_lists_the_fields_of_version_1() -> None:
+    source = DISSECTOR.read_text().split("-- Version 1.")[1].split("local fields")[0]
+    fields = set(re.findall(r'"gr_ros2\.([\w.]+)"', source))
+    page = (DISSECTOR.parents[2] / "docs" / "how-to" / "gnuradio.md").read_text()
+    table = page.split("| Fields of version 1 |")[1].split("\n\n")[0]
+    assert set(re.findall(r"`([\w.]+)`", table)) == fields
 
 
 def test_our_own_decoder_reads_the_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

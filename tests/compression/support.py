@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
 from gr_ros2.config import TopicOptions
@@ -45,8 +46,8 @@ _SINGLES = (
 class Writer:
     """Serializes random members of a type, once with garbage in the alignment gaps and once with zeros."""
 
-    def __init__(self, rng: random.Random, order: str = "<", garbage: bool = True) -> None:
-        self.rng, self.order, self.garbage = rng, order, garbage
+    def __init__(self, rng: random.Random, order: str = "<", garbage: bool = True, store: Typestore = STORE) -> None:
+        self.rng, self.order, self.garbage, self.store = rng, order, garbage, store
         self.with_garbage, self.clean = bytearray(), bytearray()
 
     def message(self, type_name: str, tail: int = 0) -> tuple[bytes, bytes]:
@@ -56,7 +57,7 @@ class Writer:
         return header + self.with_garbage + bytes(tail), header + self.clean + bytes(tail)
 
     def _type(self, type_name: str) -> None:
-        for _, (kind, detail) in STORE.fielddefs[type_name][1]:
+        for _, (kind, detail) in self.store.fielddefs[type_name][1]:
             if kind is Nodetype.BASE:
                 self._base(detail[0])
             elif kind is Nodetype.NAME:

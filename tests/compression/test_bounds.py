@@ -104,7 +104,7 @@ def test_nothing_is_prepared_that_few_bytes_may_not_stand_for(type_name: str, mo
 
 def test_the_oldest_is_forgotten_and_not_all() -> None:
     codec = codec_for("std_msgs/String")
-    fields = codec._topics[0]._coders.fields
+    fields = codec._topics[0]._choices[0].fields
     assert fields is not None
     for number in range(3 * _REMEMBERED):
         text = b"word_%d\0" % number

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.compression import load, shipped
 from gr_ros2.compression.dictionary import SHIPPED
 from gr_ros2.compression.train import learn
 from gr_ros2.errors import ConfigError
-from tests.compression.support import codec_for, simulated
+from tests.compression.support import Writer, codec_for, simulated
 
-DIGESTS = {1: "45fc91a02a6078a5579a1f88b9029d2356ca7373de80560ffd8c98c485c605bb"}
+DIGESTS = {
+    1: "45fc91a02a6078a5579a1f88b9029d2356ca7373de80560ffd8c98c485c605bb",
+    2: "acef4dc4f55ec23d0eaf874089ad63021f9b67bd9beb90f6c6ee88d4b5c50437",
+}
 """A shipped set never changes. A better one gets the next number, and the old one stays."""
 VECTORS = json.loads((Path(__file__).with_name("vectors.json")).read_text())
 
@@ -65,6 +70,64 @@ def test_a_type_of_ones_own_is_taken_apart_by_the_dictionary() -> None:
         coded = codec.encode(0, sample)
         assert coded[0] & 15 == 2
         assert codec.decode(0, coded) == sample
+
+
+RANGE = "sensor_msgs/msg/Range"
+NEWER = [name for name in shipped(2).types if name != RANGE]
+
+
+@pytest.mark.parametrize("distribution", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_LYRICAL])
+def test_the_definition_chooses_the_dictionary_and_not_the_name(distribution: Stores) -> None:
+    """A Range has a variance since Iron: the same topic carries it from robots of any distribution."""
+    store = get_typestore(distribution)
+    codec = codec_for(RANGE)
+    for seed in range(50):
+        payload, clean = Writer(random.Random(seed), store=store).message(RANGE)
+        coded = codec.encode(0, payload)
+        assert coded[0] >> 4 == (1 if distribution is Stores.ROS2_HUMBLE else 2)
+        assert coded[0] & 15 in (2, 3), "taken apart by its definition"
+        assert codec.decode(0, coded) == codec.canonical(0, payload) == clean
+
+
+@pytest.mark.parametrize("type_name", NEWER)
+def test_types_that_are_newer_than_humble_are_taken_apart(type_name: str) -> None:
+    codec, store = codec_for(type_name), get_typestore(Stores.ROS2_LYRICAL)
+    for seed in range(20):
+        payload, clean = Writer(random.Random(seed), store=store).message(type_name)
+        coded = codec.encode(0, payload)
+        if len(payload) < 1000:  # longer ones may have more items than this codec takes
+            assert coded[0] >> 4 == 2
+        assert codec.decode(0, coded) == codec.canonical(0, payload)
+        assert codec.canonical(0, payload) in (clean, payload)
+
+
+def test_a_range_that_fits_no_definition_passes_unchanged() -> None:
+    codec = codec_for(RANGE)
+    payload = Writer(random.Random(1), store=get_typestore(Stores.ROS2_JAZZY)).message(RANGE)[0] + b"\1\2\3\4"
+    assert codec.decode(0, codec.encode(0, payload)) == payload
+
+
+def test_fields_are_quantised_in_the_definitions_that_have_them() -> None:
+    codec = codec_for(RANGE, quantize="variance=0.01 range=0.01")
+    for distribution in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY):
+        payload, clean = Writer(random.Random(7), store=get_typestore(distribution)).message(RANGE)
+        decoded = codec.decode(0, codec.encode(0, payload))
+        assert decoded == codec.canonical(0, payload)
+        assert (decoded == clean) == (distribution is Stores.ROS2_HUMBLE)
+    with pytest.raises(ConfigError, match="no floating-point field"):
+        codec_for(RANGE, quantize="depth=0.01")
+
+
+def test_a_trained_dictionary_keeps_a_definition_that_differs_from_humbles() -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    texts = {name: jazzy.generate_msgdef(name, ros_version=2)[0] for name in (RANGE, "sensor_msgs/msg/Imu")}
+    writer = [Writer(random.Random(seed), store=jazzy).message(RANGE)[1] for seed in range(50)]
+    made = learn([(RANGE, payload) for payload in writer], "mine", definitions=texts)
+    assert {name: bool(entry.definition) for name, entry in made.types.items()} == {RANGE: True}
+    codec = codec_for(RANGE, made)
+    for payload in writer:
+        coded = codec.encode(0, payload)
+        assert coded[0] >> 4 == 15 and codec.decode(0, coded) == payload
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 2}', '{"format": 1, "types": {"a": 1}}', "\xff"])

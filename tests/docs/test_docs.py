@@ -44,6 +44,12 @@ OTHERS = {"cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
+    **{
+        ("docs/how-to/radios.md", f"gr-ros2 link --robot {own} --radio zmq --listen 5551 --peer 10.0.0.{other}:5551"): (
+            "opens a port to the network; tests/cli/test_link.py"
+        )
+        for own, other in ((1, 2), (2, 1))
+    },
     ("docs/how-to/dashboard.md", "gr-ros2 dashboard"): "needs a run in another terminal; tests/cli/test_dashboard.py",
     ("docs/how-to/dashboard.md", "gr-ros2 dashboard --wait 60"): "the same",
     ("docs/how-to/dashboard.md", "gr-ros2 run demo --dashboard=0.0.0.0:5006"): "opens a port to the network",

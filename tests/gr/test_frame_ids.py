@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -48,7 +50,7 @@ FRAMED = [
 NUMBERS = {"float32": np.float32, "float64": np.float64}
 
 
-def some(kind: Any, frame: str, rng: random.Random) -> Any:
+def some(kind: Any, frame: str, rng: random.Random, store: Typestore = STORE) -> Any:
     """A message of a type with arbitrary values, and one frame name in every frame field."""
     node, detail = kind
     if node.name == "BASE":
@@ -59,20 +61,22 @@ def some(kind: Any, frame: str, rng: random.Random) -> Any:
             return float(NUMBERS[name](rng.uniform(-9, 9)))
         return rng.randrange(2) if name == "bool" else rng.randrange(100)
     if node.name == "NAME":
-        _, members = STORE.fielddefs[detail]
-        values = {name: frame if name.endswith("frame_id") else some(member, frame, rng) for name, member in members}
-        return STORE.types[detail](**values)
+        _, members = store.fielddefs[detail]
+        values = {
+            name: frame if name.endswith("frame_id") else some(member, frame, rng, store) for name, member in members
+        }
+        return store.types[detail](**values)
     element, length = detail
     count = length if node.name == "ARRAY" else rng.randrange(4)
-    items = [some(element, frame, rng) for _ in range(count)]
+    items = [some(element, frame, rng, store) for _ in range(count)]
     if element[0].name == "BASE" and element[1][0] != "string":
         name = element[1][0]
         return np.array(items, dtype={"bool": "bool", "byte": "uint8", "char": "uint8"}.get(name, name))
     return items
 
 
-def message(type_name: str, frame: str, seed: int) -> Any:
-    return some((next(iter(_kinds())), type_name), frame, random.Random(seed))
+def message(type_name: str, frame: str, seed: int, store: Typestore = STORE) -> Any:
+    return some((next(iter(_kinds())), type_name), frame, random.Random(seed), store)
 
 
 def _kinds() -> Iterator[Any]:
@@ -108,6 +112,35 @@ def test_frame_names_change_and_nothing_else(type_name: str, frame: str, seed: i
     for (name, old), (same, new) in zip(leaves(before), leaves(after), strict=True):
         assert name == same
         assert new == (prefixed_frame(f"robot_{src_id}/", old) if name.endswith("frame_id") else old), name
+    assert not counters
+
+
+@pytest.mark.parametrize(
+    ("type_name", "distribution", "frames"),
+    [
+        ("sensor_msgs/msg/Range", Stores.ROS2_HUMBLE, 1),
+        ("sensor_msgs/msg/Range", Stores.ROS2_JAZZY, 1),
+        ("visualization_msgs/msg/Marker", Stores.ROS2_FOXY, 1),
+        ("geometry_msgs/msg/VelocityStamped", Stores.ROS2_JAZZY, 3),
+        ("nav_msgs/msg/Trajectory", Stores.ROS2_LYRICAL, None),
+    ],
+)
+def test_the_definition_that_fits_the_bytes_counts(type_name: str, distribution: Stores, frames: int | None) -> None:
+    """Whatever distribution is sourced here: robots of all of them may send."""
+    counters: Counter[str] = Counter()
+    prefix, store = FramePrefix(PREFIX, counters), get_typestore(distribution)
+    for seed in range(20):
+        before = message(type_name, "sonar", seed, store)
+        altered = prefix.apply(type_name, 3, bytes(store.serialize_cdr(before, type_name)))
+        changed = [
+            (old, new)
+            for (_, old), (_, new) in zip(
+                leaves(before), leaves(store.deserialize_cdr(altered, type_name)), strict=True
+            )
+            if old != new
+        ]
+        assert set(changed) == {("sonar", "robot_3/sonar")}
+        assert frames in (None, len(changed))
     assert not counters
 
 

@@ -9,7 +9,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import ros_graph
-from gr_ros2.middleware.type_definitions import UNKNOWN, definition, recorded_definition, text_hash, type_hash
+from gr_ros2.middleware.type_definitions import (
+    UNKNOWN,
+    definition,
+    recorded_definition,
+    text_hash,
+    type_hash,
+    typestores,
+)
 
 NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
@@ -130,7 +137,7 @@ def test_who_has_short_gids() -> None:
 
 
 def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None:
-    """sensor_msgs/Range has a variance since Jazzy; a bag may have the hash alone."""
+    """sensor_msgs/Range has a variance since Iron; a bag may have the hash alone."""
     jazzy = get_typestore(Stores.ROS2_JAZZY)
     digest = jazzy.hash_rihs01("sensor_msgs/msg/Range")
     assert digest != type_hash("sensor_msgs/msg/Range")
@@ -139,6 +146,28 @@ def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None
     assert text_hash("sensor_msgs/msg/Range", found.text) == digest
     strange = "RIHS01_" + 64 * "5"
     assert recorded_definition("sensor_msgs/msg/Range", "", strange) == (UNKNOWN, strange)
+
+
+@pytest.mark.parametrize(
+    "type_name", ["diagnostic_msgs/msg/DiagnosticArray", "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"]
+)
+def test_what_the_link_itself_writes_is_the_same_type_in_every_distribution(type_name: str) -> None:
+    """Diagnostics, counters, merged transforms: any node reads them, whatever is sourced where."""
+    assert len(typestores(type_name)) == 1
+
+
+def test_a_type_has_a_definition_for_each_hash_that_distributions_give_it() -> None:
+    humble, newer = typestores("sensor_msgs/msg/Range")
+    assert [len(store.fielddefs["sensor_msgs/msg/Range"][1]) for store in (humble, newer)] == [6, 7]
+    assert type_hash("sensor_msgs/msg/Range") == humble.hash_rihs01("sensor_msgs/msg/Range")
+    assert typestores("robot_msgs/msg/WheelState") == ()
+
+
+def test_a_type_that_is_newer_than_humble_is_known() -> None:
+    text, digest = definition("geometry_msgs/msg/VelocityStamped")
+    assert "string body_frame_id" in text
+    assert digest == type_hash("geometry_msgs/msg/VelocityStamped")
+    assert digest == get_typestore(Stores.ROS2_JAZZY).hash_rihs01("geometry_msgs/msg/VelocityStamped")
 
 
 def test_definitions() -> None:

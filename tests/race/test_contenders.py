@@ -27,7 +27,7 @@ def test_each_peer_races_best_effort_and_reliable() -> None:
 
 def test_cyclone_talks_to_its_peer_only_in_messages_that_fit_an_ip_packet() -> None:
     root = ElementTree.fromstring(cyclone_uri(ADDRESSES[1], "air0"))
-    assert [peer.get("address") for peer in root.iter("Peer")] == [ADDRESSES[1]]
+    assert [peer.get("Address") for peer in root.iter("Peer")] == [ADDRESSES[1]]
     assert [item.get("name") for item in root.iter("NetworkInterface")] == ["air0"]
     for name in ("MaxMessageSize", "MaxRexmitMessageSize", "FragmentSize"):
         (size,) = (re.sub("B$", "", item.text or "") for item in root.iter(name))

@@ -19,7 +19,7 @@ import zmq
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy import PHY
 from gr_ros2.radio.link import RobotLink
-from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd
+from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd, ZmqOptions
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
 
@@ -127,12 +127,19 @@ def test_the_sender_forgotten_is_the_one_heard_longest_ago(ends: list[dict[str, 
         assert bursts((1, 9)) == 1
 
 
+def test_an_address_needs_no_transport_and_an_own_one_no_host() -> None:
+    for text, meant in (("5551", "tcp://*:5551"), (":5551", "tcp://*:5551"), ("[::1]:5551", "tcp://[::1]:5551")):
+        assert ZmqOptions(bind=text, connect=("10.0.0.2:5551",)).bind == meant
+    options = ZmqOptions(bind="ipc:///tmp/a", connect=("robot-2.local:5551", "tcp://10.0.0.3:1"))
+    assert (options.bind, options.connect) == ("ipc:///tmp/a", ("tcp://robot-2.local:5551", "tcp://10.0.0.3:1"))
+
+
 def test_an_address_that_is_taken_or_wrong_is_said_in_a_line(ends: list[dict[str, Any]]) -> None:
     with Robot(1, {**ends[0], "bind": "tcp://127.0.0.1:*"}):
         pass
     for change, said in (
         ({"bind": "tcp://192.0.2.1:5555"}, "bind = 'tcp://192.0.2.1:5555': Cannot assign.*free port"),
-        ({"bind": "5555"}, "bind = '5555'.*tcp://HOST:PORT"),
+        ({"bind": "5555x"}, "bind = 'tcp://5555x'.*tcp://HOST:PORT"),
         ({"connect": ["udp://1.2.3.4"]}, "connect = 'udp://1.2.3.4'.*another robot's address"),
     ):
         with pytest.raises(RadioError, match=said):

@@ -11,7 +11,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
-_LEAST = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
+MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class Settings:
     depth: int = 16
 
     def __post_init__(self) -> None:
-        if not _LEAST <= self.packet_len <= 4095:
-            raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {_LEAST}..4095")
+        if not MIN_PACKET_LEN <= self.packet_len <= 4095:
+            raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {MIN_PACKET_LEN}..4095")
         if not 0 <= self.src_id < BROADCAST:
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")

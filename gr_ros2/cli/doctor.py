@@ -1,0 +1,55 @@
+"""`gr-ros2 doctor`: what this machine has and lacks for a link, and the command that mends it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import click
+from rich.markup import escape
+
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.ending import FAILED
+from gr_ros2.doctor.checks import examine
+
+_MARKS = {
+    "ok": "[green]ok     [/]",
+    "note": "[dim]note   [/]",
+    "warning": "[yellow]warning[/]",
+    "failed": "[red]FAILED [/]",
+}
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
+def doctor(as_json: bool) -> int:
+    """Look at what is installed, at radios, ROS, clock and limits, and say what mends what is missing.
+
+    Exit status 1 where a link would not run, 0 where it would, warnings or not.
+    """
+    findings, heading = [], ""
+    console = make_console()
+    for group, finding in examine():
+        findings.append((group, finding))
+        if as_json:
+            continue
+        if group != heading:
+            console.print(f"\n[bold]{escape(group)}[/]")
+            heading = group
+        console.print(f"{_MARKS[finding.state]} {escape(finding.what)}: {escape(finding.text)}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"          mend: {escape(finding.remedy)}", soft_wrap=True)
+    failed = [finding.what for _, finding in findings if finding.state == "failed"]
+    warned = [finding.what for _, finding in findings if finding.state == "warning"]
+    if as_json:
+        rows = [{"group": group, **asdict(finding)} for group, finding in findings]
+        click.echo(json.dumps({"ok": not failed, "findings": rows}, indent=2))
+    else:
+        console.print(f"\n{_summary(failed, warned)}", soft_wrap=True)
+    return FAILED if failed else 0
+
+
+def _summary(failed: list[str], warned: list[str]) -> str:
+    if failed:
+        return f"A link does not run here: {', '.join(failed)}."
+    return f"A link runs here; it would run better with: {', '.join(warned)}." if warned else "A link runs here."

@@ -1,0 +1,232 @@
+"""Packets of version 1 as somebody reads them who only looks on: a capture, a log, a line of hex.
+
+What a receiver learns in time, a reader is told beforehand: the hellos, without which no trailer can be checked, and
+the keys of the fleet. What it cannot check or open it says, and shows what stands in the clear.
+
+Invariants: ``read`` raises nothing but a named WireError; what it gives out as checked belongs to a hello that was
+learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gr_ros2.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
+from gr_ros2.link.v1.reassembly import Reassembly
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
+from gr_ros2.link.v1.settings import MIN_PACKET_LEN
+from gr_ros2.wire.control import ENCRYPTS, Hello
+from gr_ros2.wire.table import Row, read_table
+from gr_ros2.wire.v1 import (
+    CRC_LEN,
+    HEADER_LEN,
+    QOS_STANDING,
+    TABLE_TOPIC,
+    TAG_LEN,
+    Entry,
+    Header,
+    Part,
+    Standing,
+    body_room,
+    read_body,
+    read_header,
+    read_standing,
+)
+
+_HALF = 1 << 15
+_TABLE_BYTES = 1 << 20
+_NO_KEY = "tag not checked: no key"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What is known of a packet.
+
+    :param number: the packet number in full where it is known, otherwise its low 16 bits
+    :param check: of the trailer, in words
+    :param entries: of a source or control packet, as far as they can be read
+    :param combined: of a repair
+    :param hidden: bytes of a body that is encrypted, and not opened
+    :param announced: the table of topics that is complete with this packet
+    """
+
+    header: Header
+    number: int
+    standing: Standing | None
+    check: str
+    entries: tuple[Entry, ...] = ()
+    combined: bytes = b""
+    hidden: bytes = b""
+    announced: tuple[Row, ...] = ()
+
+    def message(self, index: int) -> Part | None:
+        """An entry, where it is a message or a fragment of one."""
+        entry = self.entries[index]
+        return entry if isinstance(entry, Part) else None
+
+
+@dataclass(slots=True)
+class _Start:
+    """A start of a robot that a hello told of."""
+
+    hello: Hello
+    trailers: Sequence[Trailer]
+    newest: int
+
+    def number(self, low: int) -> int:
+        """The full packet number of 16 bits of it, nearest to the newest; none is negative."""
+        number = self.newest + ((low - self.newest + _HALF) & 0xFFFF) - _HALF
+        return number if number >= 0 else low
+
+
+class Reader:
+    """Reads packets in the order in which they came.
+
+    :param packet_len: bytes of the longest packet on the link
+    :param keys: 32 bytes each; none where nothing sealed is to be opened
+    :raises ConfigError: a key of another length
+    """
+
+    def __init__(self, packet_len: int, keys: Sequence[bytes] = ()) -> None:
+        self._packet_len = max(packet_len, MIN_PACKET_LEN)
+        self._keys = Keys(keys, "encrypt") if keys else None
+        self._starts: dict[int, list[_Start]] = {}
+        self._current: dict[int, int] = {}
+        """Which start of a robot is heard now, by its id."""
+        self._tables: dict[int, Reassembly] = {}
+        self.topics: dict[int, dict[int, Row]] = {}
+        """What robots announced, by robot and topic id."""
+
+    def learn(self, data: bytes) -> None:
+        """Take from a packet, wherever it stands among the others, how its sender's packets are read."""
+        try:
+            header, standing, start, end = self._clear(data)
+            if standing is None or not standing.clear:
+                return
+            hello = self._hello(header, data[start:end])
+            trailers, _ = self._check_hello(header, hello, data, start, standing.row)
+        except WireError:
+            return
+        starts = self._starts.setdefault(header.src_id, [])
+        if all(known.hello.boot != hello.boot for known in starts):
+            starts.append(_Start(hello, trailers, _number(header, hello)))
+
+    def read(self, data: bytes) -> Look:
+        """One packet.
+
+        :raises WireError: it is none, or its trailer does not belong to it
+        """
+        header, standing, start, end = self._clear(data)
+        if standing is not None and standing.clear:
+            hello = self._hello(header, data[start:end])
+            number, body = _number(header, hello), data[start:end]
+            _, check = self._check_hello(header, hello, data, start, standing.row)
+            self._heard(header.src_id, hello.boot, number)
+        else:
+            number, opened, check = self._open(data, header, standing, start, end)
+            if opened is None:
+                return Look(header, number, standing, check, hidden=data[start:end])
+            body = opened
+        if standing is not None and standing.mask:
+            return Look(header, number, standing, check, combined=body)
+        entries = tuple(read_body(body, self._room(header)))
+        return Look(header, number, standing, check, entries, announced=self._announced(header.src_id, number, entries))
+
+    def _clear(self, data: bytes) -> tuple[Header, Standing | None, int, int]:
+        """What stands before the body, and where that begins and ends."""
+        header = read_header(data, self._packet_len)
+        start, end = header.size, len(data) - (TAG_LEN if header.sealed else CRC_LEN)
+        if header.qos != QOS_STANDING:
+            return header, None, start, end
+        standing = read_standing(data, start, end)
+        return header, standing, start + standing.size, end
+
+    def _room(self, header: Header) -> int:
+        return body_room(self._packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
+
+    def _hello(self, header: Header, body: bytes) -> Hello:
+        entries = read_body(body, self._room(header))
+        if not entries or not isinstance(entries[0], Hello):
+            raise EntryKindError("a packet in the clear that does not begin with a hello")
+        return entries[0]
+
+    def _check_hello(
+        self, header: Header, hello: Hello, data: bytes, start: int, row: int
+    ) -> tuple[list[Trailer], str]:
+        """What opens the packets of a start, and what is to be said of its hello's own trailer."""
+        if header.sealed and self._keys is None:
+            return [], _NO_KEY
+        number = _number(header, hello)
+        encrypt = hello.capabilities & ENCRYPTS != 0
+        keys = self._keys if header.sealed and self._keys is not None else Keys()
+        failed: WireError = WrongKeyError(
+            f"a hello of robot {header.src_id}, sealed with none of these keys, or damaged"
+        )
+        for trailer in keys.candidates(header.src_id, hello.boot, encrypt=encrypt):
+            try:
+                trailer.open(data[:start], data[start:], number, row, plain=True)
+                return [trailer], "tag ok" if header.sealed else "CRC ok"
+            except TagError:
+                continue
+            except CrcError as error:
+                failed = error
+        raise failed
+
+    def _open(
+        self, data: bytes, header: Header, standing: Standing | None, start: int, end: int
+    ) -> tuple[int, bytes | None, str]:
+        """Full packet number, body (None where it stays hidden) and what is to be said of the trailer."""
+        src_id, row = header.src_id, SOURCE_ROW if standing is None else standing.row
+        starts = self._starts.get(src_id, [])
+        if not starts:
+            missing = f"no hello of robot {src_id} among these packets"
+            if header.sealed:
+                return header.number, None, f"not opened: {missing}"
+            return header.number, data[start:end], f"CRC not checked: {missing}"
+        current = self._current.get(src_id, 0)
+        failed: WireError | None = None
+        for at in (*range(current, len(starts)), *range(current)):
+            number = starts[at].number(header.number)
+            for trailer in starts[at].trailers:
+                try:
+                    body = trailer.open(data[:start], data[start:], number, row)
+                except (CrcError, TagError) as error:
+                    failed = failed or error
+                    continue
+                self._heard(src_id, starts[at].hello.boot, number)
+                return number, body, "tag ok" if header.sealed else "CRC ok"
+        if failed is not None:
+            raise failed
+        number = starts[current].number(header.number)
+        encrypted = starts[current].hello.capabilities & ENCRYPTS
+        return number, None if encrypted else data[start:end], _NO_KEY
+
+    def _heard(self, src_id: int, boot: int, number: int) -> None:
+        for at, known in enumerate(self._starts.get(src_id, ())):
+            if known.hello.boot == boot:
+                self._current[src_id] = at
+                known.newest = max(known.newest, number)
+
+    def _announced(self, src_id: int, number: int, entries: Sequence[Entry]) -> tuple[Row, ...]:
+        """The table of topics, if it is complete now and not known yet."""
+        found: tuple[Row, ...] = ()
+        for place, part in enumerate(entries):
+            if not isinstance(part, Part) or part.topic_id != TABLE_TOPIC:
+                continue
+            table = self._tables.setdefault(src_id, Reassembly(_TABLE_BYTES))
+            whole = table.add(part, number, place, repaired=False, now=0.0)
+            table.overflowing()
+            payload = whole and whole.payload()
+            if payload:
+                found = read_table(payload)
+        topics = {row.topic_id: row for row in found}
+        if not found or self.topics.get(src_id) == topics:
+            return ()
+        self.topics[src_id] = topics
+        return found
+
+
+def _number(header: Header, hello: Hello) -> int:
+    """The full number at which a packet with a hello stands."""
+    return hello.turns << 16 | header.number

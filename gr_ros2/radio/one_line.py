@@ -1,0 +1,67 @@
+"""A link described in one line of a command: a robot's number, a radio, and where that radio finds the others.
+
+Invariant: what comes out is what a YAML file of a link has, and goes through the same loader; nothing is set that the
+file could not set, and what is left out takes the file's defaults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from typing import Any
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.radio import FRONT_ENDS
+
+DEFAULT_REGISTRY = "table4"
+DEFAULT_PHY = "psk"
+
+
+@dataclass(frozen=True)
+class Flag:
+    """An option of the command line.
+
+    :param setting: of a front end, which it sets
+    :param meaning: for help and errors
+    """
+
+    setting: str
+    meaning: str
+
+
+FLAGS: Mapping[str, Flag] = {
+    "listen": Flag("bind", "zmq: own address, host:port; a port alone is on all interfaces"),
+    "peer": Flag("connect", "zmq: address of another robot, host:port; may stand several times"),
+    "device": Flag("args", "which device, in the words of its driver; without it the first found"),
+    "frequency": Flag("frequency", "Hz, to send at, and to receive at unless --frequency-rx says otherwise"),
+    "frequency-rx": Flag("frequency_rx", "Hz, to receive at"),
+}
+
+
+def one_line(robot: int, radio: str, registry: str | None, flags: Mapping[str, Any]) -> dict[str, Any]:
+    """A link's settings, as its YAML file would have them.
+
+    :param robot: 0..254; its topics are in the namespace ``/robot_N``
+    :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
+    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``
+    :param flags: value of each option of ``FLAGS`` that was given
+    :raises ConfigError: for an unknown radio, an option it has no use for, or one that it needs
+    :raises BackendMissingError: when what the radio needs is not installed
+    """
+    known = {item.name: item for item in fields(FRONT_ENDS.load(radio).Options)}
+    for flag in flags:
+        if FLAGS[flag].setting not in known:
+            takes = [f"--{name}" for name, other in FLAGS.items() if other.setting in known]
+            raise ConfigError(f"--{flag}: radio {radio} has no such setting; it takes {', '.join(takes) or 'none'}")
+    for name, other in FLAGS.items():
+        item = known.get(other.setting)
+        if item is not None and name not in flags and item.default is MISSING and item.default_factory is MISSING:
+            raise ConfigError(f"--{name} is missing, radio {radio} needs it ({other.meaning})")
+    chosen = {FLAGS[flag].setting: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
+    return {
+        "name": f"robot_{robot}",
+        "registry": DEFAULT_REGISTRY if registry is None else registry,
+        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}"},
+        "phy": {"name": DEFAULT_PHY, "sample_rate": FRONT_ENDS[radio].sample_rate},
+        "front_end": {"name": radio, **chosen},
+    }

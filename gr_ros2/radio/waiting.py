@@ -1,0 +1,73 @@
+"""What a link waits for: topics of its own that nobody publishes, beside those that are published.
+
+Invariant: a line is told when it has changed, and not again; looking changes nothing on the graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from gr_ros2.middleware import TopicInfo
+from gr_ros2.names import INFRASTRUCTURE
+
+if TYPE_CHECKING:
+    from gr_ros2.gr import RosSource
+
+ALL_THERE = "every topic has a publisher"
+_SHOWN = 6
+"""Topics that a line names; of the others it tells how many they are."""
+
+
+class Waiting:
+    """Looks whether the topics of a link have publishers.
+
+    :param source: of a link that is open
+    """
+
+    def __init__(self, source: RosSource) -> None:
+        self._source = source
+        self._told = ALL_THERE
+
+    def look(self) -> str | None:
+        """One line for a person, None while the last one told still holds; at first all is held to be there.
+
+        :raises MiddlewareError: when the graph cannot be asked
+        """
+        missing = self._source.unmatched
+        line = waiting_line(missing, self._types(), self._source.middleware.discover()) if missing else ALL_THERE
+        if line == self._told:
+            return None
+        self._told = line
+        return line
+
+    def _types(self) -> dict[str, str]:
+        return {name: topic.type_name for name, topic in self._source.subscribed.items()}
+
+
+def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo]) -> str:
+    """What a link waits for and what there is instead, those first that may have been meant.
+
+    :param missing: topics without a publisher, at least one
+    :param types: of every topic of the link, by name
+    :param found: what is on the graph
+    """
+    published = [info for info in found if info.publishers and info.topic not in INFRASTRUCTURE]
+    wrong = [info for info in published if types.get(info.topic, info.type_name) != info.type_name]
+    others = [info for info in published if info.topic not in types]
+    last_names, wanted_types = {name.rpartition("/")[2] for name in missing}, {types[name] for name in missing}
+
+    def meant(info: TopicInfo) -> tuple[bool, bool, str]:
+        return info.topic.rpartition("/")[2] not in last_names, info.type_name not in wanted_types, info.topic
+
+    line = f"no publisher on {_listed(missing)} yet"
+    if wrong:
+        line += "".join(f"; {info.topic} has another type, {info.type_name}" for info in wrong)
+    if others:
+        return f"{line}; seen on the graph: {_listed([info.topic for info in sorted(others, key=meant)])}"
+    return line if wrong else f"{line}; nothing else is published on the graph"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,68 @@
+"""A link in one line is the link of a file: the same settings, and an option nobody has a use for is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.config import link_from, load_link
+from gr_ros2.radio.one_line import FLAGS, one_line
+from gr_ros2.settings_file import portable_registry, settled
+from gr_ros2.yaml_text import yaml_text
+
+GIVEN: dict[str, dict[str, Any]] = {
+    "sim": {},
+    "zmq": {"listen": "5551", "peer": ("10.0.0.2:5551", "10.0.0.3:5551")},
+    "file": {},
+    "soapy": {"frequency": 433.2e6, "device": "driver=hackrf"},
+    "uhd": {"frequency": 433.2e6, "frequency-rx": 434.4e6},
+    "pluto": {"frequency": 433.2e6},
+}
+
+
+@pytest.mark.parametrize("radio", list(FRONT_ENDS.own))
+def test_the_yaml_it_prints_says_the_same(radio: str, tmp_path: Path) -> None:
+    values = settled(
+        one_line(7, radio, None, GIVEN[radio]), Path(), ["front_end.write=sent"] if radio == "file" else []
+    )
+    settings = link_from(values)
+    assert (settings.name, settings.ros_source.src_id(), settings.ros_source.namespace) == ("robot_7", 7, "/robot_7")
+    assert settings.phy.sample_rate == FRONT_ENDS[radio].sample_rate
+    FRONT_ENDS.load(radio).Options(**settings.front_end_options)
+    path = tmp_path / "saved.yaml"
+    path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
+    assert load_link(path) == settings
+
+
+def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.csv").write_text("odom,nav_msgs/Odometry\n")
+    monkeypatch.chdir(tmp_path)
+    values = settled(one_line(1, "sim", "mine.csv", {}), Path())
+    assert portable_registry(values["registry"]) == str(tmp_path / "mine.csv")
+    assert portable_registry(settled(one_line(1, "sim", None, {}), Path())["registry"]) == "table4"
+
+
+@pytest.mark.parametrize(
+    ("radio", "flags", "said"),
+    [
+        ("zmq", {"listen": "5551"}, r"--peer is missing, radio zmq needs it \(zmq: address of another robot"),
+        ("pluto", {}, r"--frequency is missing, radio pluto needs it \(Hz"),
+        ("pluto", {"peer": ("a:1",)}, "--peer: radio pluto has no such setting; it takes --device, --frequency"),
+        ("sim", {"listen": "5551"}, "--listen: radio sim has no such setting; it takes none"),
+        ("zeromq", {}, "no 'zeromq'; known are sim, zmq"),
+    ],
+)
+def test_an_option_too_many_or_too_few_is_named(radio: str, flags: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        one_line(1, radio, None, flags)
+
+
+def test_every_option_is_a_setting_of_some_radio() -> None:
+    settings = {name for radio in FRONT_ENDS.own for name in FRONT_ENDS.load(radio).Options.__dataclass_fields__}
+    assert {flag.setting for flag in FLAGS.values()} <= settings

@@ -1,0 +1,62 @@
+"""What a link waits for is told at once, with what there is instead, and once."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.middleware import Qos, TopicInfo
+from gr_ros2.radio.waiting import waiting_line
+
+QOS = Qos("reliable", "volatile", 10)
+ODOM, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
+TYPES = {"/robot_1/odom": ODOM, "/robot_1/scan": SCAN}
+
+
+def published(topic: str, type_name: str) -> TopicInfo:
+    return TopicInfo(topic, type_name, publishers=(QOS,))
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ([], "nothing else is published on the graph"),
+        ([published("/rosout", "rcl_interfaces/msg/Log")], "nothing else is published on the graph"),
+        ([TopicInfo("/odom", ODOM, subscribers=(QOS,))], "nothing else is published on the graph"),
+        (
+            [published("/a", "std_msgs/msg/String"), published("/b", ODOM), published("/odom", ODOM)],
+            "seen on the graph: /odom, /b, /a",
+        ),
+        (
+            [published(f"/topic_{number}", ODOM) for number in range(8)],
+            "seen on the graph: " + ", ".join(f"/topic_{number}" for number in range(6)) + " and 2 more",
+        ),
+        ([published("/robot_1/odom", SCAN)], f"/robot_1/odom has another type, {SCAN}"),
+    ],
+)
+def test_what_may_have_been_meant_comes_first(found: list[TopicInfo], said: str) -> None:
+    assert waiting_line(["/robot_1/odom"], TYPES, found) == f"no publisher on /robot_1/odom yet; {said}"
+
+
+def test_a_line_is_told_when_it_changes() -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from gr_ros2.gr import RosSource
+    from gr_ros2.middleware.memory import MemoryMiddleware
+    from gr_ros2.radio.waiting import ALL_THERE, Waiting
+    from gr_ros2.registry import Registry
+    from tests.domains import domain
+
+    with MemoryMiddleware(domain_id=domain(1)) as robot, MemoryMiddleware(domain_id=domain(1)) as ours:
+        source = RosSource(Registry.from_rows({"odom": ODOM}), middleware=ours, namespace="/robot_1")
+        try:
+            waiting = Waiting(source)
+            assert waiting.look() == "no publisher on /robot_1/odom yet; nothing else is published on the graph"
+            assert waiting.look() is None
+            robot.advertise("/odom", ODOM, QOS)
+            assert waiting.look() == "no publisher on /robot_1/odom yet; seen on the graph: /odom"
+            assert source.stats()["unmatched"] == ["/robot_1/odom"]
+            robot.advertise("/robot_1/odom", ODOM, QOS)
+            assert waiting.look() == ALL_THERE
+            assert waiting.look() is None
+            assert source.stats()["unmatched"] == []
+        finally:
+            source.close()
