@@ -22,7 +22,7 @@ BENCHMARKS = {
     "direct": "bench.runs",
     "fast": "bench.runs",
     "ofdm": "bench.runs",
-    "husky": "bench.runs",
+    "recording": "bench.runs",
     "links": "bench.links",
     "receivers": "bench.receivers",
     "half_points": "bench.receivers",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from statistics import mean
 
 from bench.rows import Row, median_of
@@ -11,8 +10,10 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.registry import Registry
 from gr_ros2.sim import Fleet, SimSettings
+from tests.recordings import DRIVES
 
-HUSKY = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
+DRIVE = DRIVES[-1]
+"""The recorded drive where it is, else that of the simulator."""
 TWO_PACKETS = 102
 """Bytes of payload in two packets of 64 B."""
 REPEATS = 9
@@ -20,17 +21,15 @@ _TYPES = {"odom": "nav_msgs/msg/Odometry", "imu": "sensor_msgs/msg/Imu"}
 
 
 def compression() -> list[Row]:
-    """The recording where it is, and the simulator; dictionaries were trained on neither."""
-    rows = []
-    if HUSKY.exists():
-        odometry = [message.payload for message in read_bag(HUSKY, ["/robot_1/odom"])]
-        imu = [message.payload for message in read_bag(HUSKY, ["/robot_1/imu"])]
-        sizes = _sizes("odom", odometry)
-        rows += [
-            Row("compression: recorded odometry, mean of 724 B", mean(sizes), "B", "≤", 85, "{:,.1f}"),
-            Row("compression: recorded odometry, 99 %", _p99(sizes), "B", "≤", TWO_PACKETS, note=_one_packet(sizes)),
-            Row("compression: recorded imu, mean of 324 B", mean(_sizes("imu", imu)), "B", "≤", 110, "{:,.1f}"),
-        ]
+    """A recording, and the simulator; dictionaries were trained on neither."""
+    odometry = [message.payload for message in read_bag(DRIVE.path, ["/robot_1/odom"])]
+    imu = [message.payload for message in read_bag(DRIVE.path, ["/robot_1/imu"])]
+    sizes = _sizes("odom", odometry)
+    rows = [
+        Row("compression: recorded odometry, mean of 724 B", mean(sizes), "B", "≤", 85, "{:,.1f}", DRIVE.path.name),
+        Row("compression: recorded odometry, 99 %", _p99(sizes), "B", "≤", TWO_PACKETS, note=_one_packet(sizes)),
+        Row("compression: recorded imu, mean of 324 B", mean(_sizes("imu", imu)), "B", "≤", 110, "{:,.1f}"),
+    ]
     settings = SimSettings(robots=1, seed=7, prefix_frames=True)
     simulated = [m.payload for m in Fleet(settings).messages(30.0, 1.7e9) if m.topic.endswith("/odom")]
     sizes = _sizes("odom", simulated)

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from bench.rows import Row
-from bench.runs import DOMAINS, HUSKY, HUSKY_TOPICS
+from bench.runs import DOMAINS, DRIVE
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.runner import run_scenario
@@ -36,13 +36,11 @@ RECORDED_SPEED = 3.5
 def links() -> list[Row]:
     """The four links, and what a message costs on the air."""
     with TemporaryDirectory() as folder:
-        registry = Path(folder) / "recorded.csv"
-        registry.write_text("".join(f"{name},{kind}\n" for name, kind in HUSKY_TOPICS.items()))
-        drive = [f"source=bag:{HUSKY}", f"bag_speed={RECORDED_SPEED}"]
-        inputs: dict[str, list[str]] = {"simulator": []} | ({"recording": drive} if HUSKY.is_dir() else {})
+        registry = DRIVE.write_registry(Path(folder) / "drive.csv")
+        drive = [f"source=bag:{DRIVE.path}", f"bag_speed={RECORDED_SPEED}"]
+        inputs: dict[str, list[str]] = {"simulator": [], "recording": drive}
         rows = [*_paper(inputs), *_narrow(inputs), *_six_topics()]
-        if HUSKY.is_dir():
-            rows += _recorded_topics([*drive, f"registry={registry}"])
+        rows += _recorded_topics([*drive, f"registry={registry}"])
         return [*rows, *_carries_everything(), *_fitting()]
 
 

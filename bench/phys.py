@@ -18,7 +18,7 @@ from gnuradio import gr
 
 from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait
 from bench.rows import Row
-from bench.runs import HUSKY, HUSKY_TOPICS
+from bench.runs import DRIVE
 from gr_ros2.config import ChannelConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Sender
@@ -44,19 +44,17 @@ _COUNT = (4000, 200)
 
 def drive() -> list[Row]:
     """The recorded drive over every PHY with samples at its default settings, 64 B packets in noise."""
-    if not HUSKY.is_dir():
-        return [Row(f"recorded drive: skipped, {HUSKY} is missing", 0)]
     packets = drive_packets()
     return [_drive(_phy(name), packets) for name in PHY if PHY.load(name).has_samples]
 
 
 def drive_packets() -> list[bytes]:
     """What the sending engine makes of the recording: every message, uncompressed."""
-    registry = Registry.from_rows(HUSKY_TOPICS)
+    registry = Registry.from_rows(DRIVE.topics)
     sender = Sender(registry, SourceConfig(packet_len=PACKET_LEN, robot_id=1, queue_depth=0))
     ids = {f"/robot_1/{topic.name}": topic.topic_id for topic in registry}
     packets = []
-    for message in read_bag(HUSKY, list(ids)):
+    for message in read_bag(DRIVE.path, list(ids)):
         now = message.stamp_ns * 1e-9
         sender.submit(ids[message.topic], message.payload, now)
         while (packet := sender.next_packet(now)) is not None:

@@ -11,9 +11,10 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
 from gr_ros2.run.scenario import load_scenario
+from tests.recordings import DRIVES
 
-HUSKY = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
-HUSKY_TOPICS = {"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu", "fix": "sensor_msgs/NavSatFix"}
+DRIVE = DRIVES[-1]
+"""The recorded drive where it is, else that of the simulator."""
 DOMAINS = ["ros_source.domain_id=97", "ros_sink.domain_id=98"]
 PACED = ["paced=true", "drain_s=5", "ros_source.queue_depth=100"]
 """What `paper-ofdm` needs in order not to be overdriven, beside a sample rate that carries it."""
@@ -65,28 +66,24 @@ def ofdm() -> list[Row]:
     return _delivery(f"OFDM at {result.phy['sample_rate']:,.0f} samples/s", result)
 
 
-def husky() -> list[Row]:
+def recording() -> list[Row]:
     """The whole recorded drive over OFDM, as fast as the link takes it."""
-    if not HUSKY.is_dir():
-        return [Row(f"recorded drive: skipped, {HUSKY} is missing", 0)]
-    names = [f"/robot_1/{name}" for name in HUSKY_TOPICS]
-    recorded = list(read_bag(HUSKY, names))
+    recorded = list(read_bag(DRIVE.path, DRIVE.names))
     seconds = (recorded[-1].stamp_ns - recorded[0].stamp_ns) * 1e-9
     with TemporaryDirectory() as folder:
-        registry = Path(folder) / "husky.csv"
-        registry.write_text("".join(f"{name},{kind}\n" for name, kind in HUSKY_TOPICS.items()))
-        overrides = [f"registry={registry}", f"source=bag:{HUSKY}", "bag_speed=0", "pace=flow", "duration_s=0"]
+        registry = DRIVE.write_registry(Path(folder) / "drive.csv")
+        overrides = [f"registry={registry}", f"source=bag:{DRIVE.path}", "bag_speed=0", "pace=flow", "duration_s=0"]
         overrides += [*PACED, "packet_len=220", "phy.sample_rate=1e6"]
         begin = time.monotonic()
         result = _run("paper-ofdm", overrides, Path(folder))
         took = time.monotonic() - begin
         differing = 0
-        for name in HUSKY_TOPICS:
+        for name in DRIVE.topics:
             sent = [one.payload for one in recorded if one.topic == f"/robot_1/{name}"]
             got = [one.payload for one in read_bag(Path(folder) / "run" / DELIVERED_BAG, [f"/rx_robot_1/{name}"])]
             differing += abs(len(sent) - len(got)) + sum(not _same(*pair) for pair in zip(got, sent, strict=False))
     return [
-        *_delivery(f"recorded drive of {seconds:.0f} s over OFDM", result),
+        *_delivery(f"{DRIVE.path.name}, {seconds:.0f} s, over OFDM", result),
         Row("recorded drive: messages that differ from the recording", differing, "", "=", 0),
         Row("recorded drive: speed", seconds / took, "× real time", "≥", 1.0, "{:.1f}", f"{took:.1f} s in all"),
     ]

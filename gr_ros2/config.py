@@ -57,6 +57,8 @@ MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
+WireVersion = Literal[0, 1]
+Repairs = Literal["idle", "thrifty", "off"]
 Kernels = Literal["auto", "numpy"]
 
 
@@ -114,7 +116,8 @@ class SourceConfig:
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
     :param robot_id: source id 0..254; -1 takes the last run of digits of the namespace
     :param dst_id: destination id, 255 broadcast
-    :param packet_len: bytes on the wire, 14..4095
+    :param packet_len: bytes on the wire, 14..4095; 40 or more with version 1
+    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same on both ends
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
     :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
@@ -125,7 +128,10 @@ class SourceConfig:
     :param backpressure: make the middleware wait instead of dropping when a queue is full (bags)
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
-    :param repeat_s: s between repeats of a transient-local topic, 0 off
+    :param repeat_s: s between repeats of a transient-local topic, 0 off; with version 1 only while no robot reports
+    :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
+        much as losses are known or expected, off; None takes thrifty where receivers report, idle where none does
+    :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
     :param compression: code every message, C = 1; the sink must have the same setting
     :param dictionaries: files of dictionaries of your own, the same at both ends
     :param topic_options: per topic name, over the registry's columns
@@ -140,6 +146,7 @@ class SourceConfig:
     robot_id: RobotId = -1
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
+    version: WireVersion = 0
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
     flush_timeout_s: Seconds = 0.0
@@ -151,6 +158,8 @@ class SourceConfig:
     entry_ids: Literal["sequential", "random"] = "sequential"
     scheduler: str = "paper"
     repeat_s: Seconds = 10.0
+    repair: Repairs | None = None
+    expected_loss: Annotated[float, Field(ge=0, lt=1)] = 0.2
     compression: bool = False
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
@@ -160,6 +169,9 @@ class SourceConfig:
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:
+        least = self.wire_format.min_packet_len
+        if self.packet_len < least:
+            raise ValueError(f"packet_len = {self.packet_len}: version {self.version} needs at least {least}")
         most = self.wire_format.single_entry_payload(self.packet_len)
         if self.min_fragment > most:
             raise ValueError(
@@ -170,7 +182,7 @@ class SourceConfig:
     @property
     def wire_format(self) -> Format:
         """The version that packets are written in."""
-        return format_of(0)
+        return format_of(self.version)
 
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
@@ -196,9 +208,11 @@ class SinkConfig:
 
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
     :param packet_len: bytes on the wire, 14..4095, the same on both ends
+    :param version: of the wire format, the same on both ends
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
-    :param reassembly_timeout_s: s an incomplete message is kept
+    :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
+    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired (version 1)
     :param robot_id: own id: its packets and those for others are dropped and counted; -1 takes everything
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
@@ -217,12 +231,14 @@ class SinkConfig:
 
     registry: str = ""
     packet_len: PacketLen = 220
+    version: WireVersion = 0
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Count = 10
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    hold_s: Seconds = 1.0
     robot_id: RobotId = -1
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1)] = 16
-    max_source_bytes: Annotated[int, Field(ge=4096)] = 8_000_000
+    max_source_bytes: Annotated[int, Field(ge=4096)] = 32_000_000
     max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
     compression: bool = False
     dictionaries: tuple[str, ...] = ()

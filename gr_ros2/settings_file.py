@@ -19,7 +19,7 @@ from gr_ros2.yaml_text import parse_yaml
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Folder of the built-in scenarios and registries."""
 
-SHARED_KEYS = ("registry", "packet_len")
+SHARED_KEYS = ("registry", "packet_len", "version")
 """Settings both ends of a link must agree on."""
 
 ENDS = ("ros_source", "ros_sink")

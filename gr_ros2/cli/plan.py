@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import log
+
 import click
 from rich import box
 from rich.console import Console
@@ -10,7 +12,7 @@ from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.study.forecast import Advice, Forecast, Planner
+from gr_ros2.study.forecast import Advice, Effect, Forecast, Planner
 
 _WIDTH = 110
 _ADVICE = 3
@@ -48,7 +50,10 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
         for advice in found[:_ADVICE]:
             console.print(_line(advice), soft_wrap=True)
         if not found:
-            console.print("No change of packet_len, compression, scheduler or pacing makes it better.", soft_wrap=True)
+            console.print(
+                "No change of packet_len, compression, scheduler or pacing makes more better than worse.",
+                soft_wrap=True,
+            )
 
 
 def _table(forecast: Forecast) -> Table:
@@ -85,15 +90,30 @@ def _verdict(forecast: Forecast) -> str:
 
 
 def _line(advice: Advice) -> str:
-    forecast = advice.forecast
-    rates = ", ".join(f"{topic.topic} {topic.rate_hz:.1f}/s" for topic in forecast.topics)
-    ages = [topic.result.age_s.mean for topic in forecast.topics if topic.result.sent > 1]
-    known = [age for age in ages if age is not None]
-    age = f", mean age {sum(known) / len(known) * 1e3:.0f} ms" if known else ""
-    return (
-        f"Better: --set {advice.setting.replace(' ', ' --set ')}: {forecast.used:.0%} of the airtime{age}, "
-        f"{_number(forecast.air_bytes_per_message, 1, '.0f')} bytes per message ({rates})"
-    )
+    """What a change makes better and worse, by how much; the strongest effects first."""
+    used, then = (f"{share:.0%}" for share in advice.used)
+    parts = [f"{then} of the airtime" + (f" instead of {used}" if used != then else "")]
+    for word, found in (
+        ("younger", [effect for effect in advice.effects if effect.younger]),
+        ("older", [effect for effect in advice.effects if effect.older]),
+    ):
+        found.sort(key=lambda effect: abs(log(effect.age_s[1] / effect.age_s[0])), reverse=True)
+        parts += [f"{word}: {', '.join(map(_age, found))}"] if found else []
+    for word, found in (
+        ("more of", [effect for effect in advice.effects if effect.more]),
+        ("less of", [effect for effect in advice.effects if effect.fewer]),
+    ):
+        shares = [f"{effect.topic} {effect.pdr[0]:.0%} to {effect.pdr[1]:.0%}" for effect in found]
+        parts += [f"{word} {', '.join(shares)} arrives"] if found else []
+    if advice.harmless:
+        parts.append("no topic gets worse")
+    verdict = "Better" if advice.harmless else "A trade"
+    return f"{verdict}: --set {advice.setting.replace(' ', ' --set ')}: {'; '.join(parts)}"
+
+
+def _age(effect: Effect) -> str:
+    before, after = effect.age_s
+    return f"{effect.topic} {before * 1e3:.0f} to {after * 1e3:.0f} ms ({after / before - 1:+.0%})"
 
 
 def _number(value: float | None, factor: float, form: str) -> str:

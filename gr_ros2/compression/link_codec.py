@@ -12,7 +12,7 @@ different dictionary is an UnknownDictionaryError.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from gr_ros2.compression import bounds
@@ -22,7 +22,7 @@ from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Types
 from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import Topic
 from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")
@@ -35,9 +35,9 @@ STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
 
 
 class LinkCodec:
-    """Implements :class:`gr_ros2.link.message_codec.MessageCodec` for the topics of a registry.
+    """Implements :class:`gr_ros2.link.message_codec.MessageCodec` for some topics.
 
-    Both ends need the same registry and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
+    Both ends need the same topics and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
 
     :param dictionaries: a user's own dictionaries, or their files; the first one with a topic's type is used, otherwise
         the shipped one
@@ -47,7 +47,7 @@ class LinkCodec:
 
     def __init__(
         self,
-        registry: Registry,
+        topics: Iterable[Topic],
         dictionaries: Sequence[Dictionary | str | Path] = (),
         *,
         max_size: int = MAX_MESSAGE,
@@ -59,7 +59,7 @@ class LinkCodec:
             if other is not item and other.digest != item.digest:
                 raise ConfigError(f"dictionaries {other.name!r} and {item.name!r} share the id {item.prefix.hex()}")
         sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
-        self._topics = [TopicCodec(topic, sets, max_size) for topic in registry]
+        self._topics = {topic.topic_id: TopicCodec(topic, sets, max_size) for topic in topics}
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The message that the other end gets: alignment gaps are zero, quantised fields are rounded, the rest is
@@ -68,14 +68,14 @@ class LinkCodec:
         It is computed from the type alone, independently of the coded bytes, so that comparing with it detects errors
         of the codec.
 
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].canonical(payload)
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, at most one byte longer than the payload; never fails.
 
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].encode(payload)
 
@@ -83,7 +83,7 @@ class LinkCodec:
         """The message.
 
         :raises CodecError: ``row`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].decode(coded)
 

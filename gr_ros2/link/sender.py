@@ -9,9 +9,8 @@ an argument and never goes back.
 from __future__ import annotations
 
 import random
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
@@ -24,6 +23,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
+from gr_ros2.link.stats import SenderStats
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
@@ -35,23 +35,6 @@ _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
 
 Observer = Callable[[SenderEvent], None]
-
-
-@dataclass(slots=True)
-class SenderStats:
-    """What left and what did not, since the start.
-
-    ``refused`` is keyed by (topic_id, reason); ``missed`` are messages that the ROS graph lost before ``submit``.
-    """
-
-    submitted: Counter[int] = field(default_factory=Counter)
-    refused: Counter[tuple[int, str]] = field(default_factory=Counter)
-    sent: Counter[int] = field(default_factory=Counter)
-    missed: Counter[int] = field(default_factory=Counter)
-    repeats: int = 0
-    packets: int = 0
-    entries: int = 0
-    payload_bytes: int = 0
 
 
 class Sender:
@@ -73,6 +56,8 @@ class Sender:
         observer: Observer | None = None,
     ) -> None:
         self.config = config
+        if len(registry) > V0.max_topics:
+            raise ConfigError(f"{len(registry)} topics; version 0 carries {V0.max_topics}, version 1 up to 240")
         self.registry = registry.with_options(config.topic_options)
         self.src_id = config.src_id()
         self.stats = SenderStats()
@@ -338,6 +323,7 @@ class Sender:
         self._changed(now)
         stats = self.stats
         stats.packets += 1
+        stats.air["new"] += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
         self._observe(SentPacket(data, packet, tuple(record), now))

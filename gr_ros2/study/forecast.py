@@ -35,10 +35,12 @@ _MARGIN = 1.5
 """A proposed ``reassembly_timeout_s`` beside the longest pause: what a lost packet and a busy computer add."""
 _PARTS = (1, 2, 3)
 """Packets per message that packet lengths are tried for."""
-_BETTER = 0.97
-"""Weighted age, beside what it is now, from which a change is worth proposing."""
+_YOUNGER = 0.97
+"""Age of a topic beside what it is now, from which it counts as younger; its inverse, as older."""
+_NOTICED_S, _NOTICED_PDR = 0.001, 0.03
+"""Differences of an age and of the share delivered below which a topic is held to be as before."""
 _LIGHTER = 0.95
-"""The same for the airtime used, where the age stays as it is."""
+"""Airtime used beside what it is now, from which a change is worth proposing that makes nothing worse."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +93,79 @@ class Forecast:
 
 
 @dataclass(frozen=True)
+class Effect:
+    """What a change of settings does to one topic.
+
+    :param weight: of the topic, as it is configured
+    :param age_s: now, and with the change: mean age, s; of a topic that sends once, its latency. What never arrives
+        counts ``TRIAL_S``
+    :param pdr: now, and with the change: share of its messages that arrive, 0..1
+    """
+
+    topic: str
+    weight: float
+    age_s: tuple[float, float]
+    pdr: tuple[float, float]
+
+    @property
+    def younger(self) -> bool:
+        """Whether what arrives is fresher, by so much that it is noticed."""
+        before, after = self.age_s
+        return after < _YOUNGER * before and before - after > _NOTICED_S
+
+    @property
+    def older(self) -> bool:
+        """Whether it is staler, likewise."""
+        before, after = self.age_s
+        return before < _YOUNGER * after and after - before > _NOTICED_S
+
+    @property
+    def fewer(self) -> bool:
+        """Whether less of it arrives."""
+        return self.pdr[0] - self.pdr[1] > _NOTICED_PDR
+
+    @property
+    def more(self) -> bool:
+        """Whether more of it arrives."""
+        return self.pdr[1] - self.pdr[0] > _NOTICED_PDR
+
+
+@dataclass(frozen=True)
 class Advice:
-    """A change of settings, as one would write it, and what it would bring."""
+    """A change of settings, as one would write it, and what it would bring.
+
+    :param setting: one or more ``key=value``, with spaces between them
+    :param forecast: with the change
+    :param used: airtime used now and with the change, 0..1
+    :param effects: on every topic that sends
+    """
 
     setting: str
     forecast: Forecast
+    used: tuple[float, float]
+    effects: tuple[Effect, ...]
+
+    @property
+    def harmless(self) -> bool:
+        """Whether no topic gets older or arrives less."""
+        return not any(effect.older or effect.fewer for effect in self.effects)
+
+    @property
+    def gain(self) -> float:
+        """How much younger the topics get: weighted mean of the logarithms of the ratios of their ages; 0 = not."""
+        weight = sum(effect.weight for effect in self.effects)
+        gains = [effect.weight * np.log(effect.age_s[0] / effect.age_s[1]) for effect in self.effects]
+        return float(sum(gains) / weight) if weight else 0.0
+
+    @property
+    def worth_it(self) -> bool:
+        """Whether it is to be proposed: topics get younger in the mean, and those that do weigh more than those that
+        get older; or airtime is saved and nothing gets worse."""
+        younger = sum(effect.weight for effect in self.effects if effect.younger)
+        older = sum(effect.weight for effect in self.effects if effect.older)
+        if younger > older and self.gain > -np.log(_YOUNGER):
+            return True
+        return self.harmless and self.used[1] < _LIGHTER * self.used[0]
 
 
 class Planner:
@@ -130,21 +200,34 @@ class Planner:
         return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
 
     def advice(self) -> list[Advice]:
-        """Single changes that make the topics younger, or the link freer at the same age; the best first.
+        """Single changes that make topics younger or the link freer; first those that make no topic worse, the best
+        first.
 
         Each is tried on the first seconds of the traffic, and so is what it is compared with.
         """
         base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
         now = self._forecast(base)
-        age = _age(now)
-        tried = [Advice(setting, self._forecast(variant)) for setting, variant in self._variants(base)]
-        better = [
-            advice
-            for advice in tried
-            if _age(advice.forecast) < _BETTER * age
-            or (_age(advice.forecast) < age / _BETTER and advice.forecast.used < _LIGHTER * now.used)
-        ]
-        return sorted(better, key=lambda advice: (_age(advice.forecast), advice.forecast.used))
+        tried = [self._compared(setting, now, self._forecast(variant)) for setting, variant in self._variants(base)]
+        proposed = [advice for advice in tried if advice.worth_it]
+        return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.gain, advice.forecast.used))
+
+    def _compared(self, setting: str, now: Forecast, then: Forecast) -> Advice:
+        """What a change brings, topic by topic."""
+        registry = self.registry.with_options(self.scenario.ros_source.topic_options)
+        weights = {
+            name: registry[topic_id].options.weight for name, topic_id in source_names(self.scenario, registry).items()
+        }
+        effects = tuple(
+            Effect(
+                before.topic,
+                weights[before.topic],
+                (_age(before.result), _age(after.result)),
+                (before.result.pdr or 0.0, after.result.pdr or 0.0),
+            )
+            for before, after in zip(now.topics, then.topics, strict=True)
+            if before.result.sent
+        )
+        return Advice(setting, then, (now.used, then.used), effects)
 
     def _variants(self, base: Scenario) -> Iterator[tuple[str, Scenario]]:
         source, sink = base.ros_source, base.ros_sink
@@ -285,12 +368,7 @@ def _turn(scenario: Scenario) -> int:
     return TURN if scenario.ros_source.scheduler == "freshness" else 1
 
 
-def _age(forecast: Forecast) -> float:
-    """Mean age over the topics, s; of a topic that sends once, its latency; what never arrives counts TRIAL_S."""
-    ages = []
-    for topic in forecast.topics:
-        result = topic.result
-        if result.sent:
-            age = result.age_s.mean if result.sent > 1 else result.latency_s.max
-            ages.append(TRIAL_S if age is None else age)
-    return float(np.mean(ages)) if ages else TRIAL_S
+def _age(result: TopicResult) -> float:
+    """Mean age, s; of a topic that sends once, its latency; what never arrives counts TRIAL_S."""
+    age = result.age_s.mean if result.sent > 1 else result.latency_s.max
+    return TRIAL_S if age is None else max(age, _NOTICED_S)

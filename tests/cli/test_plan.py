@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -22,6 +24,17 @@ def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixt
     out = capsys.readouterr().out
     assert "it does not fit, most of it is /robot_1/odom" in out
     assert "Better: --set ros_source.compression=true --set ros_sink.compression=true" in out
+
+
+def test_it_says_what_gets_better_by_how_much_and_what_gets_worse(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["plan", "demo", "--duration", "5"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if " --set " in line]
+    assert lines
+    for line in lines:
+        assert re.match(r"(Better|A trade): --set .*: \d+% of the airtime", line)
+        assert ("; no topic gets worse" in line) == line.startswith("Better")
+        assert (" older: " in line or " less of " in line) == line.startswith("A trade")
+    assert re.search(r"younger: /robot_1/\w+ \d+ to \d+ ms \(-\d+%\)", lines[0])
 
 
 def test_it_says_what_the_sink_needs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import random
 import struct
-from pathlib import Path
 from typing import Any
 
-import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
 from gr_ros2.config import TopicOptions
-from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.registry import Registry, Topic, normalize_type
 from gr_ros2.sim import Fleet, SimSettings
 
-HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 _CODES = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I",
@@ -128,13 +124,6 @@ def codec_for(type_name: str, *dictionaries: Dictionary, max_size: int = 1 << 20
     """The codec of a link with one topic."""
     topic = Topic(0, "topic", normalize_type(type_name), TopicOptions(**options))
     return LinkCodec(Registry([topic]), dictionaries, max_size=max_size)
-
-
-def husky(topic: str) -> list[bytes]:
-    """Payloads of the recording; skips where it is not there."""
-    if not HUSKY.exists():
-        pytest.skip(f"recording {HUSKY} is missing")
-    return [message.payload for message in read_bag(HUSKY, [topic])]
 
 
 def simulated(topic: str, seconds: float = 10.0, **settings: Any) -> list[bytes]:

@@ -6,7 +6,9 @@ from statistics import mean
 
 import pytest
 
-from tests.compression.support import codec_for, husky, simulated
+from gr_ros2.middleware.bag_files import read_bag
+from tests.compression.support import codec_for, simulated
+from tests.recordings import Drive, every_drive
 
 TWO_PACKETS = 102
 """Bytes of payload in two packets of 64 B."""
@@ -22,15 +24,25 @@ def sizes(type_name: str, payloads: list[bytes]) -> list[int]:
     return sorted(out)
 
 
-def test_recorded_odometry() -> None:
-    found = sizes("nav_msgs/Odometry", husky("/robot_1/odom"))
+def payloads(drive: Drive, name: str) -> list[bytes]:
+    return [message.payload for message in read_bag(drive.path, [f"/robot_1/{name}"])]
+
+
+@every_drive
+def test_recorded_odometry(drive: Drive) -> None:
+    found = sizes("nav_msgs/Odometry", payloads(drive, "odom"))
     assert mean(found) <= 51
     assert found[int(0.99 * len(found))] <= 51  # one packet of 64 B; two were asked for
 
 
-def test_recorded_imu_and_fix() -> None:
-    assert mean(sizes("sensor_msgs/Imu", husky("/robot_1/imu"))) <= 80
-    assert mean(sizes("sensor_msgs/NavSatFix", husky("/robot_1/fix"))) <= 40
+LARGEST = {"imu": 80, "fix": 40, "scan": 200}
+"""Mean bytes of a message."""
+
+
+@every_drive
+def test_recorded_sensors(drive: Drive) -> None:
+    for name in set(drive.topics) & set(LARGEST):
+        assert mean(sizes(drive.topics[name], payloads(drive, name))) <= LARGEST[name], name
 
 
 @pytest.mark.parametrize(

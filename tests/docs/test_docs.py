@@ -189,8 +189,9 @@ def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, t
             (folder / name).write_text(other.text)
     if words[-2:-1] == ["--out"] or "--out" in words:
         shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
-    options = SHORTER.get(words[1], ())
-    shorter = [] if not options or options[0] in words else list(options)
+    shorter = list(SHORTER.get(words[1], ()))
+    if shorter and shorter[0] != "--set" and shorter[0] in words:  # of several settings of one name the last holds
+        shorter = []
     if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {
         re.split("=", word)[0] for word in words
     }:

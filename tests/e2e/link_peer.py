@@ -12,6 +12,7 @@ import threading
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.middleware.support import BEST_EFFORT, CUSTOM, message
+from tests.said import say
 
 DOMAIN = 7
 PERIOD_S = 0.05
@@ -25,7 +26,7 @@ def main(robot: str, other: str) -> None:
         f"/rx_robot_{other}/chat",
         CUSTOM,
         BEST_EFFORT,
-        lambda data: print("got", int.from_bytes(data[4:8], "little"), flush=True),
+        lambda data: say("got", int.from_bytes(data[4:8], "little")),
     )
     chat = graph.advertise(f"/robot_{robot}/chat", CUSTOM, CHAT)
     over = threading.Event()
@@ -34,7 +35,7 @@ def main(robot: str, other: str) -> None:
         number = 0
         while not over.wait(PERIOD_S):
             chat.publish(message(number, 200))
-            print("sent", number, flush=True)
+            say("sent", number)
             number += 1
 
     talker = threading.Thread(target=talk)

@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import pytest
-
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import DELIVERED_BAG
@@ -18,8 +16,6 @@ from tests.middleware.support import same
 DDS_PADDING = 3
 """Zeros DDS may put behind a message."""
 COMMAND = (sys.executable, "-m", "gr_ros2.cli")
-HUSKY = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
-needs_husky = pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording: {HUSKY} is missing")
 
 
 def on_free_domains() -> list[str]:

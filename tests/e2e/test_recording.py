@@ -1,4 +1,4 @@
-"""A real robot's recording over the OFDM loopback: each delivered message is identical to the recorded one."""
+"""A robot's recording over the OFDM loopback: each delivered message is identical to the recorded one."""
 
 from __future__ import annotations
 
@@ -11,37 +11,34 @@ from gr_ros2.middleware.bag import BagMiddleware, BagPublisher
 from gr_ros2.middleware.bag_files import BagMessage, read_bag
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
-from tests.e2e.support import HUSKY, check_complete, check_identical, delivered_bag, needs_husky, on_free_domains
+from tests.e2e.support import check_complete, check_identical, delivered_bag, on_free_domains
+from tests.recordings import Drive, every_drive
 
-TOPICS = {"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu", "fix": "sensor_msgs/NavSatFix"}
 SLICE_S = 20.0
 
 
-@pytest.fixture
-def recording(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
-    """The first 20 s of the Husky's drive as a bag of its own."""
-    path = tmp_path / "slice"
-    messages = list(read_bag(HUSKY, [f"/robot_1/{name}" for name in TOPICS]))
+def first_part(drive: Drive, path: Path) -> list[BagMessage]:
+    """The first 20 s of a drive as a bag of its own."""
+    messages = list(read_bag(drive.path, drive.names))
     messages = [one for one in messages if one.stamp_ns - messages[0].stamp_ns < SLICE_S * 1e9]
     with BagMiddleware(path=path, mode="write") as bag:
         publishers = {
-            f"/robot_1/{name}": bag.advertise(f"/robot_1/{name}", kind, Qos()) for name, kind in TOPICS.items()
+            name: bag.advertise(name, kind, Qos())
+            for name, kind in zip(drive.names, drive.topics.values(), strict=True)
         }
         for one in messages:
             publisher = publishers[one.topic]
             assert isinstance(publisher, BagPublisher)
             publisher.publish_at(one.payload, one.stamp_ns)
-    return path, messages
+    return messages
 
 
 @pytest.mark.real_time
-@needs_husky
-def test_a_recorded_drive_crosses_the_ofdm_link_completely(
-    tmp_path: Path, recording: tuple[Path, list[BagMessage]]
-) -> None:
-    bag, messages = recording
-    registry = tmp_path / "husky.csv"
-    registry.write_text("".join(f"{name},{kind}\n" for name, kind in TOPICS.items()))
+@every_drive
+def test_a_recorded_drive_crosses_the_ofdm_link_completely(tmp_path: Path, drive: Drive) -> None:
+    bag = tmp_path / "slice"
+    messages = first_part(drive, bag)
+    registry = drive.write_registry(tmp_path / "drive.csv")
     settings = [
         f"registry={registry}",
         f"source=bag:{bag}",
@@ -58,7 +55,7 @@ def test_a_recorded_drive_crosses_the_ofdm_link_completely(
     ]
     out = tmp_path / "out"
     check_complete(run_scenario(load_scenario("paper-ofdm", settings), out).result)
-    for name in TOPICS:
+    for name in drive.topics:
         sent = [one.payload for one in messages if one.topic == f"/robot_1/{name}"]
         assert len(sent) > 40
         check_identical(delivered_bag(out, f"/rx_robot_1/{name}"), sent)

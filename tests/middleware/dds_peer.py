@@ -9,6 +9,7 @@ from typing import Any
 
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.middleware.dds import DdsMiddleware
+from tests.said import say
 
 
 def report(middleware: Middleware, endpoint: Publisher | Subscription, stop: threading.Event) -> None:
@@ -17,7 +18,8 @@ def report(middleware: Middleware, endpoint: Publisher | Subscription, stop: thr
     while not stop.wait(0.01):
         now = endpoint.matched(), json.dumps(middleware.counters)
         if now != last:
-            print(f"matched {now[0]}\ncounters {now[1]}", flush=True)
+            say("matched", now[0])
+            say("counters", now[1])
             last = now
 
 
@@ -29,11 +31,11 @@ def main(domain: str, topic: str, type_name: str, role: str, *qos_words: str) ->
     if role == "pub":
         endpoint = middleware.advertise(topic, type_name, qos)
     else:
-        endpoint = middleware.subscribe(topic, type_name, qos, lambda data: print(f"data {data.hex()}", flush=True))
+        endpoint = middleware.subscribe(topic, type_name, qos, lambda data: say("data", data.hex()))
     stop = threading.Event()
     reporter = threading.Thread(target=report, args=(middleware, endpoint, stop))
     reporter.start()
-    print("ready", flush=True)
+    say("ready")
     for line in sys.stdin:
         if isinstance(endpoint, Publisher):
             endpoint.publish(bytes.fromhex(line.strip()))

@@ -11,7 +11,6 @@ from typing import Literal
 
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, TopicInfo, bag_recorder
@@ -19,7 +18,6 @@ from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions,
 from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
 from tests.waiting import wait_for
 
-HUSKY = Path(__file__).parents[3] / "shared" / "data" / "husky_outdoor"
 Storage = Literal["mcap", "sqlite3"]
 both_storages = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 
@@ -255,23 +253,6 @@ def test_many_threads_may_publish(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
     assert len(list(read_bag(tmp_path / "bag"))) == 2000
-
-
-@pytest.mark.skipif(not HUSKY.exists(), reason="the recorded Husky drive is not on this machine")
-def test_the_recorded_drive() -> None:
-    topics = {info.topic: info.type_name for info in bag_topics(HUSKY)}
-    assert topics == {
-        "/robot_1/odom": "nav_msgs/msg/Odometry",
-        "/robot_1/imu": "sensor_msgs/msg/Imu",
-        "/robot_1/fix": "sensor_msgs/msg/NavSatFix",
-    }
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    stamps: list[int] = []
-    for odom in read_bag(HUSKY, ["/robot_1/odom"]):
-        assert odom.type_name == "nav_msgs/msg/Odometry"
-        store.deserialize_cdr(odom.payload, odom.type_name)
-        stamps.append(odom.stamp_ns)
-    assert stamps == sorted(stamps) and len(stamps) > 1000
 
 
 def test_one_that_may_lose_messages_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

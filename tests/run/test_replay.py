@@ -19,7 +19,8 @@ from gr_ros2.middleware.base import Qos
 from gr_ros2.run import loss_table
 from gr_ros2.run.replay import Replayed, replay
 from gr_ros2.run.scenario import Scenario, load_scenario
-from tests.e2e.support import HUSKY, check_books, needs_husky
+from tests.e2e.support import check_books
+from tests.recordings import Drive, every_drive
 
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 20_000_001
@@ -137,14 +138,14 @@ def test_what_cannot_be_is_said_and_leaves_nothing(tmp_path: Path, blobs: Path) 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["damaged.mcap", "in"]
 
 
-@needs_husky
-def test_a_real_drive_opens_with_other_readers_and_keeps_its_stamps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@every_drive
+def test_a_drive_opens_with_other_readers_and_keeps_its_stamps(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(loss_table, "PACKETS", 50)
-    settings = load_scenario("demo", ["time=packets"], duration_s=10.0, source=f"bag:{HUSKY}")
-    done = replay(HUSKY, tmp_path / "out.mcap", settings, ("/robot_1/odom", "/robot_1/imu", "/robot_1/fix"))
+    settings = load_scenario("demo", ["time=packets"], duration_s=10.0, source=f"bag:{drive.path}")
+    done = replay(drive.path, tmp_path / "out.mcap", settings, drive.names)
     check_books(done.outcome.result)
     with AnyReader([tmp_path / "out.mcap"]) as reader:
         seen = dict.fromkeys(done.carried, 0)

@@ -16,7 +16,7 @@ from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import simulate
 from gr_ros2.sim.fleet import Fleet
-from gr_ros2.study.forecast import Planner
+from gr_ros2.study.forecast import Advice, Effect, Planner
 
 
 def planner(name: str, *overrides: str, duration: float = 5.0) -> Planner:
@@ -83,6 +83,52 @@ def test_advice_holds_when_it_is_followed() -> None:
     per_message = planner("paper-ofdm", *best.setting.split(), lens[0].setting).forecast().air_bytes_per_message
     assert per_message is not None
     assert per_message <= 115
+
+
+def effect(age: tuple[float, float], pdr: tuple[float, float] = (1.0, 1.0), weight: float = 1.0) -> Effect:
+    return Effect("/odom", weight, age, pdr)
+
+
+@pytest.mark.parametrize(
+    ("one", "says"),
+    [
+        (effect((0.1, 0.05)), {"younger"}),
+        (effect((0.1, 0.2)), {"older"}),
+        (effect((0.1, 0.098)), set()),
+        (effect((0.001, 0.0015)), set()),  # half a millisecond, which nobody notices
+        (effect((0.1, 0.05), (1.0, 0.5)), {"younger", "fewer"}),
+        (effect((0.1, 0.1), (0.5, 1.0)), {"more"}),
+    ],
+)
+def test_what_a_change_does_to_a_topic(one: Effect, says: set[str]) -> None:
+    assert {name for name in ("younger", "older", "fewer", "more") if getattr(one, name)} == says
+
+
+@pytest.mark.parametrize(
+    ("effects", "used", "worth_it", "harmless"),
+    [
+        ([effect((0.1, 0.05)), effect((0.1, 0.1))], (1.0, 1.0), True, True),
+        ([effect((9.0, 0.1)), *[effect((0.1, 0.2))] * 4, effect((0.1, 0.1))], (1.0, 0.5), False, False),  # four of six
+        ([effect((0.1, 0.05)), effect((0.1, 0.05)), effect((0.1, 0.11))], (1.0, 1.0), True, False),
+        ([effect((0.1, 0.05), weight=4.0), *[effect((0.1, 0.11))] * 3], (1.0, 1.0), True, False),  # the one that counts
+        ([effect((0.1, 0.1))], (1.0, 0.5), True, True),
+        ([effect((0.1, 0.1), (1.0, 0.9))], (1.0, 0.5), False, False),
+        ([effect((0.1, 0.1))], (1.0, 1.0), False, True),
+    ],
+)
+def test_what_is_proposed(effects: list[Effect], used: tuple[float, float], worth_it: bool, harmless: bool) -> None:
+    forecast = planner("paper-ofdm-paced", duration=1.0).forecast()
+    advice = Advice("packet_len=100", forecast, used, tuple(effects))
+    assert (advice.worth_it, advice.harmless) == (worth_it, harmless)
+
+
+@pytest.mark.parametrize("name", ["six-topics-paced", "demo", "narrow-ofdm-paced"])
+def test_nothing_is_called_better_that_makes_more_topics_older_than_younger(name: str) -> None:
+    proposed = planner(name, duration=3.0).advice()
+    for advice in proposed:
+        younger, older = ([e for e in advice.effects if getattr(e, word)] for word in ("younger", "older"))
+        assert sum(e.weight for e in older) < sum(e.weight for e in younger) or advice.harmless
+    assert [advice.harmless for advice in proposed] == sorted((advice.harmless for advice in proposed), reverse=True)
 
 
 def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> None:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
+NOBODY = -1
 MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 
 
@@ -18,7 +20,7 @@ MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 class Settings:
     """One robot's end of a link.
 
-    :param src_id: 0..254
+    :param src_id: 0..254; ``NOBODY`` at an end that only receives, and takes packets whomever they are for
     :param packet_len: bytes of the longest packet, the same at all ends
     :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
     :param dst_id: whom packets are for, 255 everybody
@@ -67,5 +69,35 @@ class Settings:
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:
             raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {MIN_PACKET_LEN}..4095")
-        if not 0 <= self.src_id < BROADCAST:
+        if not 0 <= self.src_id < BROADCAST and (self.hears or self.src_id != NOBODY):
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")
+
+
+def settings_of(
+    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False
+) -> Settings:
+    """The settings of an end from those of its blocks.
+
+    :param hears: whether it receives and can say what
+    :raises ConfigError: neither names the robot, and it would have something to say
+    """
+    send = SourceConfig() if source is None else source
+    take = SinkConfig() if sink is None else sink
+    return Settings(
+        src_id=take.robot_id if source is None else source.src_id(),
+        packet_len=take.packet_len if source is None else source.packet_len,
+        dst_id=send.dst_id,
+        hop=send.hop,
+        repair=send.repair,
+        expected_loss=send.expected_loss,
+        hears=hears,
+        half_duplex=half_duplex,
+        hold_s=take.hold_s,
+        repeat_s=send.repeat_s,
+        max_source_bytes=take.max_source_bytes,
+        max_sources=take.max_sources,
+        min_fragment=send.min_fragment,
+        flush_timeout_s=send.flush_timeout_s,
+        packet_rate=send.packet_rate,
+        queue_depth=send.queue_depth,
+    )
