@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.link.ledger_rows import ROWS
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.record.result import LatenessResult
 from gr_ros2.report.explain import explanation
 from tests.record.results import RESULT
