@@ -339,7 +339,8 @@ class Endpoint:
     def _compose(self, now: float) -> bytes | None:
         if not self._started:
             self._start(now)
-        if self._talk.urgent(now, idle=self.outbox.idle):
+        idle, latency, heard = self.outbox.idle, self.outbox.urgent, bool(self.window.receivers())
+        if self._talk.urgent(now, idle=idle, latency=latency, heard=heard):
             return self._hello(now)
         if now >= self._repeat_at:
             self._repeat_at = now + self.settings.repeat_s
