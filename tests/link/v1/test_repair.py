@@ -192,7 +192,7 @@ def test_a_packet_that_one_receiver_lacks_goes_again_as_it_was() -> None:
     sender = window(count=5)
     sender.report(9, 5, 0b10110, settled=True, loss=0.2, now=0.1)
     again = [sender.next(0.1), sender.next(0.1)]
-    assert [packet.data for packet in again if isinstance(packet, Sent)] == [b"packet 5", b"packet 2"]
+    assert [sent.data for sent in again if isinstance(sent, Sent)] == [b"packet 5", b"packet 2"]
     assert isinstance(sender.next(0.1), Repair)  # both may have been lost again
     sender.report(9, 5, 0b11111, settled=True, loss=0.2, now=0.2)
     assert sender.next(0.3) is None
