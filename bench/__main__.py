@@ -11,7 +11,7 @@ from importlib import import_module
 
 from rich.console import Console
 
-from bench.report import Row, table
+from bench.rows import Row, table
 
 BENCHMARKS = {
     "codec": "bench.codec",

@@ -13,7 +13,7 @@ from functools import lru_cache
 from itertools import count
 
 from bench.repair import losses
-from bench.report import Row
+from bench.rows import Row
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.receiver import Receiver

@@ -1,8 +1,8 @@
 """One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
 
-Laws: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a robot
-does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`, also
-when opening failed half-way.
+Invariants: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a
+robot does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`,
+also when opening failed half-way.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ what is free, and nothing about it is fixed beforehand.
 with a lifespan, until that is over; otherwise until ``depth`` newer ones have left, or newer ones that fill a repair.
 Where receivers report they say when they have it, and no more than the publishers' depth limits it.
 
-Laws: a topic's messages begin one after the other, each after the one before has left whole; every message ends in
-being sent or in a Refused with its row.
+Invariants: a topic's messages begin one after the other, each after the one before has left whole; every message ends
+in being sent or in a Refused with its row.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from zlib import crc32
 
 from gr_ros2.config import QueuePolicy
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.key import Key
@@ -155,7 +155,7 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, Row.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         if topic.latched:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
@@ -404,6 +404,6 @@ class Outbox:
             if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))

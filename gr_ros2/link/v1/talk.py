@@ -4,7 +4,7 @@ Hellos leave at the start, a few in the first second since any may be lost; when
 once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about 50 bytes/s. Where
 messages wait they are late: by half a second, or by two where receivers report.
 
-Law: a hello never says of a message that it is kept before whoever listens had time to get it the first time.
+Invariant: a hello never says of a message that it is kept before whoever listens had time to get it the first time.
 """
 
 from __future__ import annotations
