@@ -1,6 +1,6 @@
-"""The registry: which topics cross the link and which number stands for each (the paper, section 4.3).
+"""The registry: which topics cross the link, and the number of each (the paper, section 4.3).
 
-Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
+Invariant: row order is topic id order; both ends use the same file, and equal ``digest`` values confirm that.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Topic:
 
     @property
     def latched(self) -> bool:
-        """Whether late joiners are to get the last message: registered so, or so by ROS convention."""
+        """Whether late joiners get the last message: because the registry says so, or by ROS convention."""
         if self.options.durability is not None:
             return self.options.durability == "transient_local"
         return self.name.rsplit("/", 1)[-1] in _LATCHED

@@ -1,7 +1,7 @@
 """What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
 
-Law: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever; every
-block of this process is checked against every other when it is made.
+Invariant: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever;
+every block of this process is checked against every other when it is made.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from gr_ros2.boots import BootFile
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.keys import read_key_file
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
 from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.sealing import Keys

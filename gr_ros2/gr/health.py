@@ -1,8 +1,8 @@
 """How a live link is doing: its counters over the last seconds, judged against limits.
 
-Laws: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left out,
-never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are those
-of diagnostic_msgs/DiagnosticStatus.
+Invariants: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left
+out, never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are
+those of diagnostic_msgs/DiagnosticStatus.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from gr_ros2.config import DiagnosticsConfig
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 
 Stats = Mapping[str, Any]
 
@@ -192,7 +192,7 @@ def _look(stats: Stats, now: float) -> _Look:
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
     front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
-    lost_on_graph = sum(topic[Row.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    lost_on_graph = sum(topic[LedgerRow.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
         sent=stats["packets"]["out"],
@@ -200,7 +200,7 @@ def _look(stats: Stats, now: float) -> _Look:
         missing=sink["packet_loss_est"],
         rejected=rejected,
         lost_on_graph=lost_on_graph,
-        unpublished=sink[Row.PUBLISH_FAILED],
+        unpublished=sink[LedgerRow.PUBLISH_FAILED],
         topics=topics,
         front_end=front_end,
         locked={kind: count for kind, count in sink["rejected"].items() if kind in _LOCKED},

@@ -1,6 +1,6 @@
 """ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
 
-Law: source and sink are the blocks of these names around one end, so that what is heard changes what is sent.
+Invariant: source and sink are the blocks of these names around one end, so that what is heard changes what is sent.
 """
 
 from __future__ import annotations

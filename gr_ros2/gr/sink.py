@@ -1,8 +1,8 @@
 """ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
 
-Laws: a thin shell, all behaviour is in the link's engine, which one lock guards; only the bytes of a PDU are trusted;
-neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph seems
-alive; messages are published in completion order; what counts as delivered was published, and everything else is
+Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; only the bytes of a PDU are
+trusted; neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph
+seems alive; messages are published in completion order; what counts as delivered was published, and everything else is
 counted by name.
 """
 
@@ -20,26 +20,26 @@ from gnuradio import gr
 from gr_ros2.config import SinkConfig, replaced
 from gr_ros2.errors import ConfigError, GrRos2Error, SealError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
-from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
+from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
-    *("not_a_pair", "not_u8", Row.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
+    *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -93,7 +93,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._timer_idle = False
         self._running = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self._counters: Counter[str] = Counter()
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
@@ -140,8 +140,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._advertise((src_id, topic_id))
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         with self._lock:
             self._running = True
         self._thread = threading.Thread(target=self._watch_timeouts, name="gr-ros2-sink", daemon=True)
@@ -155,7 +155,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def close(self) -> None:
@@ -318,7 +318,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
             named = f"topic id {key[1]} of robot {key[0]}"
-            self._tell_first(Row.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
+            self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
         with self._lock:

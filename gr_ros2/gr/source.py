@@ -1,7 +1,8 @@
 """ROS Source: ROS topics in, packets out on message port `pdus` (the paper, section 4.1 and 4.3).
 
-Laws: a thin shell, all behaviour is in the link's engine, which one lock guards; packets are composed just before they
-go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped unnamed.
+Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; packets are composed just before
+they go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped
+unnamed.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from gnuradio import gr
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
-from gr_ros2.gr.frames import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
@@ -98,7 +99,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._running = False
         self._closed = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.emitted = 0
@@ -153,8 +154,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._end.use_credit()
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         self._unread = pmt.is_null(self.message_subscribers(PDUS))
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
@@ -172,7 +173,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def close(self) -> None:
@@ -198,7 +199,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 name: {
                     "topic_id": topic.topic_id,
                     "submitted": stats.submitted[topic.topic_id],
-                    Row.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
+                    LedgerRow.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
                     "queue": self._end.queue(topic.topic_id)[0],
@@ -364,7 +365,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            level = logging.INFO if event.reason == Row.SUPERSEDED else logging.WARNING  # what `latest` is for
+            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

@@ -1,8 +1,8 @@
 """One robot's end of a link: messages and packets in, packets and events out.
 
-An end sends and receives, so that what it hears may change what it sends. Laws: as everywhere in ``link``, time is an
-argument and never goes back; nothing happens but in a call; what the sending half does is told to its observer while
-it happens, what the receiving half does is returned, for the caller to act on before others hear of it.
+An end sends and receives, so that received packets can change what it sends. Invariants: as everywhere in ``link``,
+time is an argument and never goes back; nothing happens outside a call; the sending half reports to its observer
+immediately; the receiving half returns its events, so that the caller can act on them before any observer.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
@@ -22,11 +22,11 @@ from gr_ros2.registry import Registry
 
 
 class Endpoint(Protocol):
-    """What the shells need of an end, whatever its version of the wire format."""
+    """The interface of an end, the same for every version of the wire format."""
 
     @property
     def answers(self) -> bool:
-        """Whether what it receives can change what it sends."""
+        """Whether received packets can change what this end sends."""
 
     @property
     def sent(self) -> SenderStats:
@@ -109,7 +109,7 @@ class Endpoint(Protocol):
         """From now on a packet leaves only for a credit."""
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take so many further packets."""
+        """The PHY can take this many further packets."""
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
@@ -118,7 +118,7 @@ class Endpoint(Protocol):
         """Take the bytes of one packet; the events it causes, in order."""
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Do what is due by ``now``; the events it causes, in order. Whether a packet may go is asked apart."""
+        """Do what is due by ``now``; the events it causes, in order. ``next_packet`` is a separate question."""
 
     def next_departure(self) -> float | None:
         """Earliest time at which ``next_packet`` may have something without a further call; None where only a call can
@@ -129,10 +129,10 @@ class Endpoint(Protocol):
 
 
 class EndpointV0:
-    """An end that speaks version 0, whose receiving half tells its sending half nothing.
+    """An end of version 0. Its receiving half passes nothing on to its sending half.
 
-    :param source: settings of what it sends; None: it sends nothing
-    :param sink: settings of what it receives; None: it receives nothing
+    :param source: settings of its sending half; None: it sends nothing
+    :param sink: settings of its receiving half; None: it receives nothing
     :param codecs: of messages sent and received, where the link compresses
     :param rng: see :class:`Sender`
     :param observer: called with every SenderEvent, in order

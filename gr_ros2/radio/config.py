@@ -1,7 +1,7 @@
 """What `gr-ros2 link` is told: one robot's end of a link as one YAML file.
 
-Law: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level; whatever
-a front end needs stands under `front_end`, and its sample rate is the PHY's.
+Invariant: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level;
+whatever a front end needs stands under `front_end`, and its sample rate is the PHY's.
 """
 
 from __future__ import annotations

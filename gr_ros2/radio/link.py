@@ -1,8 +1,8 @@
 """One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
 
-Laws: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a robot
-does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`, also
-when opening failed half-way.
+Invariants: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a
+robot does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`,
+also when opening failed half-way.
 """
 
 from __future__ import annotations
@@ -153,11 +153,8 @@ class RobotLink(Flowgraph):
         """
         super().start(max_noutput_items)
         self._started = self._clock()
-        if self.config.version and not self.config.key:
-            _log.warning(
-                "link %s has no key, so anybody can read, forge and replay its packets; gr-ros2 key new FILE makes one",
-                self.config.name,
-            )
+        if self.remark:
+            _log.info("link %s: %s", self.config.name, self.remark)
         self.phy.prefer_latency()
         if self._diagnostics is not None:
             self._diagnostics.start()
@@ -176,6 +173,12 @@ class RobotLink(Flowgraph):
         """
         if self._running:
             self.front_end.check(self._clock())
+
+    @property
+    def remark(self) -> str:
+        """What whoever starts it is to know; often nothing."""
+        open_to_all = self.config.version and not self.config.key
+        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
 
     @property
     def finished(self) -> bool:

@@ -1,6 +1,6 @@
 """One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph.
 
-Laws: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
+Invariants: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
 stack it was entered on.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import own_settings
+from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
@@ -44,7 +44,7 @@ class Direction:
     """Both blocks and the link between them, ready to start.
 
     :param scenario: a one-way scenario, see :meth:`Scenario.directions`
-    :param ears: hears the events of both blocks
+    :param observer: hears the events of both blocks
     :param stack: closes what is opened here
     :param instrumented: see :class:`LoopbackLink`
     :ivar topics: topic id of every topic the source subscribes, by absolute name
@@ -56,7 +56,7 @@ class Direction:
         registry: Registry,
         phy: Phy,
         *,
-        ears: LinkObserver,
+        observer: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:
@@ -69,18 +69,21 @@ class Direction:
         # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
         pulled = scenario.bag_path is not None and scenario.bag_speed == 0
         backpressure = scenario.ros_source.backpressure or pulled
+        sends, hears = (self._end(source=True), self._end(source=False)) if scenario.version else (None, None)
         self.source = RosSource(
             registry,
             middleware=self.input,
-            observer=ears,
+            observer=observer,
             seed=scenario.seed,
+            end=sends,
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
         stack.callback(self.source.close)
         self.sink = RosSink(
             registry,
             middleware=self.output,
-            observer=ears,
+            observer=observer,
+            end=hears,
             **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)
@@ -95,6 +98,12 @@ class Direction:
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)
+
+    def _end(self, *, source: bool) -> LiveEnd:
+        """One end of a run: its starts are not counted, since nothing outlives the run."""
+        ends = (self.scenario.ros_source, None) if source else (None, self.scenario.ros_sink)
+        start = Start(self.scenario.seed + 1)
+        return LiveEnd(lambda observer: make_endpoint(self.registry, *ends, start=start, observer=observer))
 
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""

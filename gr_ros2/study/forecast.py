@@ -1,14 +1,15 @@
 """Does this traffic fit this radio? A forecast from a simulation of the link, and what would make it better.
 
-Laws: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its entries
-by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is based on.
+Invariants: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its
+entries by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is
+based on.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.freshness import TURN
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
@@ -84,6 +85,9 @@ class Forecast:
     pad: float
     pause_s: float
     topics: tuple[TopicForecast, ...]
+    air: Mapping[str, float] = field(default_factory=dict)
+    """Packets per message sent, by what they are spent on: new messages, repair, reports, hellos; version 0 does not
+    tell."""
 
     @property
     def load(self) -> float:
@@ -335,6 +339,7 @@ class Planner:
             pad=padded / (packets * scenario.packet_len) if packets else 0.0,
             pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
+            air={kind: count / max(sum(run.stats.sent.values()), 1) for kind, count in run.stats.air.items()},
         )
 
 
