@@ -6,15 +6,16 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.cli.main import run
-from gr_ros2.doctor import computer, installed, programs, radios, ros
+from gr_ros2.doctor import checks, computer, installed, programs, radios, ros
 from gr_ros2.doctor.checks import CHECKS
-from gr_ros2.doctor.finding import Check, Finding
+from gr_ros2.doctor.finding import Check, Finding, State
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains
@@ -278,7 +279,7 @@ def test_every_check_has_its_own_name() -> None:
     assert len({check.look for check in CHECKS}) == len(CHECKS)
 
 
-def test_text_and_json_say_the_same(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_check_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(ros, "_LOOK_S", 0.01)
     monkeypatch.setattr(computer, "_MEASURED_S", 0.01)
     status = run(["doctor", "--json"])
@@ -286,11 +287,26 @@ def test_text_and_json_say_the_same(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     failed = [finding for finding in told["findings"] if finding["state"] == "failed"]
     assert (status, told["ok"]) == ((1, False) if failed else (0, True))
     assert {finding["group"] for finding in told["findings"]} == {check.group for check in CHECKS}
+
+
+@pytest.mark.parametrize(
+    ("state", "status", "last"),
+    [
+        ("ok", 0, "A link runs here."),
+        ("note", 0, "A link runs here."),
+        ("warning", 0, "A link runs here; it would run better with: clock."),
+        ("failed", 1, "A link does not run here: clock."),
+    ],
+)
+def test_text_and_json_say_the_same(
+    state: State, status: int, last: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finding = Finding("clock", state, "it is [late]", "wind it up")
+    monkeypatch.setattr(checks, "CHECKS", (Check("Clock", "clock", lambda: finding),))
+    assert run(["doctor", "--json"]) == status
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"ok": not status, "findings": [{"group": "Clock", **asdict(finding)}]}
     assert run(["doctor"]) == status
-    out = capsys.readouterr().out
-    assert all(finding["what"] in out for finding in told["findings"])
-    monkeypatch.setenv("ROS_DOMAIN_ID", "999")
-    assert run(["doctor"]) == 1
-    out = capsys.readouterr().out
-    assert "FAILED  domain: " in out
-    assert "A link does not run here: " in out
+    heading, line, remedy, end = filter(None, capsys.readouterr().out.splitlines())
+    assert (heading, remedy.strip(), end) == ("Clock", "mend: wind it up", last)
+    assert line.lower().split() == [state, "clock:", "it", "is", "[late]"]
