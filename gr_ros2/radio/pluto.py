@@ -111,7 +111,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     @contextmanager
     def one_line(self) -> Iterator[None]:
-        with _stderr_own_process(), super().one_line():
+        with _stderr_deferred(), super().one_line():
             yield
 
     def _check_settings(self, direction: Direction) -> None:
@@ -141,7 +141,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
 
 @contextmanager
-def _stderr_own_process() -> Iterator[None]:
+def _stderr_deferred() -> Iterator[None]:
     """Keeps what any thread writes to stderr meanwhile: it comes out afterwards, or is logged after an error."""
     with tempfile.TemporaryFile() as kept, os.fdopen(os.dup(_STDERR), "wb") as real:
         os.dup2(kept.fileno(), _STDERR)
