@@ -17,6 +17,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.codec import MessageCodec
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry
+from gr_ros2.setting import Auto
 from gr_ros2.wire import BROADCAST
 
 _T = TypeVar("_T")
@@ -74,7 +75,7 @@ class Graph:
     :raises GrRos2Error: see :func:`gr_ros2.middleware.join_graph`
     """
 
-    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int, node_name: str) -> None:
+    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int | Auto, node_name: str) -> None:
         if isinstance(middleware, Middleware):
             self.middleware = middleware
             self.owned = False

@@ -32,6 +32,7 @@ from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import BlockThread, quicken_threads
 from gr_ros2.registry import Registry, check_outputs
+from gr_ros2.setting import AUTO
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
@@ -294,8 +295,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
         topic = self.registry[key[1]]
-        depth = self.config.publisher_depth if topic.options.depth is None else topic.options.depth
-        qos = Qos(topic.options.reliability, "transient_local" if topic.latched else "volatile", depth)
+        depth = self.config.publisher_depth if topic.options.depth == AUTO else topic.options.depth
+        asked = topic.options.reliability
+        qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
         publisher = self._publishers[key] = self.middleware.advertise(self._name(key), topic.type_name, qos)
         return publisher
 

@@ -16,6 +16,7 @@ from typing import Literal, cast, get_args
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.names import check_node, check_topic
+from gr_ros2.setting import AUTO, Auto
 
 __all__ = [
     "DISCOVERY_TOPIC",
@@ -79,13 +80,13 @@ def ros_type(name: str) -> str:
     return f"{match[1]}/{match[2]}/{match[3]}" if match else name
 
 
-def resolve_domain_id(domain_id: int, environment: Mapping[str, str] = os.environ) -> int:
-    """The DDS domain, 0..232; -1 takes ROS_DOMAIN_ID, default 0.
+def resolve_domain_id(domain_id: int | Auto, environment: Mapping[str, str] = os.environ) -> int:
+    """The DDS domain, 0..232; auto takes ROS_DOMAIN_ID, default 0.
 
     :raises ConfigError: out of range, or ROS_DOMAIN_ID is no number
     """
     origin, text = "domain_id", str(domain_id)
-    if domain_id == -1:
+    if domain_id == AUTO:
         origin, text = "ROS_DOMAIN_ID", environment.get("ROS_DOMAIN_ID", "").strip() or "0"
     if not re.fullmatch(r"[0-9]{1,3}", text) or int(text) > MAX_DOMAIN_ID:
         raise ConfigError(f"{origin} = {text!r}: a DDS domain is 0..{MAX_DOMAIN_ID}")
@@ -113,17 +114,17 @@ class DiscoveryOptions:
 
 
 def discovery_options(
-    localhost_only: bool | None = None, environment: Mapping[str, str] = os.environ
+    localhost_only: bool | Auto = AUTO, environment: Mapping[str, str] = os.environ
 ) -> DiscoveryOptions:
     """What ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS ask for; the first wins, as in rcl.
 
-    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
+    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless auto
     :raises ConfigError: for a value that means nothing (where rcl assumes one and warns)
     """
     text = environment.get("ROS_LOCALHOST_ONLY", "").strip() or "0"
     if text not in ("0", "1"):
         raise ConfigError(f"ROS_LOCALHOST_ONLY = {text!r}: write 0 or 1")
-    if localhost_only or (localhost_only is None and text == "1"):
+    if localhost_only is True or (localhost_only == AUTO and text == "1"):
         return DiscoveryOptions("LOCALHOST")
     found = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip() or "SUBNET"
     if found not in get_args(DiscoveryRange):

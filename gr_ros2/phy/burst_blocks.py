@@ -28,22 +28,28 @@ from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import Held
+from gr_ros2.setting import AUTO, Auto
 
 STOCK = "GNU Radio's blocks"
 """What PHYs of blocks by others run on."""
 _log = logging.getLogger(__name__)
 
 
+_GAP = 32
+"""Zero samples after a packet, unless a receiver needs more."""
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class BurstOptions:
     """Settings that every burst PHY has.
 
-    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
+    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next.
+        auto = 32, or as many as another receiver needs
     :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
     """
 
-    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
-    fec: CodeName = "none"
+    gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
+    fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
 
 
 class BurstPhy(Phy):
@@ -57,7 +63,7 @@ class BurstPhy(Phy):
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
-        self.gap: int = BurstOptions.gap if self.options.gap is None else self.options.gap
+        self.gap: int = _GAP if self.options.gap == AUTO else self.options.gap
 
     def airtime_samples(self) -> int:
         return self.modem.burst_samples + self.gap

@@ -240,7 +240,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
         )
     )
     airtime = result.phy.get("airtime_s")
-    if airtime and result.config.get("pace") != "flow":
+    if airtime and result.config.get("time") != "unthrottled":
         pictures.append(
             save(
                 airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),

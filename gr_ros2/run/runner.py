@@ -113,10 +113,10 @@ def run_scenario(
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
-    onlookers = Onlookers(watchers, apart=scenario.time == "real")
+    onlookers = Onlookers(watchers, apart=not scenario.simulated)
     outcome: Outcome | None = None
     try:
-        if scenario.time == "real":
+        if not scenario.simulated:
             with ExitStack() as stack:
                 outcome = _Run(scenario, out, stack, onlookers).execute(on_progress)
         else:
@@ -301,13 +301,13 @@ class _Run:
         return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        """Let the link deliver what it holds, for at most ``drain_s`` without news in pace `flow`."""
+        """Let the link deliver what it holds, for at most ``drain_s`` without news where it runs unthrottled."""
         limit = time.monotonic() + self.scenario.drain_s
         before = (0, 0)
         while time.monotonic() < limit and self.recorder.ledger.unresolved():
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
-            if self.scenario.pace == "flow" and (now := self.recorder.progress()) != before:
+            if self.scenario.time == "unthrottled" and (now := self.recorder.progress()) != before:
                 before, limit = now, time.monotonic() + self.scenario.drain_s
 
     def _empty(self) -> bool:

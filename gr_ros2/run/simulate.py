@@ -139,7 +139,7 @@ def simulate(
     :param codec: of both ends; None makes it where ``compression`` is on
     :param on_packet: called with every packet that leaves the source
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
-    :raises ConfigError: when the scenario cannot be set up, or has no times (pace ``flow``)
+    :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
     registry = scenario.load_registry()
     phy = phy or make_phy(scenario, registry)
@@ -207,14 +207,17 @@ class Way:
 
     :param airtime: of one packet, s; 0 for a PHY without samples
     :param messages: in the order of time
-    :raises ConfigError: for pace ``flow``, which has no times
+    :raises ConfigError: for time ``unthrottled``, which has no times
     """
 
     def __init__(
         self, scenario: Scenario, sender: End, receiver: End, airtime: float, messages: Iterator[Offered]
     ) -> None:
-        if scenario.pace != "airtime":
-            raise ConfigError(f"pace = {scenario.pace!r}: only pace airtime can be simulated")
+        if scenario.time == "unthrottled":
+            raise ConfigError(
+                "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
+                "be simulated; set time to real, samples or packets"
+            )
         self.sender, self.receiver = sender, receiver
         self.src_id = scenario.ros_source.src_id()
         self.air: Air | None = None
@@ -228,7 +231,7 @@ class Way:
         self._messages = messages
         self._coming = next(messages, None)
         self._clock: AirtimeClock[bytes] | None = AirtimeClock(airtime) if airtime else None
-        self._paced = scenario.paced and self._clock is not None
+        self._paced = self._clock is not None
         self._drain = scenario.drain_s
         self._until = scenario.duration_s
         if self._paced:

@@ -23,6 +23,7 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import offered, simulate
+from gr_ros2.setting import AUTO
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -176,7 +177,7 @@ class Planner:
     def __init__(self, scenario: Scenario) -> None:
         if not PHY.load(scenario.phy.name).has_samples:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
-        if scenario.time == "real":
+        if not scenario.simulated:
             # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
         self.scenario = scenario
@@ -237,8 +238,8 @@ class Planner:
             )
         if source.scheduler != "freshness":
             yield "ros_source.scheduler=freshness", replace(base, ros_source=replace(source, scheduler="freshness"))
-        if not base.paced:
-            yield "paced=true", replace(base, paced=True)
+        if source.packet_rate == 0:
+            yield "ros_source.packet_rate=auto", replace(base, ros_source=replace(source, packet_rate=AUTO))
         for packet_len in self._packet_lens():
             yield (
                 f"packet_len={packet_len}",

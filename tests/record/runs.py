@@ -92,7 +92,7 @@ def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = Tru
         scenario=scenario,
         seed=3,
         duration_s=DURATION_S,
-        config={"name": scenario, "description": "made <by> hand", "pace": "airtime" if paced else "flow"},
+        config={"name": scenario, "description": "made <by> hand", "time": "real" if paced else "unthrottled"},
         topics=topics,
         packets=recorder.ledger.packets(),
         phy={"name": "ofdm", "sample_rate": 1e5, **recorder.airtime(AIRTIME_S)},

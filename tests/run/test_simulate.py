@@ -161,8 +161,8 @@ def test_the_time_of_the_computer_is_added_to_every_latency() -> None:
 
 
 def test_what_has_no_times_is_refused() -> None:
-    with pytest.raises(ConfigError, match="pace = 'flow'"):
-        run("paper-ofdm-paced", "pace=flow")
+    with pytest.raises(ConfigError, match="time = 'unthrottled'"):
+        run("paper-ofdm-paced", "time=unthrottled")
 
 
 class Answering(EndpointV0):

@@ -32,6 +32,7 @@ from gr_ros2.link.v1.events import Accepted, Key, Refused, SentPart
 from gr_ros2.link.v1.repair import GROUP, Life
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.setting import AUTO
 from gr_ros2.wire.table import Row, write_table
 from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
 
@@ -273,9 +274,9 @@ class Outbox:
         for topic in self._topics or ():
             options = topic.options
             reliable = options.reliability
-            ordered = self._ordered.get(topic.topic_id, True) if reliable is None else reliable == "reliable"
+            ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
             ordered = ordered and self._queues[topic.topic_id].policy != "latest"
-            depth = options.depth if options.depth is not None else self._depths.get(topic.topic_id, 0)
+            depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
             codec = "" if self._codec is None else options.codec
             qos = _QOS[options.qos]
             name, kind = topic.name, topic.type_name
@@ -288,8 +289,8 @@ class Outbox:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def _bound(self, topic_id: int) -> int:
-        depth = None if self._topics is None else self._topics[topic_id].options.queue_depth
-        return self._settings.queue_depth if depth is None else depth
+        depth = AUTO if self._topics is None else self._topics[topic_id].options.queue_depth
+        return self._settings.queue_depth if depth == AUTO else depth
 
     def _admit(self, topic: Topic, serial: int, payload: bytes, coded: bool, now: float) -> None:
         qos = _QOS[topic.options.qos] if serial >= 0 else 2
