@@ -65,7 +65,7 @@ def domain() -> Finding:
 def graph() -> Iterator[Finding]:
     """The topics that are published in this domain."""
     try:
-        with join_graph(DEFAULT_MIDDLEWARE, domain_id=-1, node_name="gr_ros2_doctor") as joined:
+        with join_graph(DEFAULT_MIDDLEWARE, domain_id=AUTO, node_name="gr_ros2_doctor") as joined:
             time.sleep(_LOOK_S)
             found = joined.discover()
     except GrRos2Error as error:
