@@ -372,7 +372,9 @@ class ChannelConfig(Seeded):
     snr_db: Annotated[
         Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None, Field(title="Signal-to-noise ratio (dB)")
     ] = None
-    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5, title="Frequency offset (of the sample rate)")] = 0.0
+    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5, title="Frequency offset (share of the sample rate)")] = (
+        0.0
+    )
     epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
     taps: Annotated[tuple[complex, ...], Field(min_length=1)] = (1.0 + 0.0j,)
     doppler_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
