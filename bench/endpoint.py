@@ -6,8 +6,8 @@ import random
 import time
 
 from bench.report import Row, median_of
+from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.events import Delivered
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry

@@ -20,8 +20,8 @@ from bench.report import Row
 from fuzz.loop import inputs
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ReplayedError
+from gr_ros2.link.events import Delivered, Rejected
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.events import Delivered, Rejected
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
@@ -166,7 +166,7 @@ def _signed(data: bytes, receiver: Endpoint) -> bytes:
 
 
 def _refusals(end: Endpoint) -> int:
-    return sum(end.rejected.values()) + sum(end.dropped.values())
+    return sum(end.received.rejected.values()) + sum(end.received.dropped.values())
 
 
 def _resident() -> int:

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 from bench.report import Row
 from gr_ros2.config import TopicOptions
+from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.events import Delivered, Event, SentPacket
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
@@ -104,7 +104,7 @@ def run(
     :param tail: s after the last message
     """
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or TopicOptions())])
-    events: list[Event] = []
+    events: list[SenderEvent] = []
     common = {"packet_len": packet_len}
     sender = Endpoint(
         registry,
@@ -161,7 +161,7 @@ def run(
                     sender.receive(answer, now + slot)
         sender.handle_timeout(now)
         if complete == count * receivers and outcome.done == inf:
-            outcome.done, outcome.sent_until = now + slot, sum(sender.air.values())
+            outcome.done, outcome.sent_until = now + slot, sum(sender.sent.air.values())
             if once:
                 break
     until = times[-1]
@@ -171,7 +171,7 @@ def run(
     outcome.age = sum(mean_age(times, line, until) for line in arrived) / receivers
     during = Counter(event.kind for event in events if isinstance(event, SentPacket) and event.now < until)
     outcome.packets = (during["new"] + during["repair"]) / count
-    outcome.air = Counter(sender.air)
+    outcome.air = Counter(sender.sent.air)
     return outcome
 
 

@@ -51,6 +51,8 @@ MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
+WireVersion = Literal[0, 1]
+Repairs = Literal["idle", "thrifty", "off"]
 Kernels = Literal["auto", "numpy"]
 
 DEFAULT_MIDDLEWARE = "dds"
@@ -118,7 +120,7 @@ class Sampled:
 class Packets:
     """What sends packets.
 
-    :param packet_len: bytes on the wire, 14..4095, the same at every end of a link
+    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
     """
 
     packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
@@ -129,9 +131,11 @@ class Agreed(Packets):
     """What all ends of a link have to agree on.
 
     :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
+    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
     """
 
     registry: Annotated[Text, Field(title="Registry CSV")]
+    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -229,7 +233,11 @@ class SourceConfig(Queued, EndConfig):
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
         joins fragments of different messages)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
-    :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off
+    :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
+        version 1 only while no robot reports
+    :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
+        much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
+    :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
     """
 
     topics: tuple[str, ...] = ()
@@ -248,9 +256,14 @@ class SourceConfig(Queued, EndConfig):
     entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
     scheduler: str = "paper"
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
+    repair: Repairs | Auto = AUTO
+    expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:
+        least = self.wire_format.min_packet_len
+        if self.packet_len < least:
+            raise ValueError(f"packet_len = {self.packet_len}: version {self.version} needs at least {least}")
         most = self.wire_format.single_entry_payload(self.packet_len)
         if self.min_fragment > most:
             raise ValueError(
@@ -261,7 +274,7 @@ class SourceConfig(Queued, EndConfig):
     @property
     def wire_format(self) -> Format:
         """The version that packets are written in."""
-        return format_of(0)
+        return format_of(self.version)
 
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
@@ -287,7 +300,8 @@ class SinkConfig(EndConfig):
 
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
-    :param reassembly_timeout_s: s an incomplete message is kept
+    :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
+    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired (version 1)
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all
@@ -300,8 +314,9 @@ class SinkConfig(EndConfig):
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
-    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 8_000_000
+    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
     max_bytes: Annotated[int, Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
@@ -424,17 +439,25 @@ class PhyConfig(Sampled, Named):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OneWay:
+class OverChannel:
+    """What crosses a channel.
+
+    :param channel: what lies between transmitter and receiver
+    """
+
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OneWay(OverChannel):
     """One direction: the block that sends, what lies between, and the block that receives.
 
     :param ros_source: the sending block
     :param ros_sink: the receiving block
-    :param channel: what lies between transmitter and receiver
     """
 
     ros_source: SourceConfig = Field(default_factory=SourceConfig)
     ros_sink: SinkConfig = Field(default_factory=SinkConfig)
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

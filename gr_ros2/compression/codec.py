@@ -13,7 +13,7 @@ another one, is an UnknownDictionaryError.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from gr_ros2.compression import bounds
@@ -23,7 +23,7 @@ from gr_ros2.compression.frames import Zstd
 from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Types
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import Topic
 from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")
@@ -35,9 +35,9 @@ STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
 
 
 class LinkCodec:
-    """Implements :class:`gr_ros2.link.codec.MessageCodec` for the topics of a registry.
+    """Implements :class:`gr_ros2.link.codec.MessageCodec` for some topics.
 
-    Both ends need the same registry and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
+    Both ends need the same topics and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
 
     :param dictionaries: a user's own, or their files; the first that knows a topic's type serves it, otherwise the
         shipped ones do
@@ -47,7 +47,7 @@ class LinkCodec:
 
     def __init__(
         self,
-        registry: Registry,
+        topics: Iterable[Topic],
         dictionaries: Sequence[Dictionary | str | Path] = (),
         *,
         max_size: int = MAX_MESSAGE,
@@ -59,21 +59,21 @@ class LinkCodec:
             if other is not item and other.digest != item.digest:
                 raise ConfigError(f"dictionaries {other.name!r} and {item.name!r} share the id {item.prefix.hex()}")
         sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
-        self._topics = [TopicCodec(topic, sets, max_size) for topic in registry]
+        self._topics = {topic.topic_id: TopicCodec(topic, sets, max_size) for topic in topics}
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """What the far end gets of a message: its alignment gaps zero, its chosen fields rounded, all else as it is.
 
         It follows from the type alone, not from what was coded: so it tells a codec that errs from one that does not.
 
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].canonical(payload)
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, at most one byte longer than the payload; never fails.
 
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].encode(payload)
 
@@ -81,7 +81,7 @@ class LinkCodec:
         """The message.
 
         :raises CodecError: ``row`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
-        :raises IndexError: a topic id that is not in the registry
+        :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].decode(coded)
 

@@ -29,7 +29,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.outcome import Row, arrived
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -58,6 +58,7 @@ class _Topic:
     def __init__(self, read_position: PositionReader | None, history: int) -> None:
         self.sent = 0
         self.delivered = 0
+        self.repaired = 0
         self.delivered_bytes = 0
         self.ended: Counter[str] = Counter()
         self.sent_rate = Rate(RATE_S)
@@ -70,7 +71,8 @@ class _Topic:
 
     def rows(self) -> dict[str, int]:
         """What the events alone say: who sees both ends asks the ledger instead."""
-        rows = {row: count for row, count in {Row.DELIVERED.value: self.delivered, **self.ended}.items() if count}
+        whole = {Row.DELIVERED.value: self.delivered - self.repaired, Row.REPAIRED.value: self.repaired}
+        rows = {row: count for row, count in {**whole, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
         return {**rows, Row.IN_FLIGHT.value: rest} if rest > 0 else rows
 
@@ -155,7 +157,7 @@ class DashboardState:
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):
                     self._topic((event.src_id, event.topic_id)).ended[str(event.reason)] += 1
-            else:
+            elif isinstance(event, Received | Rejected):
                 self._begin(now)
                 self._packets["handed_up"] += 1
                 self._packets_received.add(now)
@@ -242,9 +244,7 @@ class DashboardState:
             return _final_view(place, key, final)
         # What the ledger knows wins: it has heard every event, also those from before there was a state.
         rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
-        sent, delivered = (
-            (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), rows.get(Row.DELIVERED, 0))
-        )
+        sent, delivered = (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), arrived(rows))
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
         age_now, age_mean, age_peak = topic.age.read(now) or (None, None, None)
@@ -348,6 +348,7 @@ class DashboardState:
                 return
         topic = self._topic(key)
         topic.delivered += 1
+        topic.repaired += event.repaired
         topic.delivered_bytes += len(event.payload)
         topic.delivered_rate.add(now, len(event.payload))
         if message is not None:

@@ -6,19 +6,26 @@ block of this process is checked against every other when it is made.
 
 from __future__ import annotations
 
+import random
 import threading
 import weakref
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.endpoint import Endpoint, EndpointV0
+from gr_ros2.link.events import SenderEvent
+from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
+from gr_ros2.link.v1.neighbours import Save
+from gr_ros2.link.v1.sealing import Keys
+from gr_ros2.link.v1.settings import settings_of
 from gr_ros2.middleware import Middleware, join_graph, meet
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import Auto
-from gr_ros2.wire import BROADCAST
+from gr_ros2.wire import BROADCAST, TableRow
 
 _T = TypeVar("_T")
 
@@ -66,6 +73,72 @@ def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> Mess
     from gr_ros2.compression import LinkCodec  # only here: links that do not compress need none of it
 
     return LinkCodec(registry.with_options(config.topic_options), config.dictionaries)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What an end of version 1 is to know of this start of its robot.
+
+    :param boot: number of the start, greater than all before
+    :param heard: how far other robots had been heard before, by robot id: boot number and packet number
+    :param save: stores that, see :class:`gr_ros2.boots.BootFile`
+    :param reports: whether it can be heard by those whom it hears
+    :param half_duplex: whether what it says takes air from what it hears
+    """
+
+    boot: int = 1
+    keys: Keys | None = None
+    heard: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    save: Save | None = None
+    reports: bool = False
+    half_duplex: bool = False
+
+
+def make_endpoint(
+    registry: Registry,
+    source: SourceConfig | None,
+    sink: SinkConfig | None,
+    *,
+    start: Start | None = None,
+    codec: MessageCodec | None = None,
+    rng: random.Random | None = None,
+    observer: Callable[[SenderEvent], None] | None = None,
+) -> Endpoint:
+    """One robot's end of a link, of the version that its settings name.
+
+    :param source: what it sends; None: nothing
+    :param sink: what it receives; None: nothing
+    :param start: for version 1
+    :param codec: of all messages; None makes it where ``compression`` is on
+    :raises ConfigError: for settings that do not go together
+    """
+    to_air = from_air = codec
+    if codec is None:
+        to_air = None if source is None else message_codec(source, registry)
+        from_air = None if sink is None else message_codec(sink, registry)
+    version = source.version if source is not None else 0 if sink is None else sink.version
+    if not version:
+        return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
+    start = start or Start()
+    dictionaries = () if sink is None else sink.dictionaries
+    return EndpointV1(
+        None if source is None else registry.with_options(source.topic_options),
+        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex),
+        boot=start.boot,
+        keys=start.keys,
+        codec=to_air,
+        decoder_for=lambda rows: codec or announced_codec(rows, dictionaries),
+        heard=start.heard,
+        save=start.save,
+        observer=observer,
+    )
+
+
+def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> MessageCodec:
+    """What decodes the messages of a robot that announced these topics."""
+    from gr_ros2.compression import LinkCodec
+
+    return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
 
 
 class Graph:

@@ -16,9 +16,10 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.receiver import Receiver, ReceiverStats
+from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.schedule import SCHEDULER
-from gr_ros2.link.sender import Sender, SenderStats
+from gr_ros2.link.sender import Sender
+from gr_ros2.link.stats import ReceiverStats, SenderStats
 
 __all__ = [
     "SCHEDULER",

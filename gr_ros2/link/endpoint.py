@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.events import ReceiverEvent, SenderEvent
-from gr_ros2.link.receiver import Receiver, ReceiverStats
-from gr_ros2.link.sender import Sender, SenderStats
+from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.receiver import Receiver
+from gr_ros2.link.sender import Sender
+from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.registry import Registry
 
 
@@ -37,13 +38,69 @@ class Endpoint(Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits to be sent."""
+        """Whether no message waits, and nothing that has left is worth repairing."""
+
+    @property
+    def interval(self) -> float:
+        """s from one packet to the next while busy: as configured, or as credits have come; 0 where not known."""
+
+    @property
+    def out_of_credit(self) -> bool:
+        """Whether nothing leaves before the next credit, whatever is submitted."""
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory in use for incomplete messages."""
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message.
 
+        It may be refused, and may push out waiting messages of its topic; all are counted and observed.
+
         :raises ConfigError: for a topic that is not in the registry, or at an end that sends nothing
         """
+
+    def missed(self, topic_id: int, total: int) -> None:
+        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted.
+
+        :param total: since the start; what is new of it is observed
+        """
+
+    def follow(
+        self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+    ) -> bool:
+        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+
+        :param reliable: whether all are
+        :param depth: of their history, 0 unbounded or not known
+        :param lifespan_s: s after which a message is of no use, 0 for ever
+        :param period_s: s within which they promise a message, 0 no promise
+        :return: whether that changed its queue; ``queue`` has what it is
+        """
+
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+        """Policy and deadline (s, 0 none) of a topic's queue."""
+
+    def depth(self, topic_id: int) -> int:
+        """Messages of a topic that may wait, 0 unbounded."""
+
+    def room(self, topic_id: int) -> bool:
+        """Whether a message of that topic could be submitted without pushing another out."""
+
+    def queued(self) -> dict[int, int]:
+        """Messages waiting or under way, per topic id."""
+
+    def reconfigure(self, **changes: Any) -> None:
+        """Change settings of what it sends while running.
+
+        :raises ConfigError: for a value out of range or a setting that cannot change
+        """
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+
+    def knows(self, src_id: int) -> bool:
+        """Whether a sender has a place at present."""
 
     def use_credit(self) -> None:
         """From now on a packet leaves only for a credit."""
@@ -100,9 +157,76 @@ class EndpointV0:
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """See :class:`Endpoint`."""
+        self._half().submit(topic_id, payload, now)
+
+    @property
+    def interval(self) -> float:
+        """See :class:`Endpoint`."""
+        return 0.0 if self._sender is None else self._sender.interval
+
+    @property
+    def out_of_credit(self) -> bool:
+        """See :class:`Endpoint`."""
+        return self._sender is not None and self._sender.out_of_credit
+
+    @property
+    def held_bytes(self) -> int:
+        """See :class:`Endpoint`."""
+        return 0 if self._receiver is None else self._receiver.held_bytes
+
+    def missed(self, topic_id: int, total: int) -> None:
+        """See :class:`Endpoint`."""
+        self._half().missed(topic_id, total)
+
+    def follow(
+        self,
+        topic_id: int,
+        *,
+        reliable: bool = True,  # noqa: ARG002 - version 0 delivers as it comes
+        depth: int = 0,
+        lifespan_s: float = 0.0,
+        period_s: float = 0.0,
+    ) -> bool:
+        """See :class:`Endpoint`."""
+        return self._half().follow(topic_id, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
+
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+        """See :class:`Endpoint`."""
+        return self._half().queue(topic_id)
+
+    def depth(self, topic_id: int) -> int:
+        """See :class:`Endpoint`."""
+        return self._half().depth(topic_id)
+
+    def room(self, topic_id: int) -> bool:
+        """See :class:`Endpoint`."""
+        return self._half().room(topic_id)
+
+    def queued(self) -> dict[int, int]:
+        """See :class:`Endpoint`."""
+        return {} if self._sender is None else self._sender.queued()
+
+    def reconfigure(self, **changes: Any) -> None:
+        """See :class:`Endpoint`."""
+        self._half().reconfigure(**changes)
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """See :class:`Endpoint`."""
+        assert self._receiver is not None
+        return self._receiver.unpublished(event)
+
+    def knows(self, src_id: int) -> bool:
+        """See :class:`Endpoint`."""
+        return self._receiver is not None and self._receiver.knows(src_id)
+
+    def _half(self) -> Sender:
+        """The half that sends.
+
+        :raises ConfigError: there is none
+        """
         if self._sender is None:
-            raise ConfigError("a message was submitted to an end that sends nothing; give it a source")
-        self._sender.submit(topic_id, payload, now)
+            raise ConfigError("an end that sends nothing was asked to; give it a source")
+        return self._sender
 
     def use_credit(self) -> None:
         """See :class:`Endpoint`."""

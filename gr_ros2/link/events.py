@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import Literal
 
 from gr_ros2.errors import WireError
-from gr_ros2.wire import Packet
+from gr_ros2.wire import Packet, TableRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,22 +32,26 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """A message is complete. ``qos`` is the class of the packet that completed it."""
+    """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: not all of its packets
+    came the first time."""
 
     src_id: int
     topic_id: int
     payload: bytes
     qos: int
     key: Hashable = None
+    repaired: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A message of which at least one fragment came will never be complete.
+    """A message of which at least something came will not be delivered.
 
     ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
     outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
-    or it is complete and its codec says ``unknown_dictionary`` or ``damaged``.
+    ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (nothing
+    says what its topic is), ``sender_restarted``; or it is complete and its codec says ``unknown_dictionary`` or
+    ``damaged``.
     """
 
     src_id: int
@@ -55,7 +60,35 @@ class Lost:
     key: Hashable = None
 
 
-ReceiverEvent = Received | Rejected | Delivered | Lost
+@dataclass(frozen=True, slots=True)
+class Met:
+    """A robot is heard, for the first time or again.
+
+    ``boot`` counts its starts; ``hears``: it reports what it hears.
+    """
+
+    src_id: int
+    boot: int
+    hears: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """A robot has been silent for long."""
+
+    src_id: int
+    boot: int
+
+
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """A robot's table of topics is here: what the topic ids of the messages that follow mean."""
+
+    src_id: int
+    rows: tuple[TableRow, ...]
+
+
+ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +147,23 @@ class SentEntry:
     repeat: bool = False
 
 
+AirKind = Literal["new", "repair", "report", "hello"]
+"""What a packet's airtime was spent on: messages; what may have been lost of them; telling what was heard; saying who
+is there, and requests."""
+
+
 @dataclass(frozen=True, slots=True)
 class SentPacket:
-    """A packet that left the sender: its bytes, what they say, and of which messages its entries are, in order."""
+    """A packet that left the sender: its bytes, what they say, and of which messages its entries are, in order.
+
+    ``entries`` are of messages that go for the first time: a repair has none.
+    """
 
     data: bytes
     packet: Packet
     entries: tuple[SentEntry, ...]
     now: float
+    kind: AirKind = "new"
 
 
 SenderEvent = Accepted | Refused | Missed | SentPacket

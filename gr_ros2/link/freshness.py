@@ -20,7 +20,7 @@ has fragments, at most 1 + ceil(size / cut): nothing starves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from heapq import heapify, heappop, heappush
 
 from gr_ros2.config import SourceConfig
@@ -36,9 +36,42 @@ FIRST_AGE_S = 1.0
 LARGE = 4
 """Packets from which on a message is cut with slack, to fill what others leave in packets."""
 
-_RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
+RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
+"""The order of the classes."""
 
 Queues = Mapping[int, Sequence[Outgoing]]
+
+
+def value(message: Outgoing, before: float, cost: int) -> float:
+    """What a message is worth per byte of air.
+
+    :param before: submission time of the one of its topic sent before it, s
+    :param cost: bytes that it takes beside its payload
+    """
+    younger = message.submitted - before
+    return message.weight * younger * younger / (message.remaining + cost)
+
+
+class Turns:
+    """Whose turn it is: every ``TURN``-th packet belongs to the topic whose last turn is longest ago."""
+
+    def __init__(self) -> None:
+        self._line: list[int] = []
+        self._packets = 0
+
+    def holder(self, pending: Collection[int]) -> int:
+        """The topic to which the next packet belongs, -1 for none; one of ``pending``, which is not empty."""
+        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        if self._packets % TURN != TURN - 1:
+            return -1
+        return next(topic_id for topic_id in self._line if topic_id in pending)
+
+    def sent(self, holder: int) -> None:
+        """A packet left that belonged to this topic, or to none."""
+        self._packets += 1
+        if holder >= 0:
+            self._line.remove(holder)
+            self._line.append(holder)
 
 
 class _Packing:
@@ -80,23 +113,19 @@ class FreshnessScheduler:
         """Bytes of the largest message of class latency so far, as far as half a packet goes."""
         self._newest: dict[int, float] = {}
         """Per topic, submission time of the newest message sent whole."""
-        self._line: list[int] = []
-        """Topics in the order of their turns."""
+        self._turns = Turns()
         self._holder = -1
         """Topic whose turn the planned packet is."""
-        self._packets = 0
 
     def plan(self, queues: Queues) -> Plan | None:
         pending = [topic_id for topic_id, queue in queues.items() if queue]
         if not pending:
             return None
-        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        holder = self._holder = self._turns.holder(pending)
         for topic_id in self._latency.intersection(pending):
             self._urgent = max(self._urgent, min(len(queues[topic_id][0].payload), self._half))
         packing = _Packing(self._format, self.config.packet_len)
-        self._holder = -1
-        if self._packets % TURN == TURN - 1:
-            holder = self._holder = next(topic_id for topic_id in self._line if topic_id in pending)
+        if holder >= 0:
             others = [topic_id for topic_id in pending if topic_id != holder]
             packing.keep = self._needs(queues[holder][0])
             self._fill(packing, queues, [topic_id for topic_id in others if queues[topic_id][0].qos == QOS_LATENCY])
@@ -109,10 +138,7 @@ class FreshnessScheduler:
         return Plan(tuple(packing.picks), tuple(packing.lengths), full)
 
     def sent(self, plan: Plan) -> None:
-        self._packets += 1
-        if self._holder >= 0:
-            self._line.remove(self._holder)
-            self._line.append(self._holder)
+        self._turns.sent(self._holder)
         for message in plan.picks:
             if message.done:
                 self._newest[message.topic_id] = max(message.submitted, self._newest.get(message.topic_id, 0.0))
@@ -123,7 +149,7 @@ class FreshnessScheduler:
         for topic_id in topic_ids:
             head = queues[topic_id][0]
             before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
-            heap.append((_RANK[head.qos], -self._value(head, before), topic_id, 0))
+            heap.append((RANK[head.qos], -value(head, before, self._share), topic_id, 0))
         heapify(heap)
         while heap and packing.room() > 0:
             _, _, topic_id, position = heappop(heap)
@@ -131,8 +157,8 @@ class FreshnessScheduler:
             message = queue[position]
             if self._add(packing, message) and position + 1 < len(queue):
                 following = queue[position + 1]
-                value = self._value(following, message.submitted)
-                heappush(heap, (_RANK[following.qos], -value, topic_id, position + 1))
+                worth = value(following, message.submitted, self._share)
+                heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
 
     def _add(self, packing: _Packing, message: Outgoing) -> bool:
         """Add what fits of a message; whether that was all of it."""
@@ -185,8 +211,3 @@ class FreshnessScheduler:
         if message.started:
             return min(message.cut, message.remaining - (message.total - message.index - 1))
         return max(min(len(message.payload), self._most(message)), 1)
-
-    def _value(self, message: Outgoing, before: float) -> float:
-        """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
-        younger = message.submitted - before
-        return message.weight * younger * younger / (message.remaining + self._share)

@@ -6,7 +6,6 @@ name; memory is bounded per source and in all; time is an argument and never goe
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -18,6 +17,7 @@ from gr_ros2.link.outcome import ROWS, Row
 from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
+from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import BROADCAST
@@ -25,28 +25,6 @@ from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
 """A source silent for so long gives its place to a new one when ``max_sources`` are known."""
-
-
-@dataclass(slots=True)
-class ReceiverStats:
-    """What arrived and what did not, since the start.
-
-    ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic;
-    ``delivered``, what was given out, by (src_id, topic_id); ``lost`` by (src_id, topic_id, reason);
-    ``packet_loss_est`` from gaps in sequence numbers and ``message_loss_est`` from gaps in entry ids and messages given
-    up are estimates; ``unknown_gaps`` counts where a sender restarted or was silent for long, so that nothing is known
-    of what was lost.
-    """
-
-    packets: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-    dropped: Counter[str] = field(default_factory=Counter)
-    delivered: Counter[tuple[int, int]] = field(default_factory=Counter)
-    lost: Counter[tuple[int, int, str]] = field(default_factory=Counter)
-    repeats: int = 0
-    packet_loss_est: int = 0
-    unknown_gaps: int = 0
-    message_loss_est: int = 0
 
 
 @dataclass(slots=True)

@@ -9,9 +9,8 @@ an argument and never goes back.
 from __future__ import annotations
 
 import random
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
@@ -24,6 +23,7 @@ from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.outcome import Row
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
+from gr_ros2.link.stats import SenderStats
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
@@ -36,23 +36,6 @@ _INTERVALS = 15
 """Packet intervals from which the pace of credits is taken, as their median."""
 
 Observer = Callable[[SenderEvent], None]
-
-
-@dataclass(slots=True)
-class SenderStats:
-    """What left and what did not, since the start.
-
-    ``refused`` is keyed by (topic_id, reason); ``missed`` are messages that the ROS graph lost before ``submit``.
-    """
-
-    submitted: Counter[int] = field(default_factory=Counter)
-    refused: Counter[tuple[int, str]] = field(default_factory=Counter)
-    sent: Counter[int] = field(default_factory=Counter)
-    missed: Counter[int] = field(default_factory=Counter)
-    repeats: int = 0
-    packets: int = 0
-    entries: int = 0
-    payload_bytes: int = 0
 
 
 class Sender:
@@ -74,6 +57,8 @@ class Sender:
         observer: Observer | None = None,
     ) -> None:
         self.config = config
+        if len(registry) > V0.max_topics:
+            raise ConfigError(f"{len(registry)} topics; version 0 carries {V0.max_topics}, version 1 up to 240")
         self.registry = registry.with_options(config.topic_options)
         self.src_id = config.src_id()
         self.stats = SenderStats()
@@ -349,6 +334,7 @@ class Sender:
         self._changed(now)
         stats = self.stats
         stats.packets += 1
+        stats.air["new"] += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
         self._observe(SentPacket(data, packet, tuple(record), now))

@@ -16,10 +16,12 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from math import isnan, nan
 from threading import Lock
+from typing import get_args
 
 from gr_ros2.errors import RunError
 from gr_ros2.link.events import (
     Accepted,
+    AirKind,
     Delivered,
     Lost,
     Missed,
@@ -30,7 +32,7 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.outcome import Row, arrived
 from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
@@ -100,6 +102,7 @@ class _Source:
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
+    air: Counter[str] = field(default_factory=Counter)
     last_received: int = -1
     in_air: deque[tuple[int, bytes]] = field(default_factory=deque)
     waiting: dict[bytes, deque[tuple[int, tuple[SentEntry, ...]]]] = field(default_factory=dict)
@@ -188,23 +191,27 @@ class Ledger:
 
     def packets(self) -> dict[str, int]:
         """Packet counts: ``sent``; ``received`` (decoded by the sink); ``crc_failed``; ``malformed`` (every other
-        refusal of the decoder), and each refusal by its own name as ``rejected_<kind>``."""
+        refusal of the decoder), and each refusal by its own name as ``rejected_<kind>``; where some were spent on
+        something else than new messages, ``air_<kind>`` for each of :data:`gr_ros2.link.events.AirKind`."""
         with self._lock:
             crc_failed = self._rejected["crc"]
             rejected = sum(self._rejected.values())
+            air = sum((source.air for source in self._sources.values()), Counter[str]())
+            kinds = {f"air_{kind}": air[kind] for kind in get_args(AirKind)}
             return {
                 "sent": sum(source.packets_sent for source in self._sources.values()),
                 "received": self._packets_handed_up - rejected,
                 "crc_failed": crc_failed,
                 "malformed": rejected - crc_failed,
                 **{f"rejected_{kind}": count for kind, count in sorted(self._rejected.items())},
+                **(kinds if air.total() > air["new"] else {}),
             }
 
     def totals(self) -> tuple[int, int]:
         """Messages sent and delivered so far."""
         with self._lock:
             topics = self._topics.values()
-            return sum(topic.sent for topic in topics), sum(topic.rows[Row.DELIVERED] for topic in topics)
+            return sum(topic.sent for topic in topics), sum(arrived(topic.rows) for topic in topics)
 
     def rows(self) -> dict[tuple[int, int], Counter[str]]:
         """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
@@ -257,6 +264,7 @@ class Ledger:
     def _sent(self, source: _Source, event: SentPacket) -> None:
         ordinal = source.packets_sent
         source.packets_sent += 1
+        source.air[event.kind] += 1
         for entry in event.entries:
             message = source.messages.left(entry)
             if message is not None:
@@ -282,16 +290,16 @@ class Ledger:
         if source is not None:
             message = source.messages.find(event)
             if message is not None:
-                return self._deliver(source, message, now)
+                return self._deliver(source, message, now, Row.REPAIRED if event.repaired else Row.DELIVERED)
             if source.messages.repeats(event) and source.messages.repeated(event) is None:
                 self._topic(event.src_id, event.topic_id).repeats_delivered += 1
                 return None
         self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
         return None
 
-    def _deliver(self, source: _Source, message: _Open, now: float) -> float:
+    def _deliver(self, source: _Source, message: _Open, now: float, row: Row = Row.DELIVERED) -> float:
         self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
-        self._close(source, message, Row.DELIVERED)
+        self._close(source, message, row)
         return message.t_sent
 
     def _lost(self, event: Lost) -> None:
@@ -335,8 +343,8 @@ class Ledger:
             if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
-            if topic.rows[Row.DELIVERED] != delivered:
-                self._faults.append(f"{name}: {topic.rows[Row.DELIVERED]} delivered, {delivered} have a delivery time")
+            if arrived(topic.rows) != delivered:
+                self._faults.append(f"{name}: {arrived(topic.rows)} delivered, {delivered} have a delivery time")
         if self._faults:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
@@ -369,11 +377,13 @@ def _arrived(source: _Source, digest: bytes) -> int:
 def _final_row(source: _Source, message: _Open, drained: bool) -> str:
     """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
     the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
-    behind the last packet that arrived."""
+    behind the last packet that arrived; given up where its sender repairs what is lost."""
     if message.reason:
         return message.reason
     if not message.all_sent:
         return Row.IN_FLIGHT
     if message.received >= message.total:
         return Row.NOT_TAKEN
-    return Row.LOST_FRAGMENTS if drained or message.last_packet < source.last_received else Row.IN_FLIGHT
+    if not drained and message.last_packet >= source.last_received:
+        return Row.IN_FLIGHT
+    return Row.GIVEN_UP if source.air["repair"] else Row.LOST_FRAGMENTS

@@ -90,6 +90,17 @@ class TopicResult:
 
 
 @dataclass(frozen=True, config=_READ)
+class ReceiverResult:
+    """What a further receiver of the same sender got.
+
+    :param number: from 2; the first one's topics are those of the result itself
+    """
+
+    number: _Count
+    topics: tuple[TopicResult, ...]
+
+
+@dataclass(frozen=True, config=_READ)
 class Result:
     """One experiment.
 
@@ -103,6 +114,7 @@ class Result:
     :param counters: of the blocks, by name: what was dropped and why
     :param incomplete: what was written or shown beside this result and is not whole, such as a capture on a full disk:
         one line each, with why and how much is missing. The numbers here are whole all the same.
+    :param receivers: further receivers of the same sender
     """
 
     scenario: str
@@ -116,6 +128,7 @@ class Result:
     interrupted: bool = False
     counters: dict[str, Any] = field(default_factory=dict)
     incomplete: tuple[str, ...] = ()
+    receivers: tuple[ReceiverResult, ...] = ()
 
 
 def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:

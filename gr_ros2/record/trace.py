@@ -105,11 +105,11 @@ class PacketLog:
         self._seq, self._entries = array("H"), array("B")
         self._serial = array("q")
         self._topic_id = array("B")
-        self._name, self._index, self._total = array("H"), array("L"), array("L")
+        self._name, self._index, self._total = array("L"), array("L"), array("L")
 
     def sent(self, event: SentPacket) -> None:
         """A packet left the sender."""
-        for entry, written in zip(event.entries, event.packet.entries, strict=True):
+        for entry, written in zip(event.entries, event.packet.entries, strict=False):  # a repair has none of its own
             self._serial.append(-1 if entry.repeat else entry.serial)
             self._topic_id.append(entry.topic_id)
             self._name.append(written.name)

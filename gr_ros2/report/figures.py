@@ -140,9 +140,9 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
 
 
 def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
-    """The ledger rows that occurred: delivered first, in_flight last, the others by name between them."""
+    """The ledger rows that occurred: delivered and repaired first, in_flight last, the others by name between them."""
     found = {row for ledger in ledgers for row, count in ledger.items() if count}
-    return sorted(found, key=lambda row: (row != Row.DELIVERED, row == Row.IN_FLIGHT, row))
+    return sorted(found, key=lambda row: (row != Row.DELIVERED, row != Row.REPAIRED, row == Row.IN_FLIGHT, row))
 
 
 def row_colour(row: str) -> str:

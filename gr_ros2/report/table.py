@@ -5,7 +5,7 @@ Law: a number that does not apply shows as a dash.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rich import box
@@ -49,11 +49,11 @@ def summary_grid(results: Sequence[Result]) -> Grid:
             tuple(
                 (
                     result.scenario,
-                    topic.topic,
+                    name,
                     *_table_6(result, topic),
                     *(milliseconds(value) for value in (topic.latency_s.p50, topic.latency_s.p95, topic.latency_s.p99)),
                 )
-                for topic in result.topics
+                for name, topic in _at_every_receiver(result)
             )
             for result in results
         ),
@@ -78,12 +78,19 @@ def paper_grid(results: Sequence[Result]) -> Grid:
 
 def ledger_grid(result: Result) -> Grid:
     """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
-    rows = [Row.DELIVERED, *sorted({row for topic in result.topics for row, count in topic.ledger.items() if count})]
-    rows = list(dict.fromkeys(rows))
-    lines = (
-        (topic.topic, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for topic in result.topics
-    )
+    topics = list(_at_every_receiver(result))
+    found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
+    first = [Row.DELIVERED, *(row for row in (Row.REPAIRED,) if row in found)]
+    rows = list(dict.fromkeys([*first, *sorted(found)]))
+    lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
     return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))
+
+
+def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
+    """Every topic with what to call it, those of further receivers behind those of the first."""
+    yield from ((topic.topic, topic) for topic in result.topics)
+    for receiver in result.receivers:
+        yield from ((f"{topic.topic} at receiver {receiver.number}", topic) for topic in receiver.topics)
 
 
 def as_table(grid: Grid) -> Table:

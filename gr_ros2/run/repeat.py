@@ -19,7 +19,10 @@ def _reseeded(scenario: Scenario, k: int) -> Scenario:
     """The same with every seed so much higher."""
     sim, channel = replaced(scenario.sim, seed=scenario.sim.seed + k), _reseeded_channel(scenario.channel, k)
     back = scenario.back and replace(scenario.back, channel=_reseeded_channel(scenario.back.channel, k))
-    return replace(scenario, seed=scenario.seed + k, sim=sim, channel=channel, back=back)
+    reports = scenario.reports and replace(scenario.reports, channel=_reseeded_channel(scenario.reports.channel, k))
+    receivers = tuple(_reseeded_channel(other, k) for other in scenario.receivers)
+    seed = scenario.seed + k
+    return replace(scenario, seed=seed, sim=sim, channel=channel, back=back, reports=reports, receivers=receivers)
 
 
 def _reseeded_channel(channel: ChannelConfig, k: int) -> ChannelConfig:

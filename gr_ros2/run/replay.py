@@ -17,7 +17,7 @@ from typing import Literal
 from gr_ros2.config import TopicOptions, replaced
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
-from gr_ros2.registry import MAX_TOPICS, Registry
+from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
 from gr_ros2.run.outcome import Outcome, Progress
@@ -101,9 +101,10 @@ def _made_for(
     rows = {name: recorded[name].info.type_name for name in topics or recorded}
     if not rows:
         raise ConfigError("; ".join([f"{source}: has no topics that a link can carry", *contents.remarks]))
-    if len(rows) > MAX_TOPICS:
+    most = scenario.ros_source.wire_format.max_topics
+    if len(rows) > most:
         raise ConfigError(
-            f"{source}: has {len(rows)} topics, and a link carries {MAX_TOPICS}; choose with --topics from "
+            f"{source}: has {len(rows)} topics, and a link carries {most}; choose with --topics from "
             f"{', '.join(recorded)}"
         )
     names = {name: registry[topic_id].name for name, topic_id in source_names(scenario, registry).items()}

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, AnyLink, OneWay, Traffic, build
+from gr_ros2.config import STRICT, AnyLink, ChannelConfig, OneWay, OverChannel, Seconds, Traffic, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
@@ -66,18 +66,34 @@ class Back(OneWay):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class Reports(OverChannel):
+    """What receivers say of what they hear, on a channel of their own (version 1).
+
+    :param channel: what lies between them and the sender; what is not set is as on the way there, but for the seed
+    :param delay_s: s that a report takes beside its airtime
+    """
+
+    delay_s: Seconds = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Scenario(Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator; its seed is the scenario's unless given
     :param back: the way back, where both robots talk; null = one way only
+    :param reports: the way back for reports alone (version 1, simulated time); null = there is none
+    :param receivers: channels of further receivers of the same sender, in simulated time; what is not set in one is as
+        in ``channel``, but for the seed
     :param seed: of the simulator, the channel and the sender
     """
 
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     sim: SimSettings = Field(default_factory=SimSettings)
     back: Back | None = None
+    reports: Reports | None = None
+    receivers: tuple[ChannelConfig, ...] = ()
     localhost_only: bool | Auto = True
 
     @model_validator(mode="after")
@@ -93,6 +109,12 @@ class Scenario(Experiment, Traffic, AnyLink):
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
         if self.back is not None:
             self._check_back(self.back)
+        if self.reports is not None and (not self.version or self.back is not None):
+            raise ValueError("reports: version 0 has none, and with back they go along; leave reports out")
+        if self.receivers and self.back is not None:
+            raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
+        if (self.reports is not None or self.receivers) and not self.simulated:
+            raise ValueError("reports and receivers are for simulated time; set time to samples or packets")
         return self
 
     def _check_back(self, back: Back) -> None:
@@ -111,7 +133,7 @@ class Scenario(Experiment, Traffic, AnyLink):
         """The one-way scenarios this one is made of: itself, or the way there and the way back."""
         if self.back is None:
             return (self,)
-        there = replace(self, back=None)
+        there = replace(self, back=None, reports=None, receivers=())
         back = {item.name: getattr(self.back, item.name) for item in fields(self.back)}
         return there, replace(there, **back)
 
@@ -151,6 +173,12 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
     for part in ("sim", "channel"):
         if isinstance(block := values.get(part, {}), Mapping) and "seed" in values:
             values[part] = {"seed": values["seed"], **block}
+    channel = values.get("channel", {})
+    if isinstance(channel, Mapping):
+        if isinstance(reports := values.get("reports"), Mapping):
+            values["reports"] = {**reports, "channel": _another(channel, reports.get("channel", {}), 1)}
+        if isinstance(receivers := values.get("receivers"), list | tuple):
+            values["receivers"] = [_another(channel, given, 2 + n) for n, given in enumerate(receivers)]
     if isinstance(values.get("back"), Mapping):
         back = _way_back(values)
         values["back"] = {**back, **with_shared(back, shared, f"{prefix}back.")}
@@ -167,10 +195,17 @@ def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
         kept = {key: value for key, value in parts[end].items() if key not in _OWN_KEYS}
         graph = {key: parts[other][key] for key in _GRAPH_KEYS if key in parts[other]}
         back[end] = {**kept, **graph, **back.get(end, {})}
-    seed = parts["channel"].get("seed", 0)
-    another = {"seed": seed + _BACK_SEED} if isinstance(seed, int) else {}
-    back["channel"] = {**parts["channel"], **another, **back.get("channel", {})}
+    back["channel"] = _another(parts["channel"], back.get("channel", {}), 1)
     return back
+
+
+def _another(channel: Mapping[str, Any], given: Any, place: int) -> Any:
+    """A further channel: what is not set is as in the first, but for the seed."""
+    if not isinstance(given, Mapping):
+        return given  # build() says what is wrong with it
+    seed = channel.get("seed", 0)
+    own = {"seed": seed + place * _BACK_SEED} if isinstance(seed, int) else {}
+    return {**channel, **own, **given}
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **settings: Any) -> Scenario:

@@ -11,20 +11,22 @@ of time.
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError
-from gr_ros2.gr.ends import message_codec
+from gr_ros2.gr.ends import Start, make_endpoint
 from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.endpoint import Endpoint, EndpointV0
+from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.v1.settings import NOBODY
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -32,8 +34,10 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.settings import SimSettings
+from gr_ros2.wire import BROADCAST
 
 _LONGEST_GAP_S = 30 * 86400.0
 """s between two neighbouring messages of a recording. A longer one is a stamp that was never set, and the link would be
@@ -58,8 +62,8 @@ class Landed:
     data: bytes
 
 
-Happening = tuple[float, "Way", SenderEvent | ReceiverEvent | Landed]
-"""When, s after the start; in which direction; and what."""
+Happening = tuple[float, "Way | Branch", SenderEvent | ReceiverEvent | Landed]
+"""When, s after the start; in which direction, or at which further receiver; and what."""
 Air = Callable[[bytes, float], Iterable[bytes]]
 """What becomes of a packet whose airtime is over now: what comes out of the receiver."""
 
@@ -148,9 +152,13 @@ def simulate(
     recorder = Recorder(registry, {src_id: scenario.ros_source.namespace}, topics)
     losses = PduLosses(scenario.channel)
     ends = make_ends([scenario], registry, codec)
-    way = Way(scenario, *ends, phy.airtime(), messages or offered(scenario, registry))
+    way = Way(scenario, (ends[0], ends[1]), phy.airtime(), messages or offered(scenario, registry))
     way.air = lambda data, now: [data] if losses.passes(now) else ()
-    for happening in EventLoop([way]).run():
+    ways = [way]
+    if scenario.reports is not None:
+        heard = PduLosses(scenario.reports.channel)
+        ways += report_ways(scenario, ends[:2], phy.airtime(), [lambda data, now: [data] if heard.passes(now) else ()])
+    for happening in EventLoop(ways).run():
         tell(recorder, happening, overhead_s)
         if on_packet is not None and isinstance(happening[2], SentPacket):
             on_packet(happening[2])
@@ -175,31 +183,66 @@ def tell(observer: LinkObserver, happening: Happening, overhead_s: float = 0.0) 
 
 @dataclass(frozen=True)
 class End:
-    """One robot's end, and what its sending half has done and nobody has heard of yet."""
+    """One robot's end, what its sending half has done and nobody has heard of yet, and its id, -1 for none."""
 
     endpoint: Endpoint
     told: list[SenderEvent]
+    src_id: int = -1
 
 
-def make_ends(ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None) -> tuple[End, End]:
-    """The two ends of a link: each sends in one direction and receives in the other, as far as there are two.
+def make_ends(ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None) -> list[End]:
+    """The ends of a link: the first sends, the others hear it; where there are two ways, the second sends too.
 
     :param ways: one scenario per direction
     :param codec: of all messages; None makes it where ``compression`` is on
     """
     there, back = ways[0], ways[1] if len(ways) > 1 else None
-    return _end(registry, there, back, codec), _end(registry, back, there, codec)
+    reports = there.reports is not None or back is not None
+    own_id = there.ros_source.src_id()
+    ends = [_end(registry, there, back, codec, Start(there.seed + 1, reports=reports))]
+    for number in range(1 + len(there.receivers)):
+        sink = there.ros_sink
+        if reports and back is None and sink.robot_id in (AUTO, own_id):
+            sink = replace(sink, robot_id=_free_id(own_id, number))
+        hears = replace(there, ros_sink=sink)
+        ends.append(_end(registry, back, hears, codec, Start(there.seed + 1, reports=reports)))
+    return ends
 
 
-def _end(registry: Registry, out: Scenario | None, back: Scenario | None, codec: MessageCodec | None) -> End:
+def _free_id(taken: int, number: int) -> int:
+    """A source id of a receiver that has none of its own and reports."""
+    return BROADCAST - 1 - number - (BROADCAST - 1 - number <= taken)
+
+
+def _end(
+    registry: Registry, out: Scenario | None, back: Scenario | None, codec: MessageCodec | None, start: Start
+) -> End:
     source, sink = None if out is None else out.ros_source, None if back is None else back.ros_sink
-    to_air, from_air = (
-        codec or message_codec(config, registry) if config is not None else None for config in (source, sink)
-    )
     told: list[SenderEvent] = []
     rng = None if out is None else random.Random(out.seed)
-    endpoint = EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=told.append)
-    return End(endpoint, told)
+    endpoint = make_endpoint(registry, source, sink, start=start, codec=codec, rng=rng, observer=told.append)
+    own = NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id
+    src_id = own if source is None else source.src_id()
+    return End(endpoint, told, src_id)
+
+
+class Branch:
+    """A further end that hears a way.
+
+    :param air: what becomes of packets on the way to it
+    :param number: among those that hear the same sender, from 1
+    """
+
+    def __init__(self, way: Way, receiver: End, air: Air, number: int) -> None:
+        self.src_id = way.src_id
+        self.receiver = receiver
+        self.air = air
+        self.number = number
+
+    def arrive(self, data: bytes, now: float) -> Iterator[Happening]:
+        """A packet comes out of its receiver."""
+        for event in self.receiver.endpoint.receive(data, now):
+            yield now, self, event
 
 
 class Way:
@@ -207,19 +250,33 @@ class Way:
 
     :param airtime: of one packet, s; 0 for a PHY without samples
     :param messages: in the order of time
+    :param src_id: of the end that sends; None: the scenario's source
+    :param delay_s: s from the end of a packet's airtime to its arrival
     :raises ConfigError: for time ``unthrottled``, which has no times
     """
 
     def __init__(
-        self, scenario: Scenario, sender: End, receiver: End, airtime: float, messages: Iterator[Offered]
+        self,
+        scenario: Scenario,
+        ends: tuple[End, End],
+        airtime: float,
+        messages: Iterator[Offered],
+        *,
+        src_id: int | None = None,
+        delay_s: float = 0.0,
     ) -> None:
         if scenario.time == "unthrottled":
             raise ConfigError(
                 "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
                 "be simulated; set time to real, samples or packets"
             )
-        self.sender, self.receiver = sender, receiver
-        self.src_id = scenario.ros_source.src_id()
+        self.sender, self.receiver = ends
+        self.number = 0
+        self.src_id = scenario.ros_source.src_id() if src_id is None else src_id
+        self.branches: list[Branch] = []
+        """Who else hears it; only where ``air`` is set."""
+        self.over = False
+        """Whether it is over, as far as this end can tell: one that answers may yet have something to say."""
         self.air: Air | None = None
         """What becomes of packets; None leaves that to who hears of them (:class:`Landed`)."""
         self.due = 0.0
@@ -234,8 +291,10 @@ class Way:
         self._paced = self._clock is not None
         self._drain = scenario.drain_s
         self._until = scenario.duration_s
+        self._delay_s = delay_s
+        self._delayed: deque[tuple[float, bytes]] = deque()
         if self._paced:
-            sender.endpoint.use_credit()
+            self.sender.endpoint.use_credit()
 
     @property
     def empty(self) -> bool:
@@ -259,13 +318,16 @@ class Way:
     def wake(self, now: float) -> None:
         """The sending end has been called: it may have something earlier than it said."""
         at = self.sender.endpoint.next_timeout()
-        if at is not None and self.due < inf:
+        if at is not None and (self.due < inf or self.sender.endpoint.answers):
             self.due = min(self.due, max(now, at))
+            self.over = False
 
     def _let_through(self, now: float) -> Iterator[Happening]:
         if self._clock is not None:
             for data in self._clock.due(now):
-                yield from self._land(data, now)
+                self._delayed.append((now + self._delay_s, data))
+            while self._delayed and self._delayed[0][0] <= now:
+                yield from self._land(self._delayed.popleft()[1], now)
             credits = self._clock.grants(now)
             if self._paced:
                 self.sender.endpoint.credit(credits)
@@ -276,6 +338,9 @@ class Way:
         else:
             for arrived in self.air(data, now):
                 yield from self.arrive(arrived, now)
+            for branch in self.branches:
+                for arrived in branch.air(data, now):
+                    yield from branch.arrive(arrived, now)
 
     def _submit(self, now: float) -> None:
         while self._coming is not None and self._coming.t <= now:
@@ -300,21 +365,41 @@ class Way:
     def _next(self, now: float) -> float:
         """When something may happen next; infinite when all is done, or the time to drain is over."""
         coming = self._coming
-        if coming is None and now >= self.duration_s and self.empty:
+        answers = self.sender.endpoint.answers
+        done = coming is None and now >= self.duration_s and self.empty
+        if done and not answers:
+            self.over = True
             return inf
         clock = self._clock.next_timeout(now) if self._clock is not None else None
-        times = (None if coming is None else coming.t, clock, self.sender.endpoint.next_timeout())
+        delayed = self._delayed[0][0] if self._delayed else None
+        times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_timeout())
         soonest = min((at for at in times if at is not None), default=inf)
         if soonest == inf and now < self.duration_s:
             soonest = self.duration_s  # nothing more to come before the end of the run
         soonest = max(now, soonest)
-        return inf if coming is None and soonest > self.duration_s + self._drain else soonest
+        self.over = done or (coming is None and soonest > self.duration_s + self._drain)
+        return inf if self.over and not answers else soonest
+
+
+def report_ways(scenario: Scenario, ends: Sequence[End], airtime: float, airs: Sequence[Air]) -> list[Way]:
+    """The ways by which receivers report to the one that they hear.
+
+    :param ends: it, and the receivers
+    :param airs: one per receiver
+    """
+    delay_s = 0.0 if scenario.reports is None else scenario.reports.delay_s
+    ways = []
+    for end, air in zip(ends[1:], airs, strict=True):
+        way = Way(scenario, (end, ends[0]), airtime, iter(()), src_id=end.src_id, delay_s=delay_s)
+        way.air = air
+        ways.append(way)
+    return ways
 
 
 class EventLoop:
     """The directions of one link on one clock.
 
-    :param ways: one, or the two between the same ends
+    :param ways: each with the ends that it joins
     """
 
     def __init__(self, ways: Sequence[Way]) -> None:
@@ -323,8 +408,8 @@ class EventLoop:
 
     def run(self) -> Iterator[Happening]:
         """Everything that happens, in the order of time, until nothing is left or the time to drain is over. Once."""
-        while (due := min(way.due for way in self._ways)) < inf:
-            self.now = min(due, *(self._timers()))
+        while not all(way.over for way in self._ways) and (due := min(way.due for way in self._ways)) < inf:
+            self.now = min([due, *self._timers()])
             yield from self._expire()
             for way in self._ways:
                 if way.due <= self.now:
@@ -332,14 +417,19 @@ class EventLoop:
 
     def _timers(self) -> Iterator[float]:
         """When an end that hears of its packets at once has something to do, other than to send."""
-        for way in self._ways:
-            at = way.receiver.endpoint.next_timeout() if way.air is not None else None
+        for ear in self._ears():
+            at = ear.receiver.endpoint.next_timeout()
             yield inf if at is None or at <= self.now else at
 
     def _expire(self) -> Iterator[Happening]:
+        for ear in self._ears():
+            yield from self._heard((self.now, ear, event) for event in self._overdue(ear.receiver.endpoint))
+
+    def _ears(self) -> Iterator[Way | Branch]:
         for way in self._ways:
             if way.air is not None:
-                yield from self._heard((self.now, way, event) for event in self._overdue(way.receiver.endpoint))
+                yield way
+                yield from way.branches
 
     def _overdue(self, endpoint: Endpoint) -> list[ReceiverEvent]:
         at = endpoint.next_timeout()

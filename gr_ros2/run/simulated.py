@@ -17,19 +17,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.guard import Guard
+from gr_ros2.link.events import Delivered, SenderEvent
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
-from gr_ros2.record.result import Result
+from gr_ros2.record.result import ReceiverResult, Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.losstable import packet_losses
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
-from gr_ros2.run.simulate import End, EventLoop, Happening, Landed, Way, make_ends, offered, tell
+from gr_ros2.run.simulate import (
+    Branch,
+    End,
+    EventLoop,
+    Happening,
+    Landed,
+    Way,
+    make_ends,
+    offered,
+    report_ways,
+    tell,
+)
 from gr_ros2.run.watch import LiveRun, Onlookers
 
 if TYPE_CHECKING:
@@ -73,33 +86,39 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        recorder = Recorder(
-            registry,
-            {way.ros_source.src_id(): way.ros_source.namespace for way in ways},
-            {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
-            on_delivery=None if bag is None else bag.take,
-        )
+        recorder = _recorder(registry, ways, None if bag is None else bag.take)
         onlookers = onlookers or Onlookers(apart=False)
         ears = Observers[LinkObserver]()
         recorded = ears.add(recorder, needed=True)
         ears.add(onlookers)
         ends = make_ends(ways, registry)
         directions = [
-            _Direction(way, registry, phy, pair) for way, phy, pair in zip(ways, phys, (ends, ends[::-1]), strict=False)
+            _Direction(way, registry, phy, (first, second))
+            for way, phy, (first, second) in zip(ways, phys, (ends[:2], ends[1::-1]), strict=False)
         ]
+        others = [_recorder(registry, ways) for _ in scenario.receivers]
+        loop = EventLoop(
+            [*(direction.way for direction in directions), *_further(scenario, phys[0], directions[0], ends)]
+        )
         clock = _Clock()
         onlookers.run_started(_live_run(scenario, registry, recorder, clock))
         reported, progress = 0.0, Guard("progress")
-        for happening in _whole(directions):
+        for happening in _whole(loop, directions):
             clock.now = happening[0]
-            tell(ears, happening)
+            number = happening[1].number
+            if isinstance(happening[2], SenderEvent):
+                for other in others:
+                    tell(other, happening)
+            tell(others[number - 1] if number else ears, happening)
             recorded.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *recorder.progress()))
         recorded.check()
     played = max(direction.way.duration_s for direction in directions)
-    topics = recorder.finish(played, played, all(direction.way.empty for direction in directions))
+    drained = all(direction.way.empty for direction in directions)
+    topics = recorder.finish(played, played, drained)
+    more = tuple(ReceiverResult(place, other.finish(played, played, drained)) for place, other in enumerate(others, 2))
     there, *back = (direction.counters() for direction in directions)
     result = Result(
         scenario=scenario.name,
@@ -107,6 +126,7 @@ def run_simulated(
         duration_s=played,
         config=dump(scenario),
         topics=topics,
+        receivers=more,
         packets=recorder.ledger.packets(),
         phy=phy_numbers(phys[0], len(ways), recorder),
         wall_s=time.monotonic() - began,
@@ -137,6 +157,30 @@ class _Landing:
     arrived: list[bytes] | None = None
 
 
+class _Air:
+    """What a channel does to packets, one by one, for ends whose next packet depends on it."""
+
+    def __init__(self, scenario: Scenario, phy: Phy, channel: ChannelConfig) -> None:
+        self._losses = PduLosses(channel)
+        self._passage: Passage | None = None
+        self._measured: PduLosses | None = None
+        if scenario.time == "samples" and phy.has_samples:
+            from gr_ros2.phy.measure import Passage
+
+            self._passage = Passage(phy, channel)
+        else:
+            self._measured = PduLosses(packet_losses(phy, channel))
+
+    def pass_one(self, data: bytes, now: float) -> Iterator[bytes]:
+        """What comes of a packet."""
+        if self._measured is not None:
+            arrived = [data] if self._measured.passes(now) else []
+        else:
+            assert self._passage is not None
+            arrived = [packet for _, packet in self._passage.send([data])]
+        yield from (packet for packet in arrived if self._losses.passes(now))
+
+
 class _Direction:
     """One direction, and what the air does to its packets.
 
@@ -144,7 +188,7 @@ class _Direction:
     """
 
     def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
-        self.way = Way(scenario, *ends, phy.airtime(), offered(scenario, registry))
+        self.way = Way(scenario, ends, phy.airtime(), offered(scenario, registry))
         self._scenario, self._registry = scenario, registry
         self._losses = PduLosses(scenario.channel)
         self._lost_by_phy: Counter[str] = Counter()
@@ -154,7 +198,7 @@ class _Direction:
             from gr_ros2.phy.measure import Passage  # with GNU Radio
 
             self._passage = Passage(phy, scenario.channel)
-            if ends[1].endpoint.answers:
+            if ends[1].endpoint.answers or scenario.receivers:
                 self.way.air = self._packet_by_packet
         else:
             measured = PduLosses(packet_losses(phy, scenario.channel))
@@ -223,7 +267,33 @@ class _Direction:
         yield from (packet for packet in landing.arrived or () if self._losses.passes(now))
 
 
-def _whole(directions: Sequence[_Direction]) -> Iterator[Happening]:
+def _recorder(
+    registry: Registry,
+    ways: Sequence[Scenario],
+    on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
+) -> Recorder:
+    return Recorder(
+        registry,
+        {way.ros_source.src_id(): way.ros_source.namespace for way in ways},
+        {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
+        on_delivery=on_delivery,
+    )
+
+
+def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End]) -> list[Way]:
+    """Let the further receivers hear the first way, and return those by which receivers report."""
+    first.way.branches = [
+        Branch(first.way, end, _Air(scenario, phy, channel).pass_one, number)
+        for number, (end, channel) in enumerate(zip(ends[2:], scenario.receivers, strict=False), 1)
+    ]
+    if scenario.reports is None:
+        return []
+    channel = scenario.reports.channel
+    channels = [replaced(channel, seed=channel.seed + number) for number in range(len(ends) - 1)]
+    return report_ways(scenario, ends, phy.airtime(), [_Air(scenario, phy, each).pass_one for each in channels])
+
+
+def _whole(loop: EventLoop, directions: Sequence[_Direction]) -> Iterator[Happening]:
     """Everything that happens. Packets go through the flowgraph many at a time where no end answers; until the fate of
     one is known, what comes behind it waits."""
     of = {id(direction.way): direction for direction in directions}
@@ -237,7 +307,7 @@ def _whole(directions: Sequence[_Direction]) -> Iterator[Happening]:
             else:
                 yield from of[id(happening[1])].arrive(landing, happening[0])
 
-    for happening in EventLoop([direction.way for direction in directions]).run():
+    for happening in loop.run():
         _, way, event = happening
         held.append((happening, of[id(way)].land(event.data) if isinstance(event, Landed) else None))
         yield from decided()

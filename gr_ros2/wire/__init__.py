@@ -1,7 +1,7 @@
 """The wire format: packets to bytes and back, one module per version. No IO, no state.
 
 Nothing outside of here knows where a byte stands or how wide a field is: what depends on it is asked of a
-:class:`Format`. ``v0`` is the paper's (section 5).
+:class:`Format`. ``v0`` is the paper's (section 5), ``v1`` the one that repairs, seals and announces.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ from gr_ros2.wire.format import (
     Span,
 )
 from gr_ros2.wire.numbers import unwrap
+from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.v0 import V0
+from gr_ros2.wire.v1 import V1
 
 __all__ = [
     "BROADCAST",
@@ -52,6 +54,7 @@ __all__ = [
     "Packet",
     "PadError",
     "Span",
+    "TableRow",
     "TotalError",
     "VersionError",
     "WireError",
@@ -60,7 +63,7 @@ __all__ = [
     "unwrap",
 ]
 
-FORMATS: Mapping[int, Format] = {V0.version: V0}
+FORMATS: Mapping[int, Format] = {V0.version: V0, V1.version: V1}
 """By version."""
 
 

@@ -69,7 +69,7 @@ class Packet(Protocol):
 class Span(NamedTuple):
     """A stretch of a packet's bytes.
 
-    :param kind: head, ids, entry, pad or crc
+    :param kind: head, ids, entry, control, repair, pad or crc (or the tag in its place)
     :param size: bytes, an entry's own header included
     :param entry: where it is one
     """

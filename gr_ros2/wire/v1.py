@@ -27,7 +27,8 @@ from gr_ros2.errors import (
     VersionError,
     WindowError,
 )
-from gr_ros2.wire.control import Control, read_control, write_control
+from gr_ros2.wire.control import Control, Hello, read_control, write_control
+from gr_ros2.wire.format import Span
 
 VERSION = 1
 BROADCAST = 255
@@ -386,17 +387,60 @@ def _read_varint(body: bytes, position: int, end: int) -> tuple[int, int]:
 
 
 class Packet(NamedTuple):
-    """A packet that is not sealed, as a value: for tools, tests and other implementations.
+    """A packet as a value.
 
-    :param entries: of a source or control packet
+    :param body: entries of a source or control packet, as far as they can be read
     :param standing: of a repair or control packet
     :param combined: of a repair, as long as the longest body that it combines
+    :param encrypted: the body was encrypted
     """
 
     header: Header
-    entries: tuple[Entry, ...] = ()
+    body: tuple[Entry, ...] = ()
     standing: Standing | None = None
     combined: bytes = b""
+    encrypted: bool = False
+
+    @property
+    def version(self) -> int:
+        return VERSION
+
+    @property
+    def src_id(self) -> int:
+        return self.header.src_id
+
+    @property
+    def dst_id(self) -> int:
+        return self.header.dst_id
+
+    @property
+    def seq(self) -> int:
+        """Number of the source packet, or of the one at which it stands, mod 2^16."""
+        return self.header.number
+
+    @property
+    def qos(self) -> int:
+        """Of its messages; default where it carries none."""
+        return self.header.qos if self.standing is None else 0
+
+    @property
+    def hop(self) -> int:
+        return self.header.hop
+
+    @property
+    def compressed(self) -> bool:
+        """Whether any of its messages is coded."""
+        return any(entry.coded for entry in self.entries)
+
+    @property
+    def entries(self) -> tuple[Part, ...]:
+        """Messages and fragments, in their order."""
+        return tuple([entry for entry in self.body if isinstance(entry, Part)])
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """Entries that are no messages, in their order."""
+        return tuple([entry for entry in self.body if not isinstance(entry, Part)])
 
 
 def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed: bool = True) -> bytes:
@@ -406,7 +450,7 @@ def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed:
     :param fixed: whether every packet has as many; otherwise only as many as needed
     :raises EncodeError: a field out of range, or more than fits
     """
-    header, entries, standing, combined = packet
+    header, entries, standing, combined, _ = packet
     if header.sealed or (standing is None) == (header.qos == QOS_STANDING):
         raise EncodeError(f"{header}: a sealed packet, or a standing one without its window and row")
     room = body_room(packet_len, addressed=header.dst_id != BROADCAST)
@@ -441,3 +485,98 @@ def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> Packet:
     if standing.mask:
         return Packet(header, (), standing, data[start:end])
     return Packet(header, tuple(read_body(data[start:end], room)), standing)
+
+
+class FormatV1:
+    """Implements :class:`gr_ros2.wire.Format`, for packets that are neither sealed nor addressed."""
+
+    version = VERSION
+    number_bits = 16
+    id_bits = 16
+    """A message is named by the number of the packet in which it began."""
+    max_topics = MAX_TOPICS
+    max_entries = 4095
+    max_fragments = MAX_BACK
+    min_packet_len = 40
+    max_packet_len = 4095
+    entry_cost = 3
+
+    def largest_message(self, packet_len: int) -> int:  # noqa: ARG002 - the same in packets of any length
+        """Bytes of the largest message."""
+        return MAX_MESSAGE
+
+    def smallest_packet_len(self, size: int) -> int | None:
+        """Smallest packet_len that carries a message of ``size`` bytes, None where none does."""
+        return self.min_packet_len if size <= MAX_MESSAGE else None
+
+    def room(self, packet_len: int, entries: int, payload: int) -> int:
+        """Payload bytes that one more entry may have; negative where no further entry fits."""
+        return body_room(packet_len) - self.entry_cost * (entries + 1) - payload
+
+    def single_entry_payload(self, packet_len: int) -> int:
+        """Payload bytes of a packet with one entry; one more fits, since it may fill the body."""
+        return self.room(packet_len, 0, 0)
+
+    def equal_entry_payload(self, packet_len: int, entries: int) -> int:
+        """Most payload bytes of each of so many equal entries; negative where they do not fit."""
+        return body_room(packet_len) // entries - self.entry_cost
+
+    def packed_len(self, payload_lens: Sequence[int]) -> int:
+        """Bytes of a packet with entries of these payloads, padding aside."""
+        return HEADER_LEN + STANDING_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
+
+    def layout(self, packet: Packet, packet_len: int) -> list[Span]:
+        """What stands where in a packet, in the order of its bytes."""
+        header, standing = packet.header, packet.standing
+        trailer = TAG_LEN if header.sealed else CRC_LEN
+        spans = [Span("head", header.size + (standing.size if standing is not None else 0))]
+        free = body_room(packet_len, sealed=header.sealed, addressed=header.dst_id != BROADCAST)
+        for entry in packet.body:
+            size = len(write_body([entry], free))
+            spans.append(Span("entry" if isinstance(entry, Part) else "control", size, *_shown(entry)))
+            free -= size
+        if packet.combined:
+            spans.append(Span("repair", len(packet.combined)))
+        rest = packet_len - trailer - sum(span.size for span in spans)
+        return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
+
+    def encode(self, packet: Packet, packet_len: int) -> bytes:
+        """A packet's bytes, of the first start that a sender may have: see ``encode`` of this module.
+
+        :raises EncodeError: a field out of range, or more than fits
+        """
+        return encode(packet, packet_len, 0)
+
+    def decode(self, data: bytes, packet_len: int) -> Packet:
+        """Read a packet as far as it says what it is without the hello of its sender: its trailer is checked only where
+        it carries that hello itself, and of a sealed packet nothing but a hello is read.
+
+        :raises WireError: LengthError, VersionError, CrcError, WindowError, EntryBoundsError, EntryKindError,
+            VarintError or PadError
+        """
+        header = read_header(data, packet_len)
+        trailer = TAG_LEN if header.sealed else CRC_LEN
+        room = body_room(packet_len, sealed=header.sealed, addressed=header.dst_id != BROADCAST)
+        start, end = header.size, len(data) - trailer
+        standing = None
+        if header.qos == QOS_STANDING:
+            standing = read_standing(data, start, end)
+            start += standing.size
+        clear = standing is not None and standing.clear
+        if header.sealed and not clear:
+            return Packet(header, (), standing, b"", encrypted=True)
+        if standing is not None and standing.mask:
+            return Packet(header, (), standing, data[start:end])
+        body = tuple(read_body(data[start:end], room))
+        if clear and not header.sealed:
+            hello = body[0] if body else None
+            if not isinstance(hello, Hello) or crc(data[:end], session_crc(hello.boot, hello.turns)) != data[end:]:
+                raise CrcError("CRC-32 does not match that of its hello")
+        return Packet(header, body, standing)
+
+
+def _shown(entry: Entry) -> tuple[Part, ...]:
+    return (entry,) if isinstance(entry, Part) else ()
+
+
+V1 = FormatV1()

@@ -20,14 +20,14 @@ from tests.e2e.support import COMMAND, check_books, delivered_bag, set_options
 from tests.middleware.support import LATCHED, Peer, message, same
 from tests.waiting import wait_for
 
-PEER = Path(__file__).parents[1] / "middleware" / "dds_peer.py"
 ODOM, GRID = "nav_msgs/msg/Odometry", "nav_msgs/msg/OccupancyGrid"
 
 
 @contextmanager
 def subscriber(domain: int, topic: str, type_name: str) -> Iterator[Peer]:
     """Another process on a graph; it adapts to what it finds there."""
-    command = [sys.executable, str(PEER), str(domain), topic, type_name, "sub", "adapt", "adapt", "1000"]
+    words = [str(domain), topic, type_name, "sub", "adapt", "adapt", "1000"]
+    command = [sys.executable, "-m", "tests.middleware.dds_peer", *words]
     peer = Peer(command, {"ROS_LOCALHOST_ONLY": "1"})
     try:
         wait_for(lambda: peer.ready, "the subscriber's start")

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from gr_ros2.errors import WireError
+from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.decoder import RepairDecoder
-from gr_ros2.link.v1.events import Delivered
 from gr_ros2.link.v1.gf256 import coefficient
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
 from gr_ros2.wire import v1
@@ -136,7 +136,7 @@ def test_the_second_decoder_understands_a_whole_link(mode: SealMode) -> None:
         data = one.slot(now)
         if data is None or (rng.random() < 0.4 and index > 20):
             continue
-        two.end.receive(data, now)
+        two.receive(data, now)
         read = second.read_packet(data, 64, one.boot, newest, key=KEY, encrypts=mode == "encrypt")
         newest = max(newest, int(str(read["number"])))
         body = read["body"]

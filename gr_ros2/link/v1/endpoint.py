@@ -10,21 +10,40 @@ row once per number; no clock, no randomness, no IO: time, boot number and store
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from math import inf
+from typing import Any
 
+from gr_ros2.config import QueuePolicy
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.codec import MessageCodec
-from gr_ros2.link.v1.events import AirKind, Event, Gone, Met, Rejected, SentPacket, SentPart
+from gr_ros2.link.events import (
+    AirKind,
+    Delivered,
+    Gone,
+    Lost,
+    Met,
+    Missed,
+    Received,
+    ReceiverEvent,
+    Rejected,
+    SenderEvent,
+    SentEntry,
+    SentPacket,
+)
+from gr_ros2.link.outcome import Row
+from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
-from gr_ros2.link.v1.settings import Settings
+from gr_ros2.link.v1.settings import NOBODY, Settings
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import Registry
+from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
     REPORT_LEN,
@@ -34,7 +53,7 @@ from gr_ros2.wire.control import (
     Hello,
     Report,
 )
-from gr_ros2.wire.table import Row
+from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.v1 import (
     BROADCAST,
     MAX_TOPICS,
@@ -42,6 +61,7 @@ from gr_ros2.wire.v1 import (
     TABLE_TOPIC,
     Entry,
     Header,
+    Packet,
     Standing,
     body_room,
     read_body,
@@ -53,6 +73,8 @@ from gr_ros2.wire.v1 import (
 
 FORCED = 20
 """New packets after which a report that found no room goes by itself: 5 % of the slots."""
+LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
+"""Settings that may change while it runs; others of a sending block that do not concern version 1 are left out."""
 _INTERVALS = 15
 _POLL_S = 0.02
 """s after which a thrifty sender with doubts thinks again."""
@@ -69,7 +91,7 @@ class Endpoint:
     :param rows: topics of robots that announce none
     :param heard: what ``save`` stored before this start
     :param save: stores how far a robot was heard; needed where ``keys`` are to keep replays out after a restart
-    :param observer: called with every Event, in order
+    :param observer: called with every SenderEvent, in order
     """
 
     def __init__(
@@ -80,23 +102,19 @@ class Endpoint:
         boot: int,
         keys: Keys | None = None,
         codec: MessageCodec | None = None,
-        decoder_for: Callable[[tuple[Row, ...]], MessageCodec] | None = None,
-        rows: tuple[Row, ...] = (),
+        decoder_for: Callable[[tuple[TableRow, ...]], MessageCodec] | None = None,
+        rows: tuple[TableRow, ...] = (),
         heard: Mapping[int, tuple[int, int]] | None = None,
         save: Save | None = None,
-        observer: Callable[[Event], None] | None = None,
+        observer: Callable[[SenderEvent], None] | None = None,
     ) -> None:
         self.settings = settings
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
         if topics is not None and len(topics) > MAX_TOPICS:
             raise ConfigError(f"{len(topics)} topics; at most {MAX_TOPICS}")
-        self.rejected: Counter[str] = Counter()
-        """Packets that could not be used, by kind of WireError."""
-        self.dropped: Counter[str] = Counter()
-        """Packets that do not concern us: ``own``, ``not_for_us``; ``early`` ones were kept until a hello came."""
-        self.air: Counter[AirKind] = Counter()
-        """Packets sent, by what they were spent on."""
+        self.received = ReceiverStats()
+        """What arrived and what did not."""
         self._observer = observer
         self._decoder_for = decoder_for
         self._rows = rows
@@ -106,11 +124,16 @@ class Endpoint:
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
         self._trailer = self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
-        self.window = RepairWindow(settings.repair or "idle", self._room, settings.expected_loss)
+        self.window = RepairWindow(
+            "idle" if settings.repair == AUTO else settings.repair, self._room, settings.expected_loss
+        )
         self.neighbours = Neighbours(
             (settings.src_id, boot), settings, self.keys, heard=heard or {}, save=save, inbox=self._inbox
         )
-        self._events: list[Event] = []
+        self.topics = topics
+        """What it sends."""
+        self._speaks = bool(topics) or settings.hears
+        self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._slot = -inf
         self._credits: int | None = None
@@ -126,26 +149,102 @@ class Endpoint:
 
     # ---- sending
 
+    @property
+    def answers(self) -> bool:
+        """Whether what it receives can change what it sends."""
+        return self._speaks
+
+    @property
+    def sent(self) -> SenderStats:
+        """What left and what did not."""
+        return self.outbox.stats
+
+    @property
+    def idle(self) -> bool:
+        """Whether no message waits, and nothing that has left is worth repairing."""
+        mending = self.paced and self._mode() != "off" and self.window.unconfirmed(self._now)
+        return self.outbox.idle and not mending
+
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message."""
+        if self.topics is None or not 0 <= topic_id < len(self.topics):
+            raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
         self.outbox.submit(topic_id, payload, now)
+
+    def missed(self, topic_id: int, total: int) -> None:
+        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
+        new = total - self.sent.missed[topic_id]
+        if new > 0:
+            self.sent.missed[topic_id] = total
+            self._tell(Missed(topic_id, new))
+
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+        """Policy and deadline (s, 0 none) of a topic's queue."""
+        return self.outbox.queue(topic_id)
+
+    def depth(self, topic_id: int) -> int:
+        """Messages of a topic that may wait, 0 unbounded."""
+        return self.outbox.depth(topic_id)
+
+    def room(self, topic_id: int) -> bool:
+        """Whether a message of that topic could be submitted without pushing another out."""
+        return self.outbox.room(topic_id)
+
+    def queued(self) -> dict[int, int]:
+        """Messages waiting or under way, per topic id."""
+        return self.outbox.queued()
+
+    def reconfigure(self, **changes: Any) -> None:
+        """Change settings while running.
+
+        :raises ConfigError: for a value out of range, or that cannot change now
+        """
+        changes = {name: value for name, value in changes.items() if name in LIVE_SETTINGS}
+        settings = replace(self.settings, **changes)
+        if (settings.dst_id == BROADCAST) != (self.settings.dst_id == BROADCAST):
+            raise ConfigError(f"dst_id = {settings.dst_id}: packets stay addressed, or broadcast, until the next start")
+        self.settings = settings
+        self.outbox.reconfigure(settings)
+        if "packet_rate" in changes:
+            self._slot = -inf
+
+    def knows(self, src_id: int) -> bool:
+        """Whether a robot has a place at present."""
+        return self.neighbours.get(src_id) is not None
+
+    def rows(self, src_id: int) -> Mapping[int, TableRow]:
+        """What a robot's topic ids mean, as far as it has announced them."""
+        neighbour = self.neighbours.get(src_id)
+        return {} if neighbour is None else neighbour.inbox.rows
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory in use for incomplete messages."""
+        return sum(neighbour.inbox.held for neighbour in self.neighbours)
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """Book a message that was given out but did not come onto the ROS graph. It may come again when it is kept."""
+        neighbour = self.neighbours.get(event.src_id)
+        if neighbour is not None:
+            neighbour.inbox.marks.pop(event.topic_id, None)
+        self.received.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if self._credits == 0 or now < self._slot:
+        if self.out_of_credit or now < self._slot or not self._speaks:
             return None
         data = self._compose(now)
         if data is None:
             return None
-        if self._credits is not None:
+        if self._credits is not None and not self.unpaced:
             if self._busy_since < inf:
                 self._intervals.append(now - self._busy_since)
             self._credits -= 1
             self._busy_since = now if not self._credits and not self.outbox.idle else inf
-        rate = self.settings.packet_rate
-        if rate > 0:
+        if rate := self._rate:
             # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
             self._slot = max(self._slot, now - 1 / rate) + 1 / rate
         return data
@@ -157,42 +256,58 @@ class Endpoint:
 
     def credit(self, packets: int = 1) -> None:
         """The PHY can take so many further packets."""
-        self._credits = (self._credits or 0) + packets
+        self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
 
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit."""
-        return self._credits == 0
+        return self._credits == 0 and not self.unpaced
+
+    @property
+    def unpaced(self) -> bool:
+        """Whether every packet leaves as soon as there is one, whatever the PHY grants."""
+        return self.settings.packet_rate == 0
+
+    @property
+    def _rate(self) -> float:
+        """Packets/s at most, 0 without limit."""
+        return 0.0 if self.settings.packet_rate == AUTO else self.settings.packet_rate
 
     def follow(
         self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
-    ) -> None:
-        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open."""
-        if self.outbox.follow(topic_id, reliable=reliable, depth=depth, lifespan_s=lifespan_s, period_s=period_s):
+    ) -> bool:
+        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+
+        :return: whether that changed its queue
+        """
+        before, table = self.queue(topic_id), self.outbox.digest
+        self.outbox.follow(topic_id, reliable=reliable, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
+        if self.outbox.digest != table:
             self._talk.hurry(self._now)
+        return self.queue(topic_id) != before
 
     @property
     def interval(self) -> float:
         """s from one packet to the next while busy; 0 where not known."""
-        if self.settings.packet_rate > 0:
-            return 1 / self.settings.packet_rate
+        if self._rate:
+            return 1 / self._rate
         return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
 
     @property
     def paced(self) -> bool:
         """Whether something says when there is a slot, and so when one is idle."""
-        return self._credits is not None or self.settings.packet_rate > 0
+        return self._rate > 0 or (self._credits is not None and not self.unpaced)
 
     # ---- receiving
 
-    def receive(self, data: bytes, now: float) -> list[Event]:
+    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
         """Take the bytes of one packet; the events it causes, in order."""
         self._now = max(self._now, now)
         self._receive(data, now)
         events, self._events = self._events, []
         return events
 
-    def handle_timeout(self, now: float) -> list[Event]:
+    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Do what has become due at the receiving side: go on without what is missing, let go of who is silent."""
         self._now = max(self._now, now)
         for neighbour in self.neighbours:
@@ -210,7 +325,7 @@ class Endpoint:
         now = self._now
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
-        if self._credits != 0:
+        if not self.out_of_credit and self._speaks:
             leaving = [self._talk.due]
             waiting = self.outbox.next_timeout(now)
             if waiting is not None:
@@ -276,42 +391,46 @@ class Endpoint:
         return self._source(entries, filling.lives, filling.qos, tuple(filling.sent), now)
 
     def _source(
-        self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentPart, ...], now: float
+        self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentEntry, ...], now: float
     ) -> bytes:
         number = self.window.newest + 1
         settings = self.settings
         body = write_body(entries, self._room)
-        clear = write_header(
-            Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
-        )
+        header = Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
+        clear = write_header(header)
         data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
         self.window.sent(number, body, data, lives, now)
-        return self._leave(data, "new", parts, now)
+        return self._leave(data, Packet(header, tuple(entries), encrypted=self.keys.encrypts), "new", now, parts)
 
-    def _standing(self, standing: Standing, body: bytes, number: int, kind: AirKind, now: float) -> bytes:
+    def _standing(
+        self, standing: Standing, number: int, body: bytes, entries: Sequence[Entry], *, kind: AirKind, now: float
+    ) -> bytes:
         settings = self.settings
         header = Header(QOS_STANDING, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
         clear = write_header(header) + write_standing(standing)
         body = self._padded(body, clear)
         data = self._trailer.close(clear, body, number, standing.row, plain=standing.clear)
-        return self._leave(data, kind, (), now)
+        encrypted = self.keys.encrypts and not standing.clear
+        combined = body if standing.mask else b""
+        return self._leave(data, Packet(header, tuple(entries), standing, combined, encrypted), kind, now)
 
     def _control(self, entries: Sequence[Entry], kind: AirKind, now: float, *, clear: bool = False) -> bytes:
         """A packet of entries that are no messages; it stands at the newest number."""
         row = self.window.take_row(self.window.newest)
         if row is None:
             return self._source([], self.window.exhausted(now), 0, (), now)
-        return self._standing(
-            Standing(row, clear=clear), write_body(entries, self._room), self.window.newest, kind, now
-        )
+        body = write_body(entries, self._room)
+        return self._standing(Standing(row, clear=clear), self.window.newest, body, entries, kind=kind, now=now)
 
     def _repair(self, now: float) -> bytes | None:
         chosen = self.window.next(now)
         if isinstance(chosen, Repair):
             number, mask, row, oldest, combined = chosen
-            return self._standing(Standing(row, mask, oldest), combined, number, "repair", now)
+            return self._standing(Standing(row, mask, oldest), number, combined, (), kind="repair", now=now)
         if chosen is not None:
-            return self._leave(chosen, "repair", (), now)
+            header = read_header(chosen.data, self.settings.packet_len)
+            entries = tuple(read_body(chosen.body, self._room))
+            return self._leave(chosen.data, Packet(header, entries, encrypted=self.keys.encrypts), "repair", now)
         lives = self.window.exhausted(now)
         return self._source([], lives, 0, (), now) if lives else None
 
@@ -345,9 +464,16 @@ class Endpoint:
         self._unheard = 0
         return self._control(entries, "report", now)
 
-    def _leave(self, data: bytes, kind: AirKind, parts: tuple[SentPart, ...], now: float) -> bytes:
-        self.air[kind] += 1
-        self._tell(SentPacket(data, kind, parts, now))
+    def _leave(
+        self, data: bytes, packet: Packet, kind: AirKind, now: float, parts: tuple[SentEntry, ...] = ()
+    ) -> bytes:
+        stats = self.sent
+        stats.air[kind] += 1
+        stats.packets += 1
+        if parts:
+            stats.entries += len(parts)
+            stats.payload_bytes += sum([len(part.payload) for part in packet.entries])
+        self._tell(SentPacket(data, packet, parts, now, kind))
         return data
 
     def _padded(self, body: bytes, clear: bytes) -> bytes:
@@ -360,7 +486,9 @@ class Endpoint:
         return self.settings.hop if self.settings.dst_id != BROADCAST else 0
 
     def _mode(self) -> RepairMode:
-        return self.settings.repair or ("thrifty" if self.window.receivers() else "idle")
+        if self.settings.repair != AUTO:
+            return self.settings.repair
+        return "thrifty" if self.window.receivers() else "idle"
 
     # ---- what arrives
 
@@ -369,10 +497,10 @@ class Endpoint:
             opened = self._open(data, now)
             if opened is None:
                 return
-            self._use(opened, now)
+            self._use(data, opened, now)
         except WireError as error:
-            self.rejected[error.kind] += 1
-            self._report_all([Rejected(error)])
+            self.received.rejected[error.kind] += 1
+            self._report_all([Rejected(data, error)])
             return
         if opened.met:
             for early in self.neighbours.early(opened.neighbour.src_id):
@@ -381,10 +509,10 @@ class Endpoint:
     def _open(self, data: bytes, now: float) -> Opened | None:
         header = read_header(data, self.settings.packet_len)
         if header.src_id == self.settings.src_id:
-            self.dropped["own"] += 1
+            self.received.dropped["own"] += 1
             return None
-        if header.dst_id not in (BROADCAST, self.settings.src_id):
-            self.dropped["not_for_us"] += 1
+        if header.dst_id not in (BROADCAST, self.settings.src_id) and self.settings.src_id != NOBODY:
+            self.received.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self.keys.sealed:
             raise NoKeyError(f"a sealed packet of robot {header.src_id}, and no key is configured here")
@@ -392,26 +520,30 @@ class Endpoint:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         opened = self.neighbours.open(data, header, now)
         if opened is None:
-            self.dropped["early"] += 1
+            self.received.dropped["early"] += 1
         return opened
 
-    def _use(self, opened: Opened, now: float) -> None:
+    def _use(self, data: bytes, opened: Opened, now: float) -> None:
+        self.received.packets += 1
         neighbour, number, standing = opened.neighbour, opened.number, opened.standing
         if opened.met:
             self._meet(opened, now)
         inbox = neighbour.inbox
         self._sender = neighbour
+        room = body_room(self.settings.packet_len, sealed=self.keys.sealed, addressed=opened.header.dst_id != BROADCAST)
+        encrypted = neighbour.encrypts and not (standing is not None and standing.clear)
         if standing is None:
-            self._report_all(inbox.source(number, opened.body, opened.header.qos, now))
+            entries = read_body(opened.body, room)
+            self._report_all([Received(data, Packet(opened.header, tuple(entries), encrypted=encrypted))])
+            self._report_all(inbox.source(number, opened.body, entries, opened.header.qos, now))
         elif standing.mask:
+            self._report_all([Received(data, Packet(opened.header, (), standing, opened.body, encrypted))])
             self._report_all(
                 inbox.repair(number, standing.mask, standing.row, opened.body, oldest=standing.oldest, now=now)
             )
         else:
-            room = body_room(
-                self.settings.packet_len, sealed=self.keys.sealed, addressed=opened.header.dst_id != BROADCAST
-            )
             entries = opened.entries if opened.entries is not None else read_body(opened.body, room)
+            self._report_all([Received(data, Packet(opened.header, tuple(entries), standing, b"", encrypted))])
             for entry in entries:
                 if isinstance(entry, (Hello, Ask, Report, Heard)):
                     self._entry(entry)
@@ -421,7 +553,7 @@ class Endpoint:
         """A robot that was not known, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
-            self._report_all(opened.replaced.inbox.close("restarted"))
+            self._report_all(opened.replaced.inbox.close(Row.SENDER_RESTARTED))
         self.window.forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears:
@@ -460,14 +592,21 @@ class Endpoint:
             rows=self._rows,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
+            stats=self.received,
             control=self._entry,
         )
 
-    def _report_all(self, events: Sequence[Event]) -> None:
+    def _report_all(self, events: Sequence[ReceiverEvent]) -> None:
+        stats = self.received
         for event in events:
             self._events.append(event)
-            self._tell(event)
+            if isinstance(event, Delivered):
+                stats.delivered[event.src_id, event.topic_id] += 1
+                stats.repaired[event.src_id, event.topic_id] += event.repaired
+            elif isinstance(event, Lost):
+                stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
+                stats.message_loss_est += 1
 
-    def _tell(self, event: Event) -> None:
+    def _tell(self, event: SenderEvent) -> None:
         if self._observer is not None:
             self._observer(event)

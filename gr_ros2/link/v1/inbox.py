@@ -12,20 +12,24 @@ one Delivered or Lost; memory is bounded.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
 from gr_ros2.errors import CodecError, WireError
 from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.events import Announced, Delivered, Lost
+from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder
-from gr_ros2.link.v1.events import Announced, Delivered, Key, Lost
+from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, SPAN
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.control import Control, Report
-from gr_ros2.wire.table import Row, read_table
-from gr_ros2.wire.v1 import TABLE_TOPIC, Part, read_body
+from gr_ros2.wire.table import Row as TableRow
+from gr_ros2.wire.table import read_table
+from gr_ros2.wire.v1 import TABLE_TOPIC, Entry, Part, read_body
 
 Events = list[Delivered | Lost | Announced]
 
@@ -33,6 +37,8 @@ _PACKET_COST = 150
 """Bytes of bookkeeping counted per packet held."""
 _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
+_REPORT_S = 0.1
+"""s after which even one packet is reported."""
 _WAITING = 256
 """Messages of topics not known yet that are kept until the table comes."""
 
@@ -56,6 +62,7 @@ class Inbox:
     :param room: bytes of its longest body
     :param rows: its topics, where they are known beforehand
     :param decoder_for: makes what decodes its messages of its table
+    :param stats: where it counts, beside others
     :param control: takes entries that are no messages
     """
 
@@ -67,15 +74,16 @@ class Inbox:
         room: int,
         settings: Settings,
         *,
-        rows: tuple[Row, ...],
-        decoder_for: Callable[[tuple[Row, ...]], MessageCodec] | None,
+        rows: tuple[TableRow, ...],
+        decoder_for: Callable[[tuple[TableRow, ...]], MessageCodec] | None,
         marks: dict[int, int],
+        stats: ReceiverStats,
         control: Callable[[Control], None],
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.counts: Counter[str] = Counter()
         """Packets by what became of them: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
-        self.rows: dict[int, Row] = {}
+        self.rows: dict[int, TableRow] = {}
         self.digest = 0
         """CRC-32 of the table that is known."""
         self.loss = 0.0
@@ -83,6 +91,7 @@ class Inbox:
         self._settings = settings
         self._room = room
         self._control = control
+        self._stats = stats
         self._decoder_for = decoder_for
         self._codec: MessageCodec | None = None
         span = max(min(SPAN, settings.max_source_bytes // (room + _PACKET_COST)), MAP)
@@ -109,7 +118,6 @@ class Inbox:
         """The newest message delivered, by topic."""
         self.marks = marks
         """CRC-32 of the newest message of each latched topic, as it was on the air."""
-        self.repeats = 0
         self._events: Events = []
         self._now = 0.0
         self._unreported = 0
@@ -125,23 +133,24 @@ class Inbox:
         """The newest packet number heard of."""
         return self.decoder.newest
 
-    def source(self, number: int, body: bytes, qos: int, now: float) -> Events:
+    def source(self, number: int, body: bytes, entries: Sequence[Entry], qos: int, now: float) -> Events:
         """A source packet came.
 
         :param body: as it stood in the packet, padding included
-        :raises WireError: it cannot be read
+        :param entries: what it says
         """
         self._unreported += 1
         if number in self.decoder:
             self.counts["duplicate"] += 1
+            self._stats.dropped["duplicate"] += 1
             return []
         if number < self.decoder.floor:
             self.counts["late"] += 1
             return []
         self._now = now
-        entries = read_body(body, self._room)
         self.counts["packets"] += 1
         late = number < self.decoder.newest
+        self._stats.packet_loss_est -= late
         self._advance(number, now, here=True)
         if not late:
             self.loss -= self.loss * _SMOOTHING
@@ -180,7 +189,7 @@ class Inbox:
         self._now = now
         self._settle()
         for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
-            self._lose(partial, "expired")
+            self._lose(partial, Row.EXPIRED)
         return self._given()
 
     def next_timeout(self) -> float | None:
@@ -193,14 +202,14 @@ class Inbox:
             times.append(waiting + self._settings.reassembly_timeout_s)
         return min(times) if times else None
 
-    def close(self, reason: str) -> Events:
+    def close(self, reason: Row) -> Events:
         """Give up everything that is not delivered."""
         for partial in self._reassembly.clear():
             self._lose(partial, reason)
         for waiting in [ready for line in self._ready.values() for ready in line]:
             self._events.append(Lost(self.src_id, waiting.topic_id, reason, self._key(waiting.order)))
         for waiting in self._unknown:
-            self._events.append(Lost(self.src_id, waiting.topic_id, "unknown_topic", self._key(waiting.order)))
+            self._events.append(Lost(self.src_id, waiting.topic_id, Row.UNKNOWN_TOPIC, self._key(waiting.order)))
         self._ready.clear()
         self._unknown.clear()
         return self._given()
@@ -267,6 +276,7 @@ class Inbox:
         gone = number - newest - here
         if gone:
             self.counts["missing"] += gone
+            self._stats.packet_loss_est += gone
             self._missed = True
             self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
         self.decoder.advance(number)
@@ -280,7 +290,7 @@ class Inbox:
         self.counts["repaired"] += 1
         self._take(number, read_body(body, self._room), -1, repaired=True)
 
-    def _take(self, number: int, entries: list[Part | Control], qos: int, *, repaired: bool) -> None:
+    def _take(self, number: int, entries: Sequence[Entry], qos: int, *, repaired: bool) -> None:
         """The entries of a packet that is here now."""
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):
@@ -298,12 +308,12 @@ class Inbox:
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
         for partial in self._reassembly.overflowing():
-            self._lose(partial, "memory")
+            self._lose(partial, Row.MEMORY)
         if whole is None:
             return
         payload = whole.payload()
         if payload is None:
-            self._lose(whole, "contradiction")
+            self._lose(whole, Row.DAMAGED)
             return
         order = (whole.begin, whole.place)
         self._arrived(_Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
@@ -320,7 +330,7 @@ class Inbox:
             while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
                 lost = self._unknown.popleft()
                 self._waiting -= len(lost.payload)
-                self._events.append(Lost(self.src_id, lost.topic_id, "unknown_topic", self._key(lost.order)))
+                self._events.append(Lost(self.src_id, lost.topic_id, Row.UNKNOWN_TOPIC, self._key(lost.order)))
         elif row.reliable and ready.order[0] > self._low:
             self._ready.setdefault(ready.topic_id, []).append(ready)
         else:
@@ -361,24 +371,24 @@ class Inbox:
             low = max(low, gaps[-1][1] + 1)
         return low
 
-    def _release(self, row: Row, line: list[_Ready]) -> None:
+    def _release(self, row: TableRow, line: list[_Ready]) -> None:
         line.sort(key=lambda ready: ready.order)
         while line and line[0].order[0] <= self._low:
             self._deliver(line.pop(0), row)
 
-    def _deliver(self, ready: _Ready, row: Row) -> None:
+    def _deliver(self, ready: _Ready, row: TableRow) -> None:
         topic_id, key = ready.topic_id, self._key(ready.order)
         if ready.order <= self._last.get(topic_id, (-1, -1)):
-            self._events.append(Lost(self.src_id, topic_id, "given_up" if row.reliable else "overtaken", key))
+            self._events.append(Lost(self.src_id, topic_id, _passed_over(row), key))
             return
         self._last[topic_id] = ready.order
         for partial in self._reassembly.overtaken(topic_id, ready.order[0]):
-            self._lose(partial, "given_up" if row.reliable else "overtaken")
+            self._lose(partial, _passed_over(row))
         payload = ready.payload
         if row.latched:
             mark = crc32(payload)
             if self.marks.get(topic_id) == mark:
-                self.repeats += 1
+                self._stats.repeats += 1
                 return
             self.marks[topic_id] = mark
         if ready.coded:
@@ -387,7 +397,7 @@ class Inbox:
                     raise CodecError("coded, and no codec is configured here")
                 payload = self._codec.decode(topic_id, payload)
             except CodecError as error:
-                self._events.append(Lost(self.src_id, topic_id, error.row, key))
+                self._events.append(Lost(self.src_id, topic_id, ROWS[error.row], key))
                 return
         qos = ready.qos if ready.qos >= 0 else row.qos
         self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
@@ -408,15 +418,15 @@ class Inbox:
         for ready in sorted(waiting, key=lambda item: item.order):
             self._arrived(ready)
 
-    def _know(self, rows: tuple[Row, ...]) -> None:
+    def _know(self, rows: tuple[TableRow, ...]) -> None:
         self.rows = {row.topic_id: row for row in rows}
         for topic_id in [topic_id for topic_id in self._ready if topic_id not in self.rows]:
             for ready in self._ready.pop(topic_id):
-                self._events.append(Lost(self.src_id, topic_id, "unknown_topic", self._key(ready.order)))
+                self._events.append(Lost(self.src_id, topic_id, Row.UNKNOWN_TOPIC, self._key(ready.order)))
         if self._decoder_for is not None:
             self._codec = self._decoder_for(rows)
 
-    def _lose(self, partial: Partial, reason: str) -> None:
+    def _lose(self, partial: Partial, reason: Row) -> None:
         key = self._key((partial.begin, partial.place))
         self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
 
@@ -424,5 +434,6 @@ class Inbox:
         return Key(self.boot, *order)
 
 
-_REPORT_S = 0.1
-"""s after which even one packet is reported."""
+def _passed_over(row: TableRow) -> Row:
+    """Where a message ends that is not delivered since a later one of its topic was."""
+    return Row.GIVEN_UP if row.reliable else Row.OVERTAKEN

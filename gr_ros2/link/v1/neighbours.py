@@ -22,7 +22,17 @@ from gr_ros2.link.v1.repair import MAP
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.control import ENCRYPTS, Heard, Hello
-from gr_ros2.wire.v1 import HEADER_LEN, QOS_STANDING, Entry, Header, Standing, body_room, read_body, read_standing
+from gr_ros2.wire.v1 import (
+    HEADER_LEN,
+    QOS_STANDING,
+    TAG_LEN,
+    Entry,
+    Header,
+    Standing,
+    body_room,
+    read_body,
+    read_standing,
+)
 
 Save = Callable[[int, int, int], None]
 """Stores robot id, boot number and the packet number below which nothing more is taken, before it returns."""
@@ -59,6 +69,11 @@ class Neighbour:
     """Bits of the rows of standing packets that carried entries, by number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When which topic was asked for."""
+
+    @property
+    def encrypts(self) -> bool:
+        """Whether the bodies of its packets are encrypted."""
+        return self.trailer.size == TAG_LEN and self.hello.capabilities & ENCRYPTS != 0
 
     def number(self, low: int) -> int:
         """The full packet number of 16 bits of it, nearest to the newest."""

@@ -24,32 +24,32 @@ from heapq import heapify, heappop, heappush
 from math import inf
 from zlib import crc32
 
+from gr_ros2.config import QueuePolicy
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.codec import MessageCodec
+from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
+from gr_ros2.link.outcome import Row
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
-from gr_ros2.link.v1.events import Accepted, Key, Refused, SentPart
+from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
 from gr_ros2.link.v1.settings import Settings
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO
-from gr_ros2.wire.table import Row, write_table
+from gr_ros2.wire import QOS_BULK, QOS_NAMES
+from gr_ros2.wire.table import Row as TableRow
+from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
 
-TURN = 4
-LARGE = 4
-"""Packets from which on a message begins in what others leave of a packet."""
-FIRST_AGE_S = 1.0
-"""s that a topic counts as old when its first message comes."""
 SETTLING_S = 1.0
 """s after which a latched message is named in hellos: who lacks it then has not merely not got it yet."""
 STARTING_S = 2.0
 """s from the start for which the table is repaired though nobody reports."""
-_QOS = {"default": 0, "latency": 1, "bulk": 2}
-_RANK = (1, 0, 2)
 _ENTRY = 3
 
-Observer = Callable[[Accepted | Refused], None]
+Observer = Callable[[Accepted | Refused | Missed], None]
 
 
 @dataclass(slots=True, eq=False)
@@ -66,6 +66,7 @@ class Message(Outgoing):
 class _Kept:
     """A message kept for robots that join late."""
 
+    serial: int
     payload: bytes
     coded: bool
     mark: int
@@ -78,7 +79,7 @@ class Filling:
     """The content of a source packet."""
 
     parts: list[Part]
-    sent: list[SentPart]
+    sent: list[SentEntry]
     lives: tuple[Life, ...]
     qos: int
     used: int
@@ -121,13 +122,10 @@ class Outbox:
         self._open: dict[int, Sequence[Outgoing]] = {}
         """What may go on or start now, by topic."""
         self._newest: dict[int, float] = {}
-        self._line: list[int] = []
-        self._packets = 0
+        self._turns = Turns()
+        self._holder = -1
         self._serial = 0
-        self.submitted: Counter[int] = Counter()
-        self.refused: Counter[tuple[int, str]] = Counter()
-        self.sent: Counter[int] = Counter()
-        self.repeats = 0
+        self.stats = SenderStats()
         self._starting_until = inf
         self.reported = False
         """Whether receivers report, so that they say when a message is over."""
@@ -145,7 +143,7 @@ class Outbox:
         topic = self._topics[topic_id]
         serial = self._serial
         self._serial += 1
-        self.submitted[topic_id] += 1
+        self.stats.submitted[topic_id] += 1
         codec = self._codec
         self._observe(
             Accepted(serial, topic_id, payload, now, None if codec is None else codec.canonical(topic_id, payload))
@@ -153,26 +151,31 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, "too_large", f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, Row.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         if topic.latched:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
-            kept.append(_Kept(payload, codec is not None, crc32(payload)))
-        self._admit(topic, serial, payload, codec is not None, now)
+            kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
+        qos = QOS_NAMES.index(topic.options.qos)
+        self._admit(Message(serial, topic_id, payload, qos, now, topic.options.weight, coded=codec is not None))
 
     def ask(self, topic_id: int, now: float) -> None:
         """Somebody lacks what is kept of a topic: send it again, unless it waits already."""
         self._starting_until = min(self._starting_until, now + STARTING_S)
         queue = self._queues.get(topic_id)
-        if queue is None or any(message.serial < 0 for message in queue):
+        if queue is None or any(message.repeat for message in queue):
             return
         for kept in self._kept.get(topic_id, ()):
             if topic_id == TABLE_TOPIC:
-                queue.append(Message(-1, TABLE_TOPIC, kept.payload, 0, now))
+                queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, 0, now, repeat=True))
             else:
                 assert self._topics is not None
-                self._admit(self._topics[topic_id], -1, kept.payload, kept.coded, now)
-            self.repeats += 1
+                weight = self._topics[topic_id].options.weight
+                again = Message(
+                    kept.serial, topic_id, kept.payload, QOS_BULK, now, weight, repeat=True, coded=kept.coded
+                )
+                self._admit(again)
+            self.stats.repeats += 1
 
     def announce(self, now: float) -> None:
         """Send everything that is kept: to robots that cannot ask."""
@@ -205,6 +208,15 @@ class Outbox:
         self._tabulate()
         return self.digest != before
 
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+        """Policy and deadline (s, 0 none) of a topic's queue."""
+        queue = self._queues[topic_id]
+        return queue.policy, queue.deadline_s
+
+    def reconfigure(self, settings: Settings) -> None:
+        """Other settings from now on."""
+        self._settings = settings
+
     def expire(self, now: float, interval: float) -> None:
         """Drop what would be too late."""
         for queue in self._with_deadline:
@@ -235,8 +247,8 @@ class Outbox:
             used += size
             if taken == message.remaining and position + 1 < len(queue):
                 following = queue[position + 1]
-                value = -_value(following, message.submitted)
-                heappush(heap, (_RANK[following.qos], value, topic_id, position + 1))
+                worth = value(following, message.submitted, _ENTRY)
+                heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
         if not picks:
             return None
         wait = self._settings.flush_timeout_s
@@ -266,7 +278,7 @@ class Outbox:
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without pushing another out."""
-        return self._queues[topic_id].room(self._bound(topic_id))
+        return self._queues[topic_id].room(self.depth(topic_id))
 
     def _tabulate(self) -> None:
         """Make the table of topics."""
@@ -278,24 +290,23 @@ class Outbox:
             ordered = ordered and self._queues[topic.topic_id].policy != "latest"
             depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
             codec = "" if self._codec is None else options.codec
-            qos = _QOS[options.qos]
+            qos = QOS_NAMES.index(options.qos)
             name, kind = topic.name, topic.type_name
-            rows.append(Row(topic.topic_id, name, kind, qos, ordered, topic.latched, min(depth, 255), codec))
+            rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, topic.latched, min(depth, 255), codec))
         table = write_table(rows)
         self.digest = crc32(table)
-        self._kept[TABLE_TOPIC] = deque([_Kept(table, False, self.digest)])
+        self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
-    def _bound(self, topic_id: int) -> int:
+    def depth(self, topic_id: int) -> int:
+        """Messages of a topic that may wait, 0 unbounded."""
         depth = AUTO if self._topics is None else self._topics[topic_id].options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
-    def _admit(self, topic: Topic, serial: int, payload: bytes, coded: bool, now: float) -> None:
-        qos = _QOS[topic.options.qos] if serial >= 0 else 2
-        message = Message(serial, topic.topic_id, payload, qos, now, topic.options.weight, coded=coded)
-        self._drop(self._queues[topic.topic_id].admit(message, self._bound(topic.topic_id)))
+    def _admit(self, message: Message) -> None:
+        self._drop(self._queues[message.topic_id].admit(message, self.depth(message.topic_id)))
 
     def _heap(self, now: float) -> list[tuple[int, float, int, int]]:
         """Topics that may go on, the most urgent and most valuable first."""
@@ -305,12 +316,9 @@ class Outbox:
             if queue:
                 head = queue[0]
                 before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
-                heap.append((_RANK[head.qos], -_value(head, before), topic_id, 0))
-        if len(heap) > 1 and self._packets % TURN == TURN - 1:
-            self._line += [item[2] for item in heap if item[2] not in self._line]
-            holder = next(topic_id for topic_id in self._line if any(item[2] == topic_id for item in heap))
-            self._line.remove(holder)
-            self._line.append(holder)
+                heap.append((RANK[head.qos], -value(head, before, _ENTRY), topic_id, 0))
+        holder = self._holder = self._turns.holder([item[2] for item in heap]) if heap else -1
+        if holder >= 0:
             heap = [(-1, item[1], holder, 0) if item[2] == holder and item[0] else item for item in heap]
         heapify(heap)
         return heap
@@ -325,7 +333,7 @@ class Outbox:
 
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
         parts: list[Part] = []
-        sent: list[SentPart] = []
+        sent: list[SentEntry] = []
         for place, (message, taken) in enumerate(picks):
             queue = self._queues[message.topic_id]
             if not message.started:
@@ -340,21 +348,22 @@ class Outbox:
             back = number - message.begin if offset else 0
             parts.append(Part(message.topic_id, payload, back, offset, last, message.coded))
             key = Key(self._boot, message.begin, message.place)
-            sent.append(SentPart(message.serial, message.topic_id, key, offset, taken, last, message.serial < 0))
+            total = message.index if last else 0
+            sent.append(SentEntry(message.serial, message.topic_id, key, message.index - 1, total, message.repeat))
             if last:
                 queue.popleft()
                 self._left(message, queue, now)
-        self._packets += 1
+        self._turns.sent(self._holder)
         lives = tuple({id(message.life): message.life for message, _ in picks}.values())
         ranks = [message.qos for message, _ in picks]
-        qos = min(ranks, key=lambda qos: _RANK[qos])
+        qos = min(ranks, key=lambda qos: RANK[qos])
         return Filling(parts, sent, lives, qos, used)
 
     def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
         """A message has left whole: what it overtakes is over."""
         topic_id = message.topic_id
         self._newest[topic_id] = max(message.submitted, self._newest.get(topic_id, 0.0))
-        self.sent[topic_id] += message.serial >= 0
+        self.stats.sent[topic_id] += not message.repeat
         lives = self._lives[topic_id]
         most = self._settings.depth
         if queue.policy == "latest":
@@ -381,15 +390,9 @@ class Outbox:
             item.message.index = max(item.message.index, 1)
             if isinstance(item.message, Message):
                 item.message.life.over = True
-            if item.message.serial >= 0:
+            if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: str, detail: str) -> None:
-        self.refused[topic_id, reason] += 1
+    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+        self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))
-
-
-def _value(message: Outgoing, before: float) -> float:
-    """What a message is worth per byte of air; ``before``: submission time of the one sent before it, s."""
-    younger = message.submitted - before
-    return message.weight * younger * younger / (message.remaining + _ENTRY)

@@ -253,7 +253,7 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def next(self, now: float) -> bytes | Repair | None:
+    def next(self, now: float) -> Sent | Repair | None:
         """What an idle slot carries: a packet again as it was, a combination, or nothing."""
         slots = self._slots
         slots[0] *= _DECAY
@@ -265,7 +265,7 @@ class RepairWindow:
             return None
         if len(self._receivers) == 1 and (again := self._lost(now)) is not None:
             self.counts["resent"] += 1
-            return again.data
+            return again
         window = self._window(now)
         if not window or (self.mode == "thrifty" and not self._worth(window, now)):
             return None

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
+from gr_ros2.setting import AUTO, Auto
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
+NOBODY = -1
 MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 
 
@@ -18,12 +21,12 @@ MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 class Settings:
     """One robot's end of a link.
 
-    :param src_id: 0..254
+    :param src_id: 0..254; ``NOBODY`` at an end that only receives, and takes packets whomever they are for
     :param packet_len: bytes of the longest packet, the same at all ends
     :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
     :param dst_id: whom packets are for, 255 everybody
     :param hop: hop count of addressed packets
-    :param repair: what idle slots carry; None takes ``thrifty`` where reports come and ``idle`` where none do
+    :param repair: what idle slots carry; auto takes ``thrifty`` where reports come and ``idle`` where none do
     :param expected_loss: share of packets lost, as long as no report tells
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether a report takes a slot from what is received
@@ -36,7 +39,7 @@ class Settings:
     :param max_sources: robots heard at a time
     :param min_fragment: bytes of a message below which no fragment begins in a packet that others share
     :param flush_timeout_s: s that a partly filled packet waits for company
-    :param packet_rate: packets/s, 0 unpaced or paced by credits
+    :param packet_rate: packets/s at most; auto as credits come, where they do; 0 unpaced
     :param queue_depth: messages waiting per topic; 0 unbounded
     :param depth: newer messages after which one of a topic without lifespan is not repaired any more, while nobody
         reports
@@ -47,7 +50,7 @@ class Settings:
     fixed: bool = True
     dst_id: int = BROADCAST
     hop: int = 1
-    repair: RepairMode | None = None
+    repair: RepairMode | Auto = AUTO
     expected_loss: float = 0.2
     hears: bool = True
     half_duplex: bool = False
@@ -60,12 +63,42 @@ class Settings:
     max_sources: int = 16
     min_fragment: int = 16
     flush_timeout_s: float = 0.0
-    packet_rate: float = 0.0
+    packet_rate: float | Auto = AUTO
     queue_depth: int = 100
     depth: int = 16
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:
             raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {MIN_PACKET_LEN}..4095")
-        if not 0 <= self.src_id < BROADCAST:
+        if not 0 <= self.src_id < BROADCAST and (self.hears or self.src_id != NOBODY):
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")
+
+
+def settings_of(
+    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False
+) -> Settings:
+    """The settings of an end from those of its blocks.
+
+    :param hears: whether it receives and can say what
+    :raises ConfigError: neither names the robot, and it would have something to say
+    """
+    send = SourceConfig() if source is None else source
+    take = SinkConfig() if sink is None else sink
+    return Settings(
+        src_id=(NOBODY if take.robot_id == AUTO else take.robot_id) if source is None else source.src_id(),
+        packet_len=take.packet_len if source is None else source.packet_len,
+        dst_id=send.dst_id,
+        hop=send.hop,
+        repair=send.repair,
+        expected_loss=send.expected_loss,
+        hears=hears,
+        half_duplex=half_duplex,
+        hold_s=take.hold_s,
+        repeat_s=send.repeat_s,
+        max_source_bytes=take.max_source_bytes,
+        max_sources=take.max_sources,
+        min_fragment=send.min_fragment,
+        flush_timeout_s=send.flush_timeout_s,
+        packet_rate=send.packet_rate,
+        queue_depth=send.queue_depth,
+    )

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from gr_ros2.config import TopicOptions
+from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.events import Delivered, Event
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
@@ -38,7 +38,7 @@ class Robot:
         self.settings = Settings(src_id, **{"packet_len": 64, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
         self.boot = 1000 * src_id
-        self.events: list[Event] = []
+        self.events: list[SenderEvent | ReceiverEvent] = []
         self.start()
 
     def start(self, boot: int | None = None) -> None:
@@ -60,6 +60,12 @@ class Robot:
         if self.end.out_of_credit:
             self.end.credit()
         return self.end.next_packet(now)
+
+    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
+        """What a packet causes."""
+        events = self.end.receive(data, now)
+        self.events += events
+        return events
 
     def delivered(self, src_id: int | None = None) -> list[bytes]:
         """Payloads delivered so far, by one robot or by all."""
@@ -85,10 +91,10 @@ class Air:
                 self.recorded.append((robot, data))
                 for other in self.robots:
                     if other is not robot and not self.lost(robot, other):
-                        other.end.receive(data, self.now + SLOT_S)
+                        other.receive(data, self.now + SLOT_S)
         self.now += SLOT_S
         for robot in self.robots:
-            robot.end.handle_timeout(self.now)
+            robot.events += robot.end.handle_timeout(self.now)
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
         """So long, or until something is so; the time it took."""

@@ -10,7 +10,7 @@ import pytest
 
 from bench.hostile import GROWTH, Kind, attack
 from gr_ros2.config import TopicOptions
-from gr_ros2.link.v1.events import Delivered
+from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.repair import GROUP
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
