@@ -75,7 +75,7 @@ def anywhere(modem: Any, samples: Samples, start: int) -> None:
         if place is not None:
             modem.end(samples, place)
             reading = modem.read(samples, place)
-            assert reading is None or len(reading.soft) >= modem.frame.bits
+            assert reading is None or len(reading.soft) >= modem.frames.bits(reading.length)
 
 
 def steps(data: bytes) -> Iterator[tuple[int, float, int]]:

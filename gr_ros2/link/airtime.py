@@ -2,8 +2,8 @@
 
 Laws: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
 airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air
-is free of all that is here or promised (credits not yet used), and while fewer than ``OUTSTANDING`` packets are. No
-IO, no clock: ``now`` is seconds, monotonic.
+is free of all that is here or promised (credits not yet used, each for a longest packet), and while fewer than
+``OUTSTANDING`` packets are. No IO, no clock: ``now`` is seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OUTSTANDING = 2
 class AirtimeClock(Generic[T]):
     """A queue that lets packets through at the pace of the air.
 
-    :param airtime: s each packet occupies, gap included; 0 where packets cross at once
+    :param airtime: s a packet occupies, gap included, the longest where they differ; 0 where packets cross at once
     :param lead: s ahead of the air being free at which the next packet is asked for
     :param early: s before its airtime is over at which a packet leaves: 0 where what follows takes no time, all of its
         airtime and a little more where a device takes it
@@ -45,9 +45,12 @@ class AirtimeClock(Generic[T]):
         self._queue: deque[tuple[float, T]] = deque()
         self._unused = 0
 
-    def offer(self, packet: T, now: float) -> None:
-        """A packet arrives; it uses up a credit where one is open."""
-        self._free = max(now, self._free) + self._airtime
+    def offer(self, packet: T, now: float, airtime: float | None = None) -> None:
+        """A packet arrives; it uses up a credit where one is open.
+
+        :param airtime: s that it occupies, None = those of the longest
+        """
+        self._free = max(now, self._free) + (self._airtime if airtime is None else airtime)
         self._queue.append((self._free - self._early, packet))
         self._unused = max(0, self._unused - 1)
 

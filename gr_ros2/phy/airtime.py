@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pmt
@@ -25,13 +26,22 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
 
     :param airtime: s one packet occupies, gap included; 0 lets packets pass at once
+    :param airtime_of: the same by the packet's bytes, at most ``airtime``; None = that of all
     :param lead: s before the air is free at which a credit is given
     :param early: s before its airtime is over at which a packet passes, see :class:`AirtimeClock`
     :raises ConfigError: for a value out of range
     """
 
-    def __init__(self, airtime: float, *, lead: float = LEAD_S, early: float = 0.0) -> None:
+    def __init__(
+        self,
+        airtime: float,
+        *,
+        airtime_of: Callable[[int], float] | None = None,
+        lead: float = LEAD_S,
+        early: float = 0.0,
+    ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
+        self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, early)
         self.passed = 0
         self._changed = threading.Condition()
@@ -68,8 +78,9 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return True
 
     def _arrive(self, pdu: Any) -> None:
+        airtime = None if self._airtime_of is None else self._airtime_of(int(pmt.length(pmt.cdr(pdu))))
         with self._changed:
-            self._clock.offer(pdu, time.monotonic())
+            self._clock.offer(pdu, time.monotonic(), airtime)
             self._changed.notify_all()
 
     def _run(self) -> None:

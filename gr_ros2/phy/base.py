@@ -2,7 +2,7 @@
 
 A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
 and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
-on the message port itself. Law: one packet takes the same number of samples always (fixed packet_len).
+on the message port itself. Law: how long a packet is on the air depends on its length alone.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class PhyOptions:
 class Phy(ABC):
     """One physical layer at one packet length and sample rate.
 
-    :param packet_len: bytes per packet, 14..4095
+    :param packet_len: bytes of the longest packet, 14..4095
     :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
     :param kernels: what works on the samples: ``auto`` = compiled kernels where there are any, or ``numpy``
     :param options: fields of ``Options``
@@ -97,20 +97,36 @@ class Phy(ABC):
         self.packet_len = packet_len
         self.sample_rate = sample_rate
 
-    @abstractmethod
-    def airtime_samples(self) -> int:
-        """Samples one packet occupies on the air, gap included; 0 for a PHY without samples."""
+    @property
+    def any_length(self) -> bool:
+        """Whether packets may be shorter than ``packet_len``, and then take less of the air."""
+        return False
 
-    def airtime(self) -> float:
-        """Seconds one packet occupies on the air, gap included."""
-        return self.airtime_samples() / self.sample_rate if self.has_samples else 0.0
+    def pad_all(self) -> None:  # noqa: B027 - most PHYs have nothing to do
+        """From now on :attr:`any_length` is False: for what counts samples to tell packets apart."""
+
+    @abstractmethod
+    def airtime_samples(self, packet_len: int | None = None) -> int:
+        """Samples one packet occupies on the air, gap included; 0 for a PHY without samples.
+
+        :param packet_len: its bytes, None = those of the longest; of no account where :attr:`any_length` is False
+        """
+
+    def airtime(self, packet_len: int | None = None) -> float:
+        """Seconds one packet occupies on the air, gap included.
+
+        :param packet_len: its bytes, as for :meth:`airtime_samples`
+        """
+        return self.airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
 
     @abstractmethod
     def burst_power(self) -> float:
-        """Mean of the squared magnitude of one packet's samples, gap excluded; 0 for a PHY without samples."""
+        """Mean of the squared magnitude of the longest packet's samples, gap excluded; 0 for a PHY without samples."""
 
     def computed_pdr(self, snr_db: float) -> float:  # noqa: ARG002
-        """Share of packets an ideal receiver would deliver in white noise, 0..1; 1 for a PHY without samples.
+        """Share of the longest packets an ideal receiver would deliver in white noise, 0..1.
+
+        1 for a PHY without samples.
 
         :param snr_db: mean burst power over noise power in the sampled band, dB
         """

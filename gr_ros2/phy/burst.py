@@ -1,4 +1,4 @@
-"""Bursts of fixed length without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
+"""Bursts without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
 
 Laws: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet comes
 out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and the
@@ -19,13 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.fec import Bits, CodeName, Soft, make_code
+from gr_ros2.phy.fec import Bits, Code, CodeName, Codes, Soft
 from gr_ros2.phy.soft import BitOrder
 
 Samples = NDArray[np.complex64]
 Octets = NDArray[np.uint8]
 
 CRC_LEN = 4
+_KEPT = 128
+"""Frames: the code of a long one takes some 100 kB."""
 _LOOKED_BACK = 16
 """Packets whose SNRs make one: a single preamble is short, and says it to a decibel."""
 _LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
@@ -37,33 +39,16 @@ _SPARE = 1 << 16
 class Frame:
     """Packet, filling, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
 
-    :param packet_len: bytes per packet
-    :param fec: name of the code
-    :param order: whether a byte's first bit on the air is its highest or its lowest
+    :param packet_len: bytes of the packet
     :param fill: zero bytes behind the packet, within the CRC
-    :param mask: what the bytes are whitened with, that many and four more; None = PN9
+    :param mask: what the bytes are whitened with
+    :param code: for all bits of the frame
+    :param order: whether a byte's first bit on the air is its highest or its lowest
     """
 
-    def __init__(
-        self,
-        packet_len: int,
-        fec: CodeName = "none",
-        *,
-        order: BitOrder = "big",
-        fill: int = 0,
-        mask: Octets | None = None,
-    ) -> None:
-        self._again = partial(Frame, packet_len, fec, order=order, fill=fill, mask=mask)
+    def __init__(self, packet_len: int, fill: int, mask: Octets, code: Code, order: BitOrder) -> None:
         self.packet_len = packet_len
-        self.length = packet_len + fill + CRC_LEN
-        self.coded = fec != "none"
-        self._fill, self._order = bytes(fill), order
-        self._mask = whitening(self.length) if mask is None else mask
-        self._code = make_code(fec, 8 * self.length)
-
-    def __reduce__(self) -> Any:
-        # Codes hold GNU Radio's objects, which cannot be sent to another process: it makes its own.
-        return self._again, ()
+        self._fill, self._mask, self._code, self._order = bytes(fill), mask, code, order
 
     @property
     def bits(self) -> int:
@@ -88,6 +73,66 @@ class Frame:
         if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
             return None
         return filled[: self.packet_len]
+
+
+class Frames:
+    """The frames of a link, one for each length of packet.
+
+    :param packet_len: bytes of the longest packet
+    :param fec: name of the code
+    :param fixed: every packet has that many bytes; otherwise 1 to that many, and each burst says how many
+    :param order: whether a byte's first bit on the air is its highest or its lowest
+    :param multiple: a frame's bytes are filled up with zeros to a multiple of this
+    :param mask: what the bytes of the longest frame are whitened with, shorter ones with its beginning; None = PN9
+    """
+
+    def __init__(
+        self,
+        packet_len: int,
+        fec: CodeName = "none",
+        *,
+        fixed: bool = False,
+        order: BitOrder = "big",
+        multiple: int = 1,
+        mask: Octets | None = None,
+    ) -> None:
+        self._again = partial(Frames, packet_len, fec, fixed=fixed, order=order, multiple=multiple, mask=mask)
+        self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
+        self._order, self._multiple = order, multiple
+        self._mask = whitening(self.length(packet_len)) if mask is None else mask
+        self._codes = Codes(fec)
+        self.of = lru_cache(maxsize=_KEPT)(self._make)
+        """The frame of a packet of so many bytes."""
+
+    def __reduce__(self) -> Any:
+        # Codes hold GNU Radio's objects, which cannot be sent to another process: it makes its own.
+        return self._again, ()
+
+    @property
+    def lengths(self) -> range:
+        """Bytes that a packet may have."""
+        return range(self.packet_len if self.fixed else 1, self.packet_len + 1)
+
+    def length(self, packet_len: int) -> int:
+        """Bytes of the frame of a packet of so many."""
+        return packet_len + self.fill(packet_len) + CRC_LEN
+
+    def fill(self, packet_len: int) -> int:
+        """Zero bytes behind a packet of so many."""
+        return -(packet_len + CRC_LEN) % self._multiple
+
+    def data_bits(self, packet_len: int) -> int:
+        """Bits of the frame of a packet of so many bytes, before coding."""
+        return 8 * self.length(packet_len)
+
+    def bits(self, packet_len: int) -> int:
+        """The same on the air."""
+        return self._codes.coded_bits(self.data_bits(packet_len))
+
+    def _make(self, packet_len: int) -> Frame:
+        mask = self._mask[: self.length(packet_len)]
+        code = self._codes.of(self.data_bits(packet_len))
+        return Frame(packet_len, self.fill(packet_len), mask, code, self._order)
 
 
 @lru_cache
@@ -116,14 +161,18 @@ class Search:
 class Reading:
     """What a burst says.
 
+    :param length: bytes of its packet
     :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; filling may follow
     :param points: what they were read from, for people to look at; magnitude about 1
     :param snr: mean power of the burst over that of the noise in the sampled band, as its preamble shows them
+    :param end: index behind its last sample that was needed
     """
 
+    length: int
     soft: Soft
     points: Samples
     snr: float
+    end: int
 
 
 @dataclass(frozen=True)
@@ -132,8 +181,8 @@ class Constants:
 
     :param kernel: name of the kernel
     :param values: its parameters, by the names it has for them
-    :param soft_bits: of a reading
-    :param points: of a reading
+    :param soft_bits: of a reading at most, with those that say the length
+    :param points: of a reading at most
     """
 
     kernel: str
@@ -143,9 +192,9 @@ class Constants:
 
 
 class BurstModem(ABC):
-    """A modulation for frames of one length.
+    """A modulation for the frames of a link.
 
-    :param frame: what a burst carries
+    :param frames: what bursts carry
     """
 
     margin = 0
@@ -153,18 +202,22 @@ class BurstModem(ABC):
     stretch = 8192
     """Samples searched at a time beside a preamble: what lies behind a burst is looked at again after it."""
 
-    def __init__(self, frame: Frame) -> None:
-        self.frame = frame
+    def __init__(self, frames: Frames) -> None:
+        self.frames = frames
+
+    @abstractmethod
+    def samples_of(self, packet_len: int) -> int:
+        """Samples of the burst of a packet of so many bytes as sent, without gap."""
 
     @property
-    @abstractmethod
     def burst_samples(self) -> int:
-        """Samples of a burst as sent, without gap."""
+        """Those of the longest."""
+        return self.samples_of(self.frames.packet_len)
 
     @property
     @abstractmethod
     def span(self) -> int:
-        """Samples from the reference sample on that ``end`` needs, at most those of the whole burst."""
+        """Samples from the reference sample on that ``end`` needs, at most those of the shortest burst."""
 
     @property
     @abstractmethod
@@ -184,9 +237,9 @@ class BurstModem(ABC):
     def find(self, samples: Samples) -> Search:
         """Look for the first burst."""
 
-    def end(self, samples: Samples, start: int) -> int:  # noqa: ARG002
+    @abstractmethod
+    def end(self, samples: Samples, start: int) -> int:
         """Index behind the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
-        return start + self.span
 
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
@@ -196,11 +249,17 @@ class BurstModem(ABC):
         """What a compiled kernel has to know to do the same; None where there is no kernel."""
         return None
 
+    def lengths(self) -> dict[str, Any]:
+        """Those of the constants that tell of the lengths of packets."""
+        lengths = self.frames.lengths
+        bits = [self.frames.bits(length) for length in lengths]
+        return {"shortest": lengths[0], "longest": lengths[-1], "frame_bits": bits}
+
 
 class BurstReceiver:
     """Samples in, packets out.
 
-    :param modem: modulation and frame length
+    :param modem: modulation and frames
     """
 
     def __init__(self, modem: BurstModem) -> None:
@@ -250,12 +309,18 @@ class BurstReceiver:
                 self._last -= first
         return len(self._buffer) - self._end
 
-    def _finite(self) -> bool:
-        """Whether all samples that the burst can be read from are numbers."""
+    def _finite(self, last: int) -> bool:
+        """Whether the burst's samples up to one are numbers."""
         assert self._start is not None
-        first, last = self._start - self._modem.margin, self._start + self._modem.burst_samples + self._modem.margin
-        burst = self._buffer[max(0, first) : min(last, self._end)]
+        burst = self._buffer[max(0, self._start - self._modem.margin) : min(last + self._modem.margin, self._end)]
         return isfinite(np.vdot(burst, burst).real)
+
+    def _ending(self) -> int:
+        """Index behind the last sample that reading the burst needs."""
+        assert self._start is not None
+        head = self._start + self._modem.span
+        # A head that holds what is no number says nothing of what follows; nor is anything read of it.
+        return self._modem.end(self._buffer[: self._end], self._start) if self._finite(head) else head
 
     def _take(self) -> list[bytes]:
         packets: list[bytes] = []
@@ -271,11 +336,12 @@ class BurstReceiver:
             if self._start is None or self._end - self._start < self._modem.span:
                 return packets
             if self._last is None:
-                self._last = self._modem.end(self._buffer[: self._end], self._start)
+                self._last = self._ending()
             if self._end < self._last:
                 return packets
-            reading = self._modem.read(self._buffer[: self._end], self._start) if self._finite() else None
-            packet = None if reading is None else self._modem.frame.unwrap(reading.soft)
+            whole = self._finite(self._last)
+            reading = self._modem.read(self._buffer[: self._end], self._start) if whole else None
+            packet = None if reading is None else self._modem.frames.of(reading.length).unwrap(reading.soft)
             if reading is None or packet is None:
                 self.damaged += 1
                 self._cursor = self._start + self._modem.peak_samples

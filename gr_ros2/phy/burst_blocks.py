@@ -1,6 +1,6 @@
 """GNU Radio shells around a burst modem: PDUs in, samples out, and back.
 
-Laws: a PDU that is not one packet of the right length is counted and dropped, never sent; each burst leaves at once,
+Laws: a PDU that is no packet of a length there is is counted and dropped, never sent; each burst leaves at once,
 its gap behind it; all behaviour is in the modem.
 """
 
@@ -11,7 +11,7 @@ import os
 from abc import abstractmethod
 from collections import deque
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pmt
@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import Receiver, Transmitter
 from gr_ros2.phy.kernels import fastest, which
@@ -46,10 +46,14 @@ class BurstOptions:
     :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next.
         auto = 32, or as many as another receiver needs
     :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
+    :param lengths: ``any`` = a packet is as long on the air as its bytes need, and says so; ``fixed`` = as long as the
+        longest, as the blocks of others send (``detection_threshold: stock``, ``lora_sdr``) whatever is set here. The
+        same at both ends
     """
 
     gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
     fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
+    lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
 
 
 class BurstPhy(Phy):
@@ -63,10 +67,26 @@ class BurstPhy(Phy):
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
+        self._padded = False
         self.gap: int = _GAP if self.options.gap == AUTO else self.options.gap
 
-    def airtime_samples(self) -> int:
-        return self.modem.burst_samples + self.gap
+    def frames(self, **form: Any) -> Frames:
+        """The frames of this link, as set.
+
+        :param form: further arguments of :class:`Frames`
+        """
+        return Frames(self.packet_len, self.options.fec, fixed=self.options.lengths == "fixed", **form)
+
+    @property
+    def any_length(self) -> bool:
+        return not self.modem.frames.fixed and not self._padded
+
+    def pad_all(self) -> None:
+        self._padded = True
+
+    def airtime_samples(self, packet_len: int | None = None) -> int:
+        length = packet_len if packet_len is not None and self.any_length else self.packet_len
+        return self.modem.samples_of(length) + self.gap
 
     @cached_property
     def running_modem(self) -> BurstModem:
@@ -94,27 +114,30 @@ class BurstTransmitter(Transmitter):
     """Message port `pdus` in, complex stream out."""
 
     def __init__(self, phy: BurstPhy) -> None:
-        super().__init__(f"gr_ros2_{phy.name}_tx", phy.airtime_samples())
+        super().__init__(f"gr_ros2_{phy.name}_tx")
         self._modulator = _Modulator(phy)
         self.msg_connect((self, "pdus"), (self._modulator, "pdus"))
         self.leave_by(self._modulator)
 
     @property
     def refused(self) -> int:
-        """PDUs that were no packet of the right length."""
+        """PDUs that were no packet of a length there is."""
         return self._modulator.refused
+
+    def packets_sent(self) -> int:
+        return self._modulator.sent
 
 
 class TakesPackets(Held):
     """Message port `pdus` in of a Python block inside a hier block; stands before GNU Radio's class.
 
-    :param packet_len: bytes of a packet; anything else is dropped and counted
+    :param lengths: bytes a packet may have; anything else is dropped and counted
     :param args: of GNU Radio's class
     """
 
-    def __init__(self, packet_len: int, *args: Any) -> None:
+    def __init__(self, lengths: range, *args: Any) -> None:
         super().__init__(*args)
-        self._packet_len = packet_len
+        self._lengths = lengths
         self.refused = 0
         block: Any = self
         block.message_port_register_in(PDUS)
@@ -126,13 +149,15 @@ class TakesPackets(Held):
 
     def _take(self, message: Any) -> None:
         vector = pmt.cdr(message) if pmt.is_pair(message) else message
-        if pmt.is_u8vector(vector) and pmt.length(vector) == self._packet_len:
+        if pmt.is_u8vector(vector) and pmt.length(vector) in self._lengths:
             self.take_packet(octets(vector))
             return
         self.refused += 1
         if self.refused == 1:
             block: Any = self
-            _log.warning("%s: dropped a PDU that is not %d bytes", block.name(), self._packet_len)
+            least, most = self._lengths[0], self._lengths[-1]
+            needed = f"{most}" if least == most else f"{least} to {most}"
+            _log.warning("%s: dropped a PDU that is not %s bytes", block.name(), needed)
 
 
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
@@ -143,12 +168,15 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     """
 
     def __init__(self, phy: BurstPhy) -> None:
-        super().__init__(phy.packet_len, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
+        least = 1 if phy.any_length else phy.packet_len
+        super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._modem = phy.running_modem
+        self._gap = phy.gap
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
-        self._burst = self._whole[: phy.modem.burst_samples]
         self._waiting: deque[bytes] = deque()
         self._rest = self._whole[:0]
+        self.sent = 0
+        """Packets that have left as samples."""
 
     def take_packet(self, packet: bytes) -> None:
         self._waiting.append(packet)
@@ -157,12 +185,15 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         out, done = output_items[0], 0
         while done < len(out) and (len(self._rest) or self._waiting):
             if not len(self._rest):
-                self._burst[:] = self._modem.modulate(self._waiting.popleft())
-                self._rest = self._whole
+                burst = self._modem.modulate(self._waiting.popleft())
+                self._rest = self._whole[: len(burst) + self._gap]
+                self._rest[: len(burst)] = burst
+                self._rest[len(burst) :] = 0
             count = min(len(out) - done, len(self._rest))
             out[done : done + count] = self._rest[:count]
             self._rest = self._rest[count:]
             done += count
+            self.sent += not len(self._rest)
         return done
 
 

@@ -20,7 +20,7 @@ class DirectPhy(Phy):
     def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
 
-    def airtime_samples(self) -> int:
+    def airtime_samples(self, packet_len: int | None = None) -> int:  # noqa: ARG002
         return 0
 
     def burst_power(self) -> float:

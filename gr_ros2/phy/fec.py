@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from math import gcd
 from pathlib import Path
 from typing import Any, Literal
@@ -36,6 +37,7 @@ _LEAST = 1e-3
 _POLAR_MOST = 2048
 _POLAR_RATE = 0.625
 """Above this rate a code of twice the length is taken."""
+_POLAR_ROOM = int(_POLAR_MOST * _POLAR_RATE)
 _POLAR_DESIGN_DB = 1.0
 _GOLDEN = 0.618
 
@@ -99,10 +101,15 @@ class Convolutional(Code):
 
     def __init__(self, bits: int) -> None:
         super().__init__(bits)
-        self.coded_bits = 2 * bits + _CC_TAIL
+        self.coded_bits = self.coded(bits)
         arguments = (bits, _CONSTRAINT, 2, _POLYNOMIALS, 0)
         self._encoder = fec.cc_encoder.make(*arguments, fec.CC_TERMINATED, False)
         self._decoder = fec.cc_decoder.make(*arguments, -1, fec.CC_TERMINATED, False)
+
+    @staticmethod
+    def coded(bits: int) -> int:
+        """Bits on the air for so many."""
+        return 2 * bits + _CC_TAIL
 
     def encode(self, bits: Bits) -> Bits:
         return _work(self._encoder, bits, self.coded_bits)
@@ -122,8 +129,13 @@ class Blocks(Code):
 
     def __init__(self, bits: int, room: int) -> None:
         super().__init__(bits)
-        self.count = -(-bits // room)
-        self.each = -(-bits // self.count)
+        self.count, self.each = self.cut(bits, room)
+
+    @staticmethod
+    def cut(bits: int, room: int) -> tuple[int, int]:
+        """Blocks, and data bits of each."""
+        count = -(-bits // room)
+        return count, -(-bits // count)
 
     def blocks_of(self, bits: Bits) -> Bits:
         padded = np.zeros(self.count * self.each, np.uint8)
@@ -131,40 +143,65 @@ class Blocks(Code):
         return padded.reshape(self.count, self.each)
 
 
-class Ldpc(Blocks):
-    """Rate 1/2 and below, the smaller or larger of two of GNU Radio's matrices; sum-product decoder.
+class Matrix:
+    """One of GNU Radio's LDPC matrices, which takes it most of a second to set up.
 
+    :param room: data bits of a block
+    :param size: coded bits of a block
     :raises BackendMissingError: where GNU Radio's matrices are not installed
     """
 
-    def __init__(self, bits: int) -> None:
-        self._room, self._size, name = next((code for code in _LDPC if bits <= code[0]), _LDPC[-1])
-        super().__init__(bits, self._room)
+    def __init__(self, room: int, size: int, name: str) -> None:
         path = Path(gr.prefix()) / "share" / "gnuradio" / "fec" / "ldpc" / f"{name}.alist"
         if not path.is_file():
             raise BackendMissingError(f"fec 'ldpc' needs {path}, which comes with GNU Radio (apt install gnuradio)")
-        self._checks = self._size - self._room
-        self.coded_bits = self.count * (self.each + self._checks)
-        self._encoder = fec.ldpc_encoder.make(str(path))
-        self._decoder = _ldpc_decoder(str(path))
+        self.room, self.size, self.checks = room, size, size - room
+        self.encoder = fec.ldpc_encoder.make(str(path))
+        self.decoder = _ldpc_decoder(str(path))
+
+
+class Ldpc(Blocks):
+    """Rate 1/2 and below; sum-product decoder.
+
+    :param matrix: the one that :meth:`shape` names
+    """
+
+    def __init__(self, bits: int, matrix: Matrix) -> None:
+        super().__init__(bits, matrix.room)
+        self._matrix = matrix
+        self.coded_bits = self.coded(bits)
+
+    @staticmethod
+    def shape(bits: int) -> tuple[int, int, str]:
+        """Data bits, coded bits and name of the matrix for so many bits."""
+        return next((code for code in _LDPC if bits <= code[0]), _LDPC[-1])
+
+    @classmethod
+    def coded(cls, bits: int) -> int:
+        """Bits on the air for so many."""
+        room, size, _ = cls.shape(bits)
+        count, each = cls.cut(bits, room)
+        return count * (each + size - room)
 
     def encode(self, bits: Bits) -> Bits:
-        word = np.zeros(self._room, np.uint8)
+        matrix = self._matrix
+        word = np.zeros(matrix.room, np.uint8)
         out = []
         for block in self.blocks_of(bits):
             word[: self.each] = block
             # The data stand behind the checks.
-            out.append(_work(self._encoder, word, self._size)[: self._checks + self.each])
+            out.append(_work(matrix.encoder, word, matrix.size)[: matrix.checks + self.each])
         return np.concatenate(out)
 
     def decode(self, soft: Soft) -> Bits:
-        levels = np.full(self._size, -_LIMIT, np.float32)
+        matrix = self._matrix
+        levels = np.full(matrix.size, -_LIMIT, np.float32)
         out = []
         # It also divides by what is 0 for a bit of which nothing is known.
         known = np.where(np.abs(soft) < _LEAST, np.float32(_LEAST), np.clip(soft, -_LIMIT, _LIMIT))
         for block in known.reshape(self.count, -1):
             levels[: block.size] = block
-            out.append(_work(self._decoder, levels, self._room)[: self.each])
+            out.append(_work(matrix.decoder, levels, matrix.room)[: self.each])
         data: Bits = np.concatenate(out)[: self.bits]
         return data
 
@@ -181,14 +218,19 @@ class Polar(Blocks):
     """Rate 0.31 to 0.625, blocks of up to 2048 bits, frozen bits after Arikan; successive cancellation decoder."""
 
     def __init__(self, bits: int) -> None:
-        super().__init__(bits, int(_POLAR_MOST * _POLAR_RATE))
-        size = 1 << int(np.ceil(np.log2(self.each / _POLAR_RATE)))
-        self._size = size
-        self.coded_bits = self.count * size
+        super().__init__(bits, _POLAR_ROOM)
+        self.coded_bits = self.coded(bits)
+        self._size = size = self.coded_bits // self.count
         frozen = np.sort(np.argsort(capacities(size, _POLAR_DESIGN_DB), kind="stable")[: size - self.each]).tolist()
         zeros = [0] * len(frozen)
         self._encoder = fec.polar_encoder.make(size, self.each, frozen, zeros, False)
         self._decoder = fec.polar_decoder_sc.make(size, self.each, frozen, zeros)
+
+    @classmethod
+    def coded(cls, bits: int) -> int:
+        """Bits on the air for so many."""
+        count, each = cls.cut(bits, _POLAR_ROOM)
+        return count << int(np.ceil(np.log2(each / _POLAR_RATE)))
 
     def encode(self, bits: Bits) -> Bits:
         return np.concatenate([_work(self._encoder, block, self._size) for block in self.blocks_of(bits)])
@@ -210,15 +252,33 @@ def capacities(size: int, design_db: float) -> NDArray[np.float64]:
     return capacity
 
 
-def make_code(name: CodeName, bits: int) -> Code:
-    """The code of this name for frames of so many bits.
+class Codes:
+    """The codes of one name, one for each number of bits; what is dear to make they share.
 
-    :raises BackendMissingError: where GNU Radio lacks what it needs
+    One thread may encode while another decodes.
     """
-    if name == "none":
-        return Uncoded(bits)
-    made: dict[str, type[Convolutional | Ldpc | Polar]] = {"cc": Convolutional, "ldpc": Ldpc, "polar": Polar}
-    return Spread(made[name](bits))
+
+    def __init__(self, name: CodeName) -> None:
+        self.name = name
+        self._matrix = lru_cache(maxsize=len(_LDPC))(Matrix)
+
+    def coded_bits(self, bits: int) -> int:
+        """Bits on the air for so many."""
+        return bits if self.name == "none" else _CODES[self.name].coded(bits)
+
+    def of(self, bits: int) -> Code:
+        """The code for frames of so many bits.
+
+        :raises BackendMissingError: where GNU Radio lacks what it needs
+        """
+        if self.name == "none":
+            return Uncoded(bits)
+        if self.name == "ldpc":
+            return Spread(Ldpc(bits, self._matrix(*Ldpc.shape(bits))))
+        return Spread(Convolutional(bits) if self.name == "cc" else Polar(bits))
+
+
+_CODES: dict[str, type[Convolutional | Ldpc | Polar]] = {"cc": Convolutional, "ldpc": Ldpc, "polar": Polar}
 
 
 def _work(coder: Any, given: NDArray[Any], size: int) -> Bits:

@@ -90,13 +90,13 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
 
 
 class Transmitter(HierBlock):
-    """Message port `pdus` in, complex stream out: as many samples for every packet.
+    """Message port `pdus` in, complex stream out.
 
     :param name: in GNU Radio's log
-    :param airtime_samples: of a packet, gap included
+    :param airtime_samples: of a packet, gap included, where every one has as many
     """
 
-    def __init__(self, name: str, airtime_samples: int) -> None:
+    def __init__(self, name: str, airtime_samples: int = 0) -> None:
         super().__init__(name, gr.io_signature(0, 0, 0), gr.io_signature(1, 1, gr.sizeof_gr_complex))
         self.message_port_register_hier_in("pdus")
         self._airtime_samples = airtime_samples

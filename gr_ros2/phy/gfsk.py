@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.burst import Frame, Samples
+from gr_ros2.phy.burst import Frames, Samples
 from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, Reals, preamble_steps, shape
 
 _PULSE_SYMBOLS = 4
@@ -39,8 +39,8 @@ class GfskOptions(LinearOptions):
 class GfskModem(LinearModem):
     """See :class:`GfskOptions`."""
 
-    def __init__(self, frame: Frame, options: GfskOptions) -> None:
-        super().__init__(frame, 2, options.sps, turn=np.pi / 2)
+    def __init__(self, frames: Frames, options: GfskOptions) -> None:
+        super().__init__(frames, 2, options.sps, turn=np.pi / 2)
         self._pulse = frequency_pulse(options.sps, options.bt)
         self.taps: NDArray[np.float32] = wiener(main_pulse(self._pulse, options.sps), options.sps).astype(np.float32)
         self._head = np.concatenate((np.tile([1.0, -1.0], _LEAD // 2), preamble_steps()))
@@ -51,17 +51,16 @@ class GfskModem(LinearModem):
     def symbol_energy(self) -> float:
         return float(self.sps)
 
-    @property
-    def burst_samples(self) -> int:
-        return (_LEAD + self.symbols + _TAIL - 2) * self.sps + len(self._pulse)
+    def samples_of(self, packet_len: int) -> int:
+        return (_LEAD + self.symbols(packet_len) + _TAIL - 2) * self.sps + len(self._pulse)
 
     @property
     def preamble(self) -> Samples:
         return self._wave(self._head)
 
     def modulate(self, packet: bytes) -> Samples:
-        data = self.frame.wrap(packet)
-        if self.frame.coded:
+        data = self.payload_bits(packet)
+        if self.frames.coded:
             data = 1 ^ data ^ np.concatenate(([self._last], data[:-1]))
         bits = np.concatenate((self._head, 2.0 * data - 1, np.tile([1, -1], _TAIL // 2)))
         return self._wave(bits)
@@ -75,7 +74,7 @@ class GfskModem(LinearModem):
     def before_payload(self) -> int | None:
         # A bit is 1 where the phase is that of the symbol before, the first one's before is the preamble's last. With a
         # code the bits were sent so that the phases themselves are the bits, since a decoder minds errors in pairs.
-        return None if self.frame.coded else int(self._last)
+        return None if self.frames.coded else int(self._last)
 
 
 def frequency_pulse(sps: int, bt: float) -> Reals:
@@ -128,7 +127,7 @@ def wiener(pulse: Reals, sps: int) -> Reals:
 class GfskPhy(LinearPhy):
     """For cheap transmitters and nonlinear amplifiers: the envelope is constant while a burst lasts.
 
-    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 14..4095 B. The computed curve is that
+    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 1..4095 B. The computed curve is that
     of antipodal pulses, which GMSK comes near to at a bandwidth-time product of 0.5 (MSK is equal).
 
     :param options: see :class:`GfskOptions`
@@ -140,4 +139,4 @@ class GfskPhy(LinearPhy):
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
-        self.modem = GfskModem(Frame(packet_len, self.options.fec), self.options)
+        self.modem = GfskModem(self.frames(), self.options)

@@ -2,7 +2,8 @@
 
 Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is one
 only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
-preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before.
+preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before; the
+payload begins with the word of its length, where lengths differ.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Constants, Frames, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
-from gr_ros2.phy.fec import Soft
+from gr_ros2.phy.fec import Bits, Soft
+from gr_ros2.phy.length_word import WORD_BITS, LengthWord
 from gr_ros2.phy.soft import Points, spread_about
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error
 
@@ -75,7 +77,7 @@ class LinearModem(BurstModem):
     Samples to :meth:`find` and :meth:`read` have passed a filter with :attr:`taps`. The reference sample is that
     of the preamble's first symbol.
 
-    :param frame: what a burst carries
+    :param frames: what bursts carry
     :param order: phases, a power of 2
     :param sps: samples per symbol, 2 or more
     :param turn: phase steps beside data and carrier, radians per symbol
@@ -83,13 +85,12 @@ class LinearModem(BurstModem):
 
     stretch = 2048
 
-    def __init__(self, frame: Frame, order: int, sps: int, turn: float = 0.0) -> None:
-        super().__init__(frame)
+    def __init__(self, frames: Frames, order: int, sps: int, turn: float = 0.0) -> None:
+        super().__init__(frames)
         self.order, self.sps = order, sps
         gray = np.arange(order) ^ np.arange(order) >> 1
         self.constellation = Points(np.exp(2j * np.pi / order * np.argsort(gray)), "big")
-        self.payload_symbols = -(-frame.bits // self.constellation.bits)
-        self.symbols = PREAMBLE + self.payload_symbols
+        self._word = None if frames.fixed else LengthWord(frames.lengths, frames.lengths)
         self.margin = sps + _SLACK
         self._turn = turn
         self._steps = preamble_steps().astype(np.float32)
@@ -104,9 +105,22 @@ class LinearModem(BurstModem):
     def symbol_energy(self) -> float:
         """Energy of a symbol, in units of the mean power of a burst."""
 
+    def payload_symbols(self, packet_len: int) -> int:
+        """Symbols behind the preamble of the burst of a packet of so many bytes."""
+        word = 0 if self._word is None else WORD_BITS
+        return -(-(word + self.frames.bits(packet_len)) // self.constellation.bits)
+
+    def symbols(self, packet_len: int) -> int:
+        """Symbols of the burst of a packet of so many bytes."""
+        return PREAMBLE + self.payload_symbols(packet_len)
+
     @property
     def span(self) -> int:
-        return (self.symbols - 1) * self.sps + 1 + _SLACK
+        return self._needed(self.frames.lengths[0])
+
+    def _needed(self, packet_len: int) -> int:
+        """Samples from the reference sample on that reading a packet of so many bytes needs."""
+        return (self.symbols(packet_len) - 1) * self.sps + 1 + _SLACK
 
     @property
     def preamble_samples(self) -> int:
@@ -137,9 +151,14 @@ class LinearModem(BurstModem):
         basis, _ = np.linalg.qr(columns)
         self._explained = np.asarray(basis.conj().T, np.complex64)
 
+    def payload_bits(self, packet: bytes) -> Bits:
+        """The word of the packet's length, where lengths differ, and its frame."""
+        wrapped = self.frames.of(len(packet)).wrap(packet)
+        return wrapped if self._word is None else np.concatenate((self._word.word(len(packet)), wrapped))
+
     def payload(self, packet: bytes) -> Samples:
         """The payload's points."""
-        return self.constellation.map(self.frame.wrap(packet))
+        return self.constellation.map(self.payload_bits(packet))
 
     def find(self, samples: Samples) -> Search:
         sps = self.sps
@@ -167,34 +186,58 @@ class LinearModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
+    def end(self, samples: Samples, start: int) -> int:
+        length = self.frames.packet_len
+        if self._word is not None:
+            frequency, phase, _ = self._measure(samples, start)
+            length = self._length(samples, start, frequency, phase)
+        return start + self._needed(length)
+
     def read(self, samples: Samples, start: int) -> Reading:
-        sps, order = self.sps, self.order
         frequency, phase, snr = self._measure(samples, start)
+        length, skipped = self.frames.packet_len, 0
+        if self._word is not None:
+            length, skipped = self._length(samples, start, frequency, phase), WORD_BITS
+        points, soft = self._payload(samples, start, frequency, phase, self.payload_symbols(length))
+        return Reading(length, soft[skipped:], points, snr, start + self._needed(length))
+
+    def _length(self, samples: Samples, start: int, frequency: float, phase: float) -> int:
+        """Bytes of the packet, from as many symbols as every burst has."""
+        assert self._word is not None
+        symbols = self.payload_symbols(self.frames.lengths[0])
+        _, soft = self._payload(samples, start, frequency, phase, symbols)
+        return self._word.read(soft)
+
+    def _payload(
+        self, samples: Samples, start: int, frequency: float, phase: float, symbols: int
+    ) -> tuple[Samples, Soft]:
+        """The payload's first so many points, and their soft bits."""
+        sps, order = self.sps, self.order
         late = 0.0
         start_exact = start + self._lateness(samples, start, frequency)
-        points = np.empty(self.payload_symbols, np.complex64)
+        points = np.empty(symbols, np.complex64)
         known_at, known = float(PREAMBLE - 1) / 2, 0.0
-        for first in range(0, self.payload_symbols, _CHUNK):
-            count = min(_CHUNK, self.payload_symbols - first)
-            symbols = first + PREAMBLE + np.arange(count)
+        for first in range(0, symbols, _CHUNK):
+            count = min(_CHUNK, symbols - first)
+            places = first + PREAMBLE + np.arange(count)
             at = start_exact + late + (first + PREAMBLE) * sps
-            turned = np.exp(-1j * (phase + frequency * symbols))
+            turned = np.exp(-1j * (phase + frequency * places))
             raw = _at(samples, at, sps, count) * turned
             edges = np.arange(0, max(1, count // _BLOCK)) * _BLOCK
             raised = np.add.reduceat(np.abs(raw) * np.exp(1j * order * np.angle(raw)), edges)
             centres = first + PREAMBLE + (edges + np.append(edges[1:], count) - 1) / 2
             drift = np.unwrap(np.concatenate(([known * order], np.angle(raised))))[1:] / order
-            drift = np.interp(symbols, np.concatenate(([known_at], centres)), np.concatenate(([known], drift)))
+            drift = np.interp(places, np.concatenate(([known_at], centres)), np.concatenate(([known], drift)))
             straight = (raw * np.exp(-1j * drift)).astype(np.complex64)
             points[first : first + count] = straight
-            known_at, known = float(symbols[-1]), float(drift[-1])
-            if first + count < self.payload_symbols:
+            known_at, known = float(places[-1]), float(drift[-1])
+            if first + count < symbols:
                 model = turned * np.exp(-1j * drift) * self.constellation.nearest(straight).conj()
                 late += summit(*(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1)))
         decided = self.constellation.nearest(points)
         gain, noise = spread_about(points, decided)
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
-        return Reading(self.meant(self.constellation.soft(likely)), points / np.float32(gain), snr)
+        return points / np.float32(gain), self.meant(self.constellation.soft(likely))
 
     @property
     def before_payload(self) -> int | None:
@@ -211,13 +254,14 @@ class LinearModem(BurstModem):
         return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
 
     def constants(self) -> Constants:
-        bits = self.constellation.bits
+        bits, points = self.constellation.bits, self.payload_symbols(self.frames.packet_len)
         before = self.before_payload
         values = {
+            **self.lengths(),
+            "signs": np.empty(0) if self._word is None else self._word.signs,
             "sps": self.sps,
             "order": self.order,
             "point_bits": bits,
-            "payload": self.payload_symbols,
             "preamble": PREAMBLE,
             "chunk": _CHUNK,
             "block": _BLOCK,
@@ -237,7 +281,7 @@ class LinearModem(BurstModem):
             "points": self.constellation.points,
             "marks": self.constellation.marks,
         }
-        return Constants("linear", values, self.payload_symbols * bits, self.payload_symbols)
+        return Constants("linear", values, points * bits, points)
 
     def _measure(self, samples: Samples, start: int) -> tuple[float, float, float]:
         """Carrier frequency and phase from the preamble, in radians per symbol and radians, and SNR.
@@ -306,11 +350,12 @@ class LinearPhy(BurstPhy):
 
     def computed_pdr(self, snr_db: float) -> float:
         snr = 10 ** (snr_db / 10) * self.modem.symbol_energy
-        if self.modem.frame.coded:
-            return coded_success(
-                self.modem.constellation.points, snr, self.modem.frame.data_bits, self.modem.frame.bits
-            )
-        return packet_success(psk_symbol_error(self.modem.order, snr), self.modem.payload_symbols)
+        frames = self.modem.frames
+        bits = frames.bits(self.packet_len)
+        if frames.coded:
+            points = self.modem.constellation.points
+            return coded_success(points, snr, frames.data_bits(self.packet_len), bits)
+        return packet_success(psk_symbol_error(self.modem.order, snr), -(-bits // self.modem.constellation.bits))
 
 
 def shape(symbols: NDArray[_T], taps: Reals, sps: int) -> NDArray[_T]:

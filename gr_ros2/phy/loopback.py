@@ -52,7 +52,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         self._throttled = throttled
         last = source
         if phy.has_samples and throttled:
-            self._gate = AirtimeGate(phy.airtime())
+            self._gate = AirtimeGate(phy.airtime(), airtime_of=phy.airtime if phy.any_length else None)
             last = self._follow(last, self._gate)
         if phy.has_samples:
             # The channel also stops tags.

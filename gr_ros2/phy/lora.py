@@ -1,8 +1,9 @@
 """The `lora` PHY: chirp spread spectrum after LoRa's example, for links far below the noise.
 
-Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame of known length; the
-format is our own (it has LoRa's chirps, Gray code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no
-header), so it does not talk to LoRa modems. With `implementation: lora_sdr` all of this is that module's.
+Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame, whose length is told
+by chirps before it where lengths differ; the format is our own (it has LoRa's chirps, Gray code, diagonal interleaver
+and Hamming code, but CRC-32, PN9 and no header), so it does not talk to LoRa modems. With `implementation: lora_sdr`
+all of this is that module's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
-from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frames, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import summit
@@ -30,6 +31,8 @@ MAX_BURST = 1 << 22
 _UP, _SYNC, _DOWN = 8, (24, 32), 2
 """Symbols of the preamble: plain up-chirps, a sync word, plain down-chirps."""
 _HEAD = _UP + len(_SYNC) + _DOWN
+_TELLING = 4
+"""Chirps that tell the length: with fewer a code's gain would end where they are misheard."""
 _LOOK = 6
 """Up-chirps added up to see a burst."""
 _LIMIT, _THRESHOLD = 10.0, 36.0
@@ -96,12 +99,13 @@ class _Place(NamedTuple):
 class LoraModem(BurstModem):
     """See :class:`LoraOptions`. The reference sample is the first of an up-chirp early in the preamble, about."""
 
-    def __init__(self, frame: Frame, options: LoraOptions) -> None:
-        super().__init__(frame)
+    def __init__(self, frames: Frames, options: LoraOptions) -> None:
+        super().__init__(frames)
         self.spreading_factor, self.code_bits = options.spreading_factor, 4 + options.coding_rate
         self.chips = 1 << options.spreading_factor
-        self.blocks = -(-frame.bits // (4 * options.spreading_factor))
-        self.symbols = self.blocks * self.code_bits
+        self._telling = np.empty((0, 0), np.int64) if frames.fixed else telling(frames.lengths, self.chips)
+        self._before = self._telling.shape[1]
+        """Chirps between preamble and payload."""
         n = np.arange(self.chips)
         self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)
         self._down = self._up.conj()
@@ -115,13 +119,21 @@ class LoraModem(BurstModem):
         self._zeros = [np.flatnonzero(~gray >> bit & 1) for bit in range(options.spreading_factor)]
         self.margin = 2 * self.chips
 
-    @property
-    def burst_samples(self) -> int:
-        return (_HEAD + self.symbols) * self.chips
+    def blocks(self, packet_len: int) -> int:
+        """Blocks of code words of a packet of so many bytes."""
+        return -(-self.frames.bits(packet_len) // (4 * self.spreading_factor))
+
+    def symbols(self, packet_len: int) -> int:
+        """Chirps of a packet's payload."""
+        return self.blocks(packet_len) * self.code_bits
+
+    def samples_of(self, packet_len: int) -> int:
+        return (_HEAD + self._before + self.symbols(packet_len)) * self.chips
 
     @property
     def span(self) -> int:
-        return (_HEAD + 1) * self.chips
+        # With the chirps that tell the length, and what a value between two samples is made from.
+        return (_HEAD + 1 + (self._before + 1 if self._before else 0)) * self.chips
 
     @property
     def preamble_samples(self) -> int:
@@ -132,8 +144,9 @@ class LoraModem(BurstModem):
         return _LOOK * self.chips
 
     def modulate(self, packet: bytes) -> Samples:
-        values = self._spread(self.frame.wrap(packet))
-        starts = np.concatenate((np.zeros(_UP, np.int64), _SYNC, values))
+        values = self._spread(self.frames.of(len(packet)).wrap(packet))
+        told = self._telling[len(packet) - self.frames.lengths[0]] if self._before else ()
+        starts = np.concatenate((np.zeros(_UP, np.int64), _SYNC, told, values)).astype(np.int64)
         chips = (np.arange(self.chips) + starts[:, None]) % self.chips
         ups = self._up[chips]
         head = _UP + len(_SYNC)
@@ -149,8 +162,8 @@ class LoraModem(BurstModem):
         # Neighbours count together: a burst that starts between two samples shares its peak between two bins. However
         # strong, one chirp counts no more than a few times the noise: data repeat a value now and then, and end.
         pairs = np.minimum(powers + np.roll(powers, 1, axis=1), _LIMIT)
-        pairs = np.cumsum(np.concatenate((np.zeros((1, self.chips)), pairs)), axis=0)
-        pairs = pairs[_LOOK:] - pairs[:-_LOOK]
+        # Not as differences of running sums: strong chirps add up to the same, and rounding would choose among them.
+        pairs = np.add.reduce([pairs[first : count - _LOOK + 1 + first] for first in range(_LOOK)])
         above = np.flatnonzero(pairs.max(axis=1) > _THRESHOLD)
         if not len(above):
             return Search((count - _LOOK) * self.chips)
@@ -164,22 +177,39 @@ class LoraModem(BurstModem):
     def end(self, samples: Samples, start: int) -> int:
         place = self._place(samples, start)
         # What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
-        return start + self.span if place is None else int(place.begin) + self.symbols * self.chips - _SINC
+        return start + self.span if place is None else self._end(place, self._length(samples, place))
+
+    def _end(self, place: _Place, length: int) -> int:
+        return round(place.begin) + (self._before + self.symbols(length)) * self.chips - _SINC
+
+    def _tones(self, samples: Samples, place: _Place, first: float, count: int) -> NDArray[np.complex64]:
+        """So many chirps from a place on, as tones, by rows."""
+        turn = np.exp(-2j * np.pi * place.carrier * np.arange(self.chips) / self.chips) * self._down
+        rows = _delayed(samples, first, count * self.chips).reshape(count, self.chips)
+        return np.asarray(rows * turn, np.complex64)
+
+    def _length(self, samples: Samples, place: _Place) -> int:
+        """Bytes of the packet."""
+        if not self._before:
+            return self.frames.packet_len
+        heights = np.abs(np.fft.fft(self._tones(samples, place, place.begin, self._before)))
+        likely = heights[np.arange(self._before), self._telling].sum(axis=1)
+        return self.frames.lengths[0] + int(np.argmax(likely))
 
     def read(self, samples: Samples, start: int) -> Reading | None:
         place = self._place(samples, start)
         if place is None:
             return None
-        begin, carrier, snr = place
-        turn = np.exp(-2j * np.pi * carrier * np.arange(self.chips) / self.chips) * self._down
-        soft = np.empty((self.symbols, self.spreading_factor), np.float32)
-        points = np.empty(self.symbols, np.complex64)
+        length = self._length(samples, place)
+        symbols = self.symbols(length)
+        begin = place.begin + self._before * self.chips
+        soft = np.empty((symbols, self.spreading_factor), np.float32)
+        points = np.empty(symbols, np.complex64)
         step = max(1, _CHUNK // self.chips)
         pace = 0.0
-        for first in range(0, self.symbols, step):
-            count = min(step, self.symbols - first)
-            at = begin + first * self.chips
-            tones = _delayed(samples, at, count * self.chips).reshape(count, self.chips) * turn
+        for first in range(0, symbols, step):
+            count = min(step, symbols - first)
+            tones = self._tones(samples, place, begin + first * self.chips, count)
             spectrum = np.fft.fft(tones)
             heights = np.abs(spectrum)
             peaks = np.argmax(heights, axis=1)
@@ -188,14 +218,17 @@ class LoraModem(BurstModem):
             late = self._late(tones, peaks)
             pace -= _PACE_GAIN * late
             begin += pace - _GAIN * late
-        return Reading(self._collect(soft), points, snr)
+        return Reading(length, self._collect(soft), points, place.snr, self._end(place, length))
 
     def constants(self) -> Constants:
+        symbols = self.symbols(self.frames.packet_len)
         values = {
+            **self.lengths(),
+            "telling": self._telling,
+            "before": self._before,
             "chips": self.chips,
             "spreading_factor": self.spreading_factor,
             "code_bits": self.code_bits,
-            "symbols": self.symbols,
             "step": max(1, _CHUNK // self.chips),
             "look": _LOOK,
             "head": _HEAD,
@@ -214,7 +247,7 @@ class LoraModem(BurstModem):
             "tapered": self._tapered,
             "words": self._words,
         }
-        return Constants("lora", values, self.blocks * self.spreading_factor * 4, self.symbols)
+        return Constants("lora", values, self.blocks(self.frames.packet_len) * self.spreading_factor * 4, symbols)
 
     def _soft(self, heights: NDArray[np.float64]) -> Soft:
         """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
@@ -293,9 +326,9 @@ class LoraModem(BurstModem):
     def _spread(self, bits: Bits) -> NDArray[np.int64]:
         """Bits to chirp starts: Hamming code, diagonal interleaver, Gray code."""
         sf = self.spreading_factor
-        filled = np.zeros(self.blocks * sf * 4, np.int64)
+        filled = np.zeros(-(-len(bits) // (sf * 4)) * sf * 4, np.int64)
         filled[: len(bits)] = bits
-        words = self._words[filled.reshape(-1, 4) @ _NIBBLE].reshape(self.blocks, sf)
+        words = self._words[filled.reshape(-1, 4) @ _NIBBLE].reshape(-1, sf)
         coded = (words[:, :, None] >> np.arange(self.code_bits)) & 1
         rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
         mixed = coded[:, rows, np.arange(self.code_bits)[:, None]]
@@ -307,9 +340,9 @@ class LoraModem(BurstModem):
     def _collect(self, soft: Soft) -> Soft:
         """Soft bits of chirps to those of the frame, through the likeliest code words."""
         sf = self.spreading_factor
-        mixed = soft.reshape(self.blocks, self.code_bits, sf)
+        mixed = soft.reshape(-1, self.code_bits, sf)
         rows = (np.arange(sf)[None, :] + np.arange(self.code_bits)[:, None]) % sf
-        coded = np.empty((self.blocks, sf, self.code_bits), np.float32)
+        coded = np.empty((len(mixed), sf, self.code_bits), np.float32)
         coded[:, rows, np.arange(self.code_bits)[:, None]] = mixed
         signs = 2.0 * (self._words[:, None] >> np.arange(self.code_bits) & 1) - 1
         likely = coded.reshape(-1, self.code_bits) @ (signs.T / 2).astype(np.float32)
@@ -327,6 +360,20 @@ def code_words(check_bits: int) -> NDArray[np.int64]:
     checks = [d[0] ^ d[1] ^ d[2], d[1] ^ d[2] ^ d[3], d[0] ^ d[1] ^ d[3], d[0] ^ d[2] ^ d[3]]
     chosen = [parity] if check_bits == 1 else checks[:check_bits]
     return np.asarray(data + sum((bit << 4 + i) for i, bit in enumerate(chosen)))
+
+
+def telling(lengths: range, chips: int) -> NDArray[np.int64]:
+    """Where the chirps that tell a length begin, by rows: of any two lengths three of the four differ.
+
+    Of lengths below the number of chips all four do, and of neighbours in opposite directions, so that a carrier
+    measured wrongly by one bin makes no length another.
+
+    :param lengths: bytes, below 32 times ``chips``
+    :param chips: of a chirp, 128 or more
+    """
+    high, low = np.divmod(np.array(lengths), chips)
+    ways = np.array([1, -1, 1, -1])[:_TELLING]
+    return np.asarray((low[:, None] * ways + high[:, None] * np.arange(_TELLING)) % chips)
 
 
 def _delayed(samples: Samples, at: float, count: int) -> Samples:
@@ -367,7 +414,7 @@ class LoraPhy(BurstPhy):
         for name in _SDR_ONLY:
             if getattr(chosen, name) != getattr(LoraOptions, name):
                 raise ConfigError(f"phy lora: {name} = {getattr(chosen, name)}: only with implementation = lora_sdr")
-        self.modem: LoraModem = LoraModem(Frame(packet_len, chosen.fec), chosen)
+        self.modem: LoraModem = LoraModem(self.frames(), chosen)
         if self.modem.burst_samples > MAX_BURST:
             raise ConfigError(
                 f"phy lora: packet_len = {packet_len} with spreading_factor = {chosen.spreading_factor}: a burst "
@@ -411,8 +458,12 @@ class LoraPhy(BurstPhy):
             carrier=None if chosen.carrier_hz is None else chosen.carrier_hz * per_chip / self.sample_rate,
         )
 
-    def airtime_samples(self) -> int:
-        return super().airtime_samples() if self._sdr is None else self._sdr.airtime_samples
+    @property
+    def any_length(self) -> bool:
+        return self._sdr is None and super().any_length
+
+    def airtime_samples(self, packet_len: int | None = None) -> int:
+        return super().airtime_samples(packet_len) if self._sdr is None else self._sdr.airtime_samples
 
     def burst_power(self) -> float:
         return 1.0
@@ -428,9 +479,10 @@ class LoraPhy(BurstPhy):
         lost = at_least(2 if check_bits >= 3 else 1, 4 + check_bits, wrong)
         if self._sdr is not None:
             return (1 - at_least(2, 8, wrong)) * packet_success(lost, self._sdr.blocks)
-        if self.modem.frame.coded:
-            return coded_orthogonal_success(chips, wrong, self.modem.frame.data_bits, self.modem.symbols)
-        return packet_success(lost, self.modem.blocks)
+        modem, length = self.modem, self.packet_len
+        if modem.frames.coded:
+            return coded_orthogonal_success(chips, wrong, modem.frames.data_bits(length), modem.symbols(length))
+        return packet_success(lost, modem.blocks(length))
 
     def runs_on(self) -> str:
         return super().runs_on() if self._sdr is None else STOCK

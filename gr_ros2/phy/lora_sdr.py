@@ -172,7 +172,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
     """Message port `pdus` in, `pdus` out: nibbles of each packet's frame."""
 
     def __init__(self, frame: SdrFrame) -> None:
-        super().__init__(frame.packet_len, "gr_ros2_lora_sdr_framer", None, None)
+        super().__init__(range(frame.packet_len, frame.packet_len + 1), "gr_ros2_lora_sdr_framer", None, None)
         self._frame = frame
         self.message_port_register_out(PDUS)
 

@@ -67,14 +67,14 @@ def record(phy: Phy, count: int, seed: int = 0) -> Recording:
 def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
     """The samples a PHY's transmitter makes of packets, one behind the other.
 
-    :param packets: of the PHY's packet_len
+    :param packets: of lengths the PHY takes
     :raises PhyError: for a PHY without samples, or when the samples do not come
     """
     top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
     top.connect(transmitter, sink)
     outlet = _Outlet()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
-    wanted = len(packets) * phy.airtime_samples()
+    wanted = sum(phy.airtime_samples(len(packet)) for packet in packets)
     try:
         begin(top.start)
         for packet in packets:

@@ -1,7 +1,8 @@
 """The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, by a modem of our own or by those blocks.
 
 Law: own and stock send the same samples for the same packet, but for the number in the header, and take the same time
-but for the gap (packets of which a CRC-32 would not fit the stock header excepted).
+but for the gap (packets of which a CRC-32 would not fit the stock header excepted). Ours are as long as they need where
+``lengths`` is not fixed, and the stock receiver understands them all the same.
 """
 
 from __future__ import annotations
@@ -13,9 +14,8 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
-from gr_ros2.phy.burst import Frame
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
-from gr_ros2.phy.ofdm_layout import Layout, point_power
+from gr_ros2.phy.ofdm_layout import CRC_LEN, Layout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
@@ -83,10 +83,9 @@ class OfdmPhy(BurstPhy):
             self._stock = self._checked_stock()
             self.gap = self._stock.gap
         else:
-            fill = layout.fill(packet_len)
-            mask = layout.mask(packet_len + fill + 4)
-            frame = Frame(packet_len, chosen.fec, order="little", fill=fill, mask=mask)
-            self.modem: OfdmModem = OfdmModem(frame, layout, None if threshold == AUTO else threshold)
+            mask = layout.mask(packet_len + layout.fill(packet_len) + CRC_LEN)
+            frames = self.frames(order="little", multiple=layout.multiple, mask=mask)
+            self.modem: OfdmModem = OfdmModem(frames, layout, None if threshold == AUTO else threshold)
 
     def _checked_stock(self) -> StockFrame:
         chosen, symbol = self.options, self.layout.symbol_samples
@@ -101,11 +100,15 @@ class OfdmPhy(BurstPhy):
         return StockFrame(self.layout, self.packet_len, gap)
 
     def frame_bits(self) -> int:
-        """Payload bits of one frame, CRC-32, filling and coding included."""
-        return self.modem.frame.bits if self._stock is None else self._stock.bits
+        """Payload bits of the longest frame, CRC-32, filling and coding included."""
+        return self.modem.frames.bits(self.packet_len) if self._stock is None else self._stock.bits
 
-    def airtime_samples(self) -> int:
-        return self.layout.symbols(self.frame_bits()) * self.layout.symbol_samples + self.gap
+    @property
+    def any_length(self) -> bool:
+        return self._stock is None and super().any_length
+
+    def airtime_samples(self, packet_len: int | None = None) -> int:
+        return super().airtime_samples(packet_len) if self._stock is None else self._stock.airtime_samples
 
     def burst_power(self) -> float:
         return self.layout.power(self.frame_bits())
@@ -113,8 +116,9 @@ class OfdmPhy(BurstPhy):
     def computed_pdr(self, snr_db: float) -> float:
         noise = self.burst_power() / 10 ** (snr_db / 10)
         snr = point_power(self.options.payload_modulation) * self.options.fft_len / noise
-        if self._stock is None and self.modem.frame.coded:
-            return coded_success(self.modem.constellation.points, snr, self.modem.frame.data_bits, self.frame_bits())
+        if self._stock is None and self.modem.frames.coded:
+            bits = self.modem.frames.data_bits(self.packet_len)
+            return coded_success(self.modem.constellation.points, snr, bits, self.frame_bits())
         order = 1 << self.layout.bits_per_carrier
         error = psk_symbol_error(order, snr) if order <= 8 else qam_symbol_error(order, snr)
         return packet_success(error, self.frame_bits() // self.layout.bits_per_carrier)

@@ -18,6 +18,7 @@ from gnuradio.digital import ofdm_txrx
 from numpy.typing import NDArray
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.phy.length_word import WORD_BITS
 
 BITS = {"bpsk": 1, "qpsk": 2, "8psk": 3, "16qam": 4, "64qam": 6}
 """Payload bits on one carrier of one symbol, by modulation."""
@@ -30,8 +31,6 @@ CRC_LEN = 4
 _MAX_FRAME_LEN = 4095
 """The stock header counts the bytes of its frame, CRC-32 included, in 12 bits."""
 _HEADER_SEED = 0x6F
-_HEADER_BITS = 32
-"""Bits of the header, one on a carrier."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class Layout:
             raise ConfigError(
                 f"phy ofdm: carriers = {self.outermost}: at most {self.fft_len // 2 - 1} with this fft_len"
             )
-        if left < _HEADER_BITS:
+        if left < WORD_BITS:
             raise ConfigError(
-                f"phy ofdm: {left} carriers are left for data, the header needs {_HEADER_BITS}; "
+                f"phy ofdm: {left} carriers are left for data, the header needs {WORD_BITS}; "
                 "use more carriers, or fewer pilots"
             )
         if self.pilot_places is None and self.outermost < max(places):
@@ -88,9 +87,14 @@ class Layout:
         """Payload bits on one carrier of one symbol."""
         return BITS[self.modulation]
 
+    @property
+    def multiple(self) -> int:
+        """What the bytes of a frame are a multiple of, so that it takes whole constellation points."""
+        return 3 if self.bits_per_carrier % 3 == 0 else 1
+
     def fill(self, packet_len: int) -> int:
         """Bytes a packet is filled up with, so that it and its CRC-32 take whole constellation points."""
-        return -(packet_len + CRC_LEN) % (3 if self.bits_per_carrier % 3 == 0 else 1)
+        return -(packet_len + CRC_LEN) % self.multiple
 
     def fits_header(self, packet_len: int) -> bool:
         """Whether the header has room for the length of a frame with a CRC-32."""
@@ -116,13 +120,9 @@ class Layout:
         seed = _SCRAMBLER["seed"] if self.scramble else 0
         return np.packbits(_register(seed, 8 * length), bitorder="little")
 
-    def header_bits(self, length: int) -> NDArray[np.uint8]:
-        """The header of frame number 0: length in bytes (of which it has room for 12 bits), number, CRC-8."""
-        size = len(self.data[0])
-        fields = (length % (_MAX_FRAME_LEN + 1)).to_bytes(2, "little") + bytes(2)
-        value = int.from_bytes(fields[:2], "little") | _crc8(fields) << 24
-        bits = np.array([value >> place & 1 if place < _HEADER_BITS else 0 for place in range(size)], np.uint8)
-        return bits ^ _register(_HEADER_SEED if self.scramble else 0, size)
+    def header_mask(self) -> NDArray[np.uint8]:
+        """What scrambling adds to the bits of the header, zeros where it is off. Behind its 32 bits there are zeros."""
+        return _register(_HEADER_SEED if self.scramble else 0, len(self.data[0]))
 
     @property
     def pilots(self) -> tuple[tuple[int, ...], ...]:
@@ -214,13 +214,3 @@ def _register(seed: int, count: int) -> NDArray[np.uint8]:
         bits[place] = state & 1
         state = state >> 1 | ((state & _SCRAMBLER["mask"]).bit_count() & 1) << _SCRAMBLER["len"]
     return bits
-
-
-def _crc8(data: bytes) -> int:
-    """Polynomial 0x07, start 0xFF, highest bit first."""
-    crc = 0xFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x07 if crc & 0x80 else 0)) & 0xFF
-    return crc

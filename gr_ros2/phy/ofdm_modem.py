@@ -2,7 +2,7 @@
 
 Laws: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a short
 impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the payload
-is decided to be, weighted with how sure that is.
+is decided to be, weighted with how sure that is; how long that is the header says, where lengths differ.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frame, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Constants, Frames, Reading, Samples, Search
+from gr_ros2.phy.fec import Soft
+from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
 from gr_ros2.phy.soft import Points
 
@@ -38,6 +40,8 @@ _TURN = 0.4
 _DOUBT = 1e-3
 """Of the power of what was sent: with less doubt about it symbols are not decided again in order to estimate."""
 _TINY = 1e-20
+_FILL_MARK = 0x555
+"""In the number field of a header, for each byte that the frame is filled up with."""
 
 
 class _Place(NamedTuple):
@@ -66,13 +70,13 @@ class _Channel(NamedTuple):
 class OfdmModem(BurstModem):
     """See :class:`gr_ros2.phy.ofdm.OfdmOptions`. The reference sample is the first of the first sync word's prefix.
 
-    :param frame: what a burst carries, lowest bit of a byte first
+    :param frames: what bursts carry, lowest bit of a byte first
     :param layout: carriers and constellation
     :param threshold: of the preamble's metric, 0..1; None = by the share of false alarms
     """
 
-    def __init__(self, frame: Frame, layout: Layout, threshold: float | None) -> None:
-        super().__init__(frame)
+    def __init__(self, frames: Frames, layout: Layout, threshold: float | None) -> None:
+        super().__init__(frames)
         self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
         self._bpsk = Points(np.array([-1, 1], complex), "little")
         self._layout = layout
@@ -83,14 +87,14 @@ class OfdmModem(BurstModem):
         self._back = self._prefix // 4
         self.margin = self._prefix
         self.stretch = max(2048, 16 * self._size)
-        self.symbols = layout.symbols(frame.bits)
-        self._power = layout.power(frame.bits)
+        self._power = layout.power(frames.bits(frames.packet_len))
         self._carriers = np.array(sorted(layout.data[0] + layout.pilots[0]))
         self._data = np.flatnonzero(np.isin(self._carriers, layout.data[0]))
         self._pilots = np.searchsorted(self._carriers, layout.pilots[0])
         self._known = np.zeros(len(self._carriers), np.complex64)
         self._known[self._pilots] = layout.pilot_symbols[0]
-        self._header = self._bpsk.map(layout.header_bits(-(-frame.bits // 8)))
+        self._header_mask = layout.header_mask()
+        self._prepare_header()
         words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
         self._words = words[:, self._carriers].astype(np.complex64)
         self._twice, self._once = np.flatnonzero(self._words[0]), np.flatnonzero(self._words[0] == 0)
@@ -98,6 +102,29 @@ class OfdmModem(BurstModem):
         self._pair_weight = float((np.abs(self._crosswise) ** 2).sum()) / len(self._twice)
         self._prepare_search(words)
         self._prepare_estimate()
+
+    def _prepare_header(self) -> None:
+        frames = self.frames
+        self._word: LengthWord | None = None
+        if frames.fixed:
+            self._full = header_bits([-(-frames.bits(frames.packet_len) // 8)], 0)[0]
+            return
+        fields = [frames.length(length) for length in frames.lengths]
+        self._word = LengthWord(frames.lengths, fields, [frames.fill(length) * _FILL_MARK for length in frames.lengths])
+        self._full = self._word.word(frames.packet_len)
+
+    def _header(self, packet_len: int) -> Samples:
+        """The header's points."""
+        bits = self._header_mask.copy()
+        bits[:WORD_BITS] ^= self._full if self._word is None else self._word.word(packet_len)
+        return self._bpsk.map(bits)
+
+    def _said(self, soft: Soft) -> int:
+        """Bytes of the packet, from soft bits of the header."""
+        if self._word is None:
+            return self.frames.packet_len
+        word = soft[:WORD_BITS] * (1 - 2.0 * self._header_mask[:WORD_BITS])
+        return self._word.read_header(word)
 
     def _prepare_search(self, words: NDArray[np.complex128]) -> None:
         even = np.flatnonzero(np.abs(words[0]) > 0)
@@ -124,13 +151,12 @@ class OfdmModem(BurstModem):
         self._smooth = smoother(np.ones(len(self._carriers)))
         self._degrees = 2 * len(self._carriers) - len(delays)
 
-    @property
-    def burst_samples(self) -> int:
-        return self.symbols * self._symbol
+    def samples_of(self, packet_len: int) -> int:
+        return self._layout.symbols(self.frames.bits(packet_len)) * self._symbol
 
     @property
     def span(self) -> int:
-        return self.burst_samples - self._back
+        return self.samples_of(self.frames.lengths[0]) - self._back
 
     @property
     def preamble_samples(self) -> int:
@@ -141,13 +167,14 @@ class OfdmModem(BurstModem):
         return self._symbol
 
     def modulate(self, packet: bytes) -> Samples:
-        grid = np.zeros((self.symbols, self._size), np.complex64)
+        symbols = self._layout.symbols(self.frames.bits(len(packet)))
+        grid = np.zeros((symbols, self._size), np.complex64)
         grid[:2, self._carriers] = self._words
-        payload = np.zeros((self.symbols - 2, len(self._carriers)), np.complex64)
+        payload = np.zeros((symbols - 2, len(self._carriers)), np.complex64)
         payload[:] = self._known
-        points = np.zeros((self.symbols - 2, len(self._data)), np.complex64)
-        points[0] = self._header
-        mapped = self.constellation.map(self.frame.wrap(packet))
+        points = np.zeros((symbols - 2, len(self._data)), np.complex64)
+        points[0] = self._header(len(packet))
+        mapped = self.constellation.map(self.frames.of(len(packet)).wrap(packet))
         points[1:].reshape(-1)[: len(mapped)] = mapped
         payload[:, self._data] = points
         grid[2:, self._carriers] = payload
@@ -181,15 +208,33 @@ class OfdmModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
+    def end(self, samples: Samples, start: int) -> int:
+        if self._word is None:
+            return start + self._needed(self.frames.packet_len)
+        begin, frequency, _ = self._place(samples, start)
+        rows = self._rows(samples, _Clock(float(begin), 0.0), frequency, 0, HEAD_SYMBOLS)
+        return start + self._needed(self._head(rows)[1])
+
+    def _needed(self, packet_len: int) -> int:
+        """Samples from the reference sample on that reading a packet of so many bytes needs."""
+        return self.samples_of(packet_len) - self._back
+
+    def _head(self, rows: Complexes) -> tuple[_Channel, int]:
+        """What sync words and header tell: the channel, and the bytes of the packet."""
+        all_used = np.ones((1, len(self._data)), bool)
+        channel = self._first_estimate(rows[:2])
+        channel, likely, _, _ = self._decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
+        return channel, self._said(self._bpsk.soft(likely))
+
     def read(self, samples: Samples, start: int) -> Reading:
         begin, frequency, _ = self._place(samples, start)
         clock = _Clock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
-        channel = self._first_estimate(rows[:2])
         snr = self._snr(rows[:2])
-        channel, _, _, _ = self._decide(rows[2:], channel, self._bpsk, np.ones((1, len(self._data)), bool), rounds=1)
-        count = self.symbols - HEAD_SYMBOLS
-        points = -(-self.frame.bits // self.constellation.bits)
+        channel, length = self._head(rows)
+        bits = self.frames.bits(length)
+        count = self._layout.symbols(bits) - HEAD_SYMBOLS
+        points = -(-bits // self.constellation.bits)
         used = np.arange(count * len(self._data)).reshape(count, -1) < points
         soft, looked = [], []
         for first in range(0, count, _CHUNK):
@@ -200,16 +245,18 @@ class OfdmModem(BurstModem):
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
             clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
-        return Reading(np.concatenate(soft), np.concatenate(looked), snr)
+        end = start + self._needed(length)
+        return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end)
 
     def constants(self) -> Constants:
-        points = -(-self.frame.bits // self.constellation.bits)
+        points = -(-self.frames.bits(self.frames.packet_len) // self.constellation.bits)
         values = {
+            **self.lengths(),
+            "headers": self._full if self._word is None else self._word.bits,
+            "header_mask": self._header_mask,
             "size": self._size,
             "prefix": self._prefix,
-            "symbols": self.symbols,
             "repeat": self._repeat,
-            "frame_bits": self.frame.bits,
             "degrees": self._degrees,
             "chunk": _CHUNK,
             "carrier_count": len(self._carriers),
@@ -243,7 +290,6 @@ class OfdmModem(BurstModem):
             "smooth": self._smooth,
             "smooth_words": self._smooth_words,
             "crosswise": self._crosswise,
-            "header": self._header,
             "points": self.constellation.points,
             "word_weight": self._word_weight,
             "marks": self.constellation.marks,

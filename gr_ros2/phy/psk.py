@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.burst import Frame, Samples
+from gr_ros2.phy.burst import Frames, Samples
 from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, shape
 
 _ORDER = {"bpsk": 2, "qpsk": 4, "8psk": 8}
@@ -35,8 +35,8 @@ class PskOptions(LinearOptions):
 class PskModem(LinearModem):
     """See :class:`PskOptions`."""
 
-    def __init__(self, frame: Frame, options: PskOptions) -> None:
-        super().__init__(frame, _ORDER[options.modulation], options.sps)
+    def __init__(self, frames: Frames, options: PskOptions) -> None:
+        super().__init__(frames, _ORDER[options.modulation], options.sps)
         taps = firdes.root_raised_cosine(1.0, options.sps, 1.0, options.rolloff, _PULSE_SYMBOLS * options.sps + 1)
         pulse = np.array(taps)
         pulse /= np.sqrt((pulse**2).sum())
@@ -46,11 +46,10 @@ class PskModem(LinearModem):
 
     @property
     def symbol_energy(self) -> float:
-        return self.burst_samples / self.symbols
+        return self.burst_samples / self.symbols(self.frames.packet_len)
 
-    @property
-    def burst_samples(self) -> int:
-        return (self.symbols - 1) * self.sps + len(self.taps)
+    def samples_of(self, packet_len: int) -> int:
+        return (self.symbols(packet_len) - 1) * self.sps + len(self.taps)
 
     @property
     def preamble(self) -> Samples:
@@ -63,7 +62,7 @@ class PskModem(LinearModem):
 class PskPhy(LinearPhy):
     """Single carrier for narrow channels without echoes: an echo of a symbol's length is beyond it, take `ofdm` there.
 
-    Carrier offset up to 5 % of the symbol rate, clocks within 100 ppm; packets of 14..4095 B.
+    Carrier offset up to 5 % of the symbol rate, clocks within 100 ppm; packets of 1..4095 B.
 
     :param options: see :class:`PskOptions`
     :raises ConfigError: for an option that is unknown or out of range
@@ -74,4 +73,4 @@ class PskPhy(LinearPhy):
 
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
-        self.modem = PskModem(Frame(packet_len, self.options.fec), self.options)
+        self.modem = PskModem(self.frames(), self.options)

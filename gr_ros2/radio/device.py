@@ -155,7 +155,7 @@ class DeviceFrontEnd(FrontEnd):
         """s after each burst in which nothing is sent."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self) -> float:
+    def airtime(self, packet_len: int | None = None) -> float:  # noqa: ARG002 - all bursts are as long
         return self.layout.total / self.phy.sample_rate + self._silence()
 
     def early(self) -> float:

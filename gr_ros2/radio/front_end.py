@@ -46,6 +46,8 @@ class FrontEnd(ABC):
     """Whether the channel is a real one, which no setting can impair."""
     loops_back: ClassVar[bool] = False
     """Whether a robot hears itself as if it were another."""
+    any_length: ClassVar[bool] = False
+    """Whether bursts may be of different lengths; else each is as long as the longest, and packets with it."""
     refuses: ClassVar[frozenset[str]] = frozenset()
     """Options of its base that it cannot have, and GRC does not offer."""
 
@@ -55,6 +57,8 @@ class FrontEnd(ABC):
             raise ConfigError(
                 f"front_end {self.name}: phy {phy.name} has no samples to carry; choose another phy, or front_end sim"
             )
+        if not self.any_length:
+            phy.pad_all()
         self.phy = phy
 
     @property
@@ -75,9 +79,12 @@ class FrontEnd(ABC):
         """Hz at which it receives; None where there is no radio."""
         return None
 
-    def airtime(self) -> float:
-        """s from the start of one packet to the earliest start of the next."""
-        return self.phy.airtime() + float(self.options.guard_s)
+    def airtime(self, packet_len: int | None = None) -> float:
+        """s from the start of one packet to the earliest start of the next.
+
+        :param packet_len: its bytes, None = those of the longest
+        """
+        return self.phy.airtime(packet_len) + float(self.options.guard_s)
 
     def early(self) -> float:
         """s before its airtime is over at which a packet has to come: 0 where samples need no time to pass."""

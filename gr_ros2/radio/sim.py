@@ -18,6 +18,7 @@ class SimFrontEnd(FrontEnd):
 
     name = "sim"
     loops_back = True
+    any_length = True
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)

@@ -179,7 +179,7 @@ def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost() -> None:
         stack.callback(flowgraph.wait)
         stack.callback(flowgraph.stop)
         publisher.publish(message(0, 200))
-        wait_for(lambda: heard, "the first message")
+        wait_for(lambda: heard and tap.packets, "the first message and its packets")
         sent = [message(0, 200)]
         thrown = list(garbage(5, tap.packets[0]))
         for number, bad in enumerate(thrown, start=1):

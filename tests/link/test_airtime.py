@@ -112,3 +112,17 @@ def test_a_source_that_obeys_credits_never_overlaps_and_never_piles_up(
         now = max(at, now + 1e-9)
         ends += [now] * len(clock.due(now))
     assert len(ends) == len(thinking)
+
+
+def test_a_packet_takes_the_air_for_its_own_airtime_and_is_promised_that_of_the_longest() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0)
+    clock.offer("short", 0.0, 0.25)
+    clock.offer("long", 0.0)
+    assert clock.due(0.24) == []
+    assert clock.due(0.25) == ["short"]
+    assert clock.due(1.24) == []
+    assert clock.due(1.25) == ["long"]
+    assert clock.grants(1.25) == 1
+    assert clock.grants(2.24) == 0
+    clock.offer("short", 1.25, 0.25)
+    assert clock.grants(1.5) == 1

@@ -13,7 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import numpy as np
 
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstReceiver, Frame, whitening
+from gr_ros2.phy.burst import BurstReceiver, Frames, Samples, whitening
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.lora import code_words
 
@@ -39,11 +39,16 @@ def bursts(phy: Any, count: int, seed: int = 0) -> tuple[list[bytes], np.ndarray
     return packets, np.concatenate([*parts, np.zeros(400)])
 
 
-def listen(phy: Any, samples: np.ndarray, cut: int = 4096) -> tuple[list[bytes], int]:
-    """Packets received, and how many bursts were damaged."""
+def received_by(phy: Any, samples: np.ndarray) -> Samples:
+    """Samples as a modem gets them."""
     if phy.receiver_taps is not None:
         samples = np.convolve(samples, phy.receiver_taps)
-    samples = samples.astype(np.complex64)
+    return samples.astype(np.complex64)
+
+
+def listen(phy: Any, samples: np.ndarray, cut: int = 4096) -> tuple[list[bytes], int]:
+    """Packets received, and how many bursts were damaged."""
+    samples = received_by(phy, samples)
     engine = BurstReceiver(phy.modem)
     packets = [packet for at in range(0, len(samples), cut) for packet in engine.feed(samples[at : at + cut])]
     return packets, engine.damaged
@@ -66,7 +71,7 @@ def delayed(samples: np.ndarray, delay: float) -> np.ndarray:
 
 
 def test_a_frame_is_whitened_and_checked() -> None:
-    frame = Frame(20)
+    frame = Frames(20).of(20)
     wrapped = frame.wrap(bytes(20))
     whole = bytes(20) + zlib.crc32(bytes(20)).to_bytes(4, "little")
     assert np.array_equal(np.packbits(wrapped), np.frombuffer(whole, np.uint8) ^ whitening(24))
@@ -89,6 +94,16 @@ def test_it_does_not_matter_where_the_stream_is_cut(name: str, cut: int) -> None
     phy = PHY.load(name)(64, 1e6)
     packets, samples = bursts(phy, 12)
     assert received(phy, samples, cut) == packets
+
+
+@pytest.mark.parametrize("cut", [1, 777, 1_000_000])
+@pytest.mark.parametrize("name", NAMES)
+def test_packets_of_any_length_come_out_wherever_the_stream_is_cut(name: str, cut: int) -> None:
+    phy = PHY.load(name)(64, 1e6)
+    draw = random.Random(4)
+    packets = [draw.randbytes(draw.randrange(1, 65)) for _ in range(4 if cut == 1 else 20)]
+    parts = [part for packet in packets for part in (phy.modem.modulate(packet), np.zeros(phy.gap))]
+    assert received(phy, np.concatenate([np.zeros(200), *parts, np.zeros(40)]), cut) == packets
 
 
 @pytest.mark.parametrize("options", [{"coding_rate": 1, "gap": 16}, {"spreading_factor": 9, "coding_rate": 3}], ids=str)

@@ -15,7 +15,7 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from gr_ros2.phy.measure import deliver, pdr, record
+from gr_ros2.phy.measure import deliver, modulated, pdr, record
 from gr_ros2.phy.tap import SYMBOLS_SHOWN
 from gr_ros2.phy.theory import half_point
 from tests.gr.probe import Probe
@@ -84,6 +84,32 @@ def test_nothing_is_lost_back_to_back_and_the_air_is_as_long_and_strong_as_claim
     power = np.mean(np.abs(samples) ** 2) * phy.airtime_samples() / (phy.airtime_samples() - phy.gap)  # type: ignore[attr-defined]
     assert power == pytest.approx(phy.burst_power(), rel=0.09 if packet_len < 1000 else 0.04)
     assert np.all(samples.reshape(count, -1)[:, -phy.gap :] == 0)  # type: ignore[attr-defined]
+    assert deliver(phy, recording, ChannelConfig()) == recording.packets
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_packets_take_the_air_that_their_bytes_need(name: str, options: dict[str, Any]) -> None:
+    phy = make(name, options)
+    if not phy.any_length:
+        assert phy.airtime_samples(1) == phy.airtime_samples()
+        return
+    draw = random.Random(7)
+    lengths = [1, 2, 3, 62, 63, 64, *(draw.randrange(1, 65) for _ in range(6)), 64, 1]
+    recording = modulated(phy, [draw.randbytes(length) for length in lengths])
+    assert len(recording.samples) == sum(phy.airtime_samples(length) for length in lengths)
+    assert deliver(phy, recording, ChannelConfig(snr_db=30, seed=1)) == recording.packets
+    assert phy.airtime_samples(1) <= phy.airtime_samples(13) <= phy.airtime_samples(64) == phy.airtime_samples()
+    phy.pad_all()
+    assert not phy.any_length
+    assert phy.airtime_samples(1) == phy.airtime_samples()
+
+
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_lengths_that_are_fixed_take_no_other_packet(name: str) -> None:
+    phy = make(name, {"lengths": "fixed"})
+    assert not phy.any_length
+    assert phy.airtime_samples(13) == phy.airtime_samples() <= make(name, {}).airtime_samples()
+    recording = record(phy, 5)
     assert deliver(phy, recording, ChannelConfig()) == recording.packets
 
 
@@ -182,11 +208,12 @@ def test_a_pdu_that_is_no_packet_is_counted_and_not_sent(name: str) -> None:
     source, sink = Probe(), Probe()
     link = LoopbackLink(make(name, {}), source, sink, throttled=False)
     with link:
-        source.post(bytes(63))
+        source.post(b"")
+        source.post(bytes(65))
         source.post(bytes(64))
         wait_for(lambda: sink.handled == 1, "the right one")
         assert link.counts().transmitted == 1
-        assert link._transmitter.refused == 1
+        assert link._transmitter.refused == 2
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -13,7 +13,7 @@ import numpy as np
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import BackendMissingError
 from gr_ros2.phy import PHY, fec
-from gr_ros2.phy.fec import make_code
+from gr_ros2.phy.fec import Codes
 from gr_ros2.phy.measure import deliver, pdr, record
 from gr_ros2.phy.theory import coded_success, half_point
 
@@ -31,7 +31,7 @@ def bits(count: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("count", [144, 152, 153, 544, 902, 903, 1281, 32792])
 @pytest.mark.parametrize("name", ["none", *CODES])
 def test_any_number_of_bits(name: str, count: int) -> None:
-    code = make_code(name, count)
+    code = Codes(name).of(count)
     data = bits(count)
     sent = code.encode(data)
     assert len(sent) == code.coded_bits
@@ -41,7 +41,7 @@ def test_any_number_of_bits(name: str, count: int) -> None:
 
 @pytest.mark.parametrize("name", CODES)
 def test_a_burst_of_errors_is_corrected(name: str) -> None:
-    code = make_code(name, 544)
+    code = Codes(name).of(544)
     data = bits(544)
     received = soft(code.encode(data))
     received[300:340] = 0  # a fade
@@ -51,7 +51,7 @@ def test_a_burst_of_errors_is_corrected(name: str) -> None:
 
 @pytest.mark.parametrize("name", CODES)
 def test_certainty_beyond_measure_does_no_harm(name: str) -> None:
-    code = make_code(name, 544)
+    code = Codes(name).of(544)
     data = bits(544)
     assert np.array_equal(code.decode(soft(code.encode(data)) * np.float32(1e6)), data)
 
@@ -59,7 +59,7 @@ def test_certainty_beyond_measure_does_no_harm(name: str) -> None:
 @pytest.mark.parametrize(("name", "at_db"), [("cc", 4.0), ("ldpc", 2.5), ("polar", 3.0)])
 def test_packets_of_64_bytes_arrive_at_an_eb_n0_that_loses_all_without_a_code(name: str, at_db: float) -> None:
     def share(which: str) -> float:
-        code = make_code(which, 544)
+        code = Codes(which).of(544)
         energy = 10 ** (at_db / 10) * code.bits / code.coded_bits
         draw, right = np.random.default_rng(1), 0
         for seed in range(60):
@@ -103,4 +103,4 @@ def test_the_bound_is_that_of_the_literature() -> None:
 def test_missing_matrices_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fec.gr, "prefix", lambda: "/nowhere")
     with pytest.raises(BackendMissingError, match=r"/nowhere/share/gnuradio/fec/ldpc"):
-        make_code("ldpc", 544)
+        Codes("ldpc").of(544)

@@ -107,7 +107,7 @@ def test_without_the_module_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) 
         BackendMissingError, match=r"implementation 'lora_sdr' needs .*gr-lora_sdr.*take 'own', at both"
     ):
         make()
-    assert LoraPhy(64, 1e6).airtime_samples() == 22048
+    assert LoraPhy(64, 1e6).airtime_samples() == 22560
 
 
 @with_the_module

@@ -28,6 +28,9 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 }  // namespace
 
+// Of this interface and of the parameters in `modem.h`: one more with each change. `kernels/library.py` has the same.
+GR_ROS2_API int kernels_version() { return 2; }
+
 // What it was compiled for.
 GR_ROS2_API const char* kernels_target() {
 #if defined(__AVX2__) && defined(__FMA__)
@@ -87,18 +90,19 @@ GR_ROS2_API int64_t modem_end(const void* modem, const void* samples, int64_t co
 
 // 1, or 0 where there is no burst, or -1 without memory.
 GR_ROS2_API int modem_read(const void* modem, const void* samples, int64_t count, int64_t start, float* soft, void* points,
-                           double* snr) {
+                           void* report) {
     try {
-        return static_cast<const Modem*>(modem)->read(view(samples, count), start, soft, static_cast<Sample*>(points), snr);
+        return static_cast<const Modem*>(modem)->read(view(samples, count), start, soft, static_cast<Sample*>(points),
+                                                      static_cast<Report*>(report));
     } catch (const std::exception&) {
         return -1;
     }
 }
 
 // 1, or 0 where the kernel leaves it to numpy, or -1 without memory.
-GR_ROS2_API int modem_modulate(const void* modem, const uint8_t* bits, void* out) {
+GR_ROS2_API int modem_modulate(const void* modem, const uint8_t* bits, int32_t length, void* out) {
     try {
-        return static_cast<const Modem*>(modem)->modulate(bits, static_cast<Sample*>(out));
+        return static_cast<const Modem*>(modem)->modulate(bits, length, static_cast<Sample*>(out));
     } catch (const std::exception&) {
         return -1;
     }

@@ -16,8 +16,11 @@ from typing import Any
 _FOLDER = Path(__file__).parent
 _EVERYWHERE, _AVX2 = "_baseline", "_avx2"
 """Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
+VERSION = 2
+"""That of ``abi.cpp``: a library left from before a change is not used."""
 _POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "kernels_version": (_INT, []),
     "kernels_target": (ctypes.c_char_p, []),
     "kernels_has_avx2": (_INT, []),
     "modem_new": (_POINTER, [_INT, _POINTER, _LONG]),
@@ -25,7 +28,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "modem_find": (_LONG, [_POINTER, _POINTER, _LONG, _POINTER]),
     "modem_end": (_LONG, [_POINTER, _POINTER, _LONG, _LONG]),
     "modem_read": (_INT, [_POINTER, _POINTER, _LONG, _LONG, _POINTER, _POINTER, _POINTER]),
-    "modem_modulate": (_INT, [_POINTER, _POINTER, _POINTER]),
+    "modem_modulate": (_INT, [_POINTER, _POINTER, _INT, _POINTER]),
 }
 """Result and arguments of each function of ``abi.cpp``."""
 
@@ -72,4 +75,6 @@ def _open(path: Path) -> Any:
     for name, (result, arguments) in _SIGNATURES.items():
         function = getattr(functions, name)
         function.restype, function.argtypes = result, arguments
+    if functions.kernels_version() != VERSION:
+        raise OSError(f"{path.name} is of version {functions.kernels_version()}, not {VERSION}")
     return functions

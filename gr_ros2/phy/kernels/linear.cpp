@@ -17,7 +17,14 @@ struct Carrier {
     double frequency, alike;
 };
 
+// A burst's carrier and first symbol.
+struct Track {
+    double begin, phase, frequency, snr;
+};
+
 struct Scratch {
+    std::vector<Sample> head;                              // the points that tell the length
+    std::vector<float> head_soft;
     std::vector<float> re, im, power, match, chance;       // per sample, per position
     std::vector<Sample> symbols, spectrum, spare, rotation;  // per preamble symbol, per bin
     std::vector<Sample> raw, turned, other;                // per symbol of a chunk
@@ -35,6 +42,8 @@ class Linear final : public Modem {
    public:
     explicit Linear(const LinearParameters& p)
         : p_(p),
+          lengths_(p.shortest, p.longest, p.frame_bits),
+          signs_(p.signs, p.signs + (lengths_.fixed() ? 0 : static_cast<size_t>(lengths_.count()) * kWordBits)),
           steps_(p.steps, p.steps + p.preamble - 1),
           known_(p.known, p.known + p.preamble),
           explained_(p.explained, p.explained + static_cast<size_t>(p.unknowns) * (p.preamble - 2 * p.edge)),
@@ -62,25 +71,69 @@ class Linear final : public Modem {
         return {positions, kNone};
     }
 
-    int64_t end(Samples, int64_t start) const override {
-        return start + static_cast<int64_t>(p_.preamble + p_.payload - 1) * p_.sps + 1 + p_.slack;
+    int64_t end(Samples samples, int64_t start) const override {
+        int length = lengths_.longest();
+        Scratch& s = prepared();
+        if (!lengths_.fixed() && start >= 1 && start < samples.count) {
+            const Carrier found = carrier(samples, start, s);
+            length = said(samples, measured(samples, start, found, s), s);
+        }
+        return start + needed(length);
     }
 
-    bool read(Samples samples, int64_t start, float* soft, Sample* points, double* snr) const override {
+    bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
         if (start < 1 || start >= samples.count) return false;
         Scratch& s = prepared();
         const Carrier found = carrier(samples, start, s);
-        const double frequency = found.frequency + p_.turn;
-        const double phase = straighten(found.frequency, s);
-        *snr = signal_to_noise(s);
-        const double begin = static_cast<double>(start) + lateness(samples, start, found.frequency, s);
-        if (!follow(samples, begin, phase, frequency, points, s)) return false;
-        decide(points, soft, s);
-        if (p_.differential) differ(soft);
+        const Track track = measured(samples, start, found, s);
+        report->snr = track.snr;
+        const int length = lengths_.fixed() ? lengths_.longest() : said(samples, track, s);
+        const int payload = symbols(length);
+        if (!follow(samples, track, payload, points, s)) return false;
+        decide(points, payload, soft, s);
+        if (p_.differential) differ(soft, payload);
+        const int skipped = lengths_.fixed() ? 0 : kWordBits;
+        report->soft = static_cast<int64_t>(payload) * p_.point_bits - skipped;
+        if (skipped) std::memmove(soft, soft + skipped, sizeof(float) * report->soft);
+        report->points = payload;
+        report->length = length;
+        report->end = start + needed(length);
         return true;
     }
 
    private:
+    // Symbols behind the preamble.
+    int symbols(int length) const {
+        const int bits = lengths_.bits(length) + (lengths_.fixed() ? 0 : kWordBits);
+        return (bits + p_.point_bits - 1) / p_.point_bits;
+    }
+
+    // Samples from the reference sample on.
+    int64_t needed(int length) const {
+        return static_cast<int64_t>(p_.preamble + symbols(length) - 1) * p_.sps + 1 + p_.slack;
+    }
+
+    // What a preamble tells of what follows.
+    Track measured(Samples samples, int64_t start, const Carrier& found, Scratch& s) const {
+        Track track;
+        track.frequency = found.frequency + p_.turn;
+        track.phase = straighten(found.frequency, s);
+        track.snr = signal_to_noise(s);
+        track.begin = static_cast<double>(start) + lateness(samples, start, found.frequency, s);
+        return track;
+    }
+
+    // Bytes of the packet, from as many symbols as every burst has.
+    int said(Samples samples, const Track& track, Scratch& s) const {
+        const int payload = symbols(lengths_.shortest());
+        s.head.resize(payload);
+        s.head_soft.resize(static_cast<size_t>(payload) * p_.point_bits);
+        follow(samples, track, payload, s.head.data(), s);
+        decide(s.head.data(), payload, s.head_soft.data(), s);
+        if (p_.differential) differ(s.head_soft.data(), payload);
+        return lengths_.shortest() + likeliest_word(signs_.data(), lengths_.count(), s.head_soft.data());
+    }
+
     Scratch& prepared() const {
         Scratch& s = scratch();
         for (auto* one : {&s.symbols, &s.rotation}) one->resize(p_.preamble);
@@ -90,7 +143,7 @@ class Linear final : public Modem {
         s.drift.resize(p_.chunk);
         const int blocks = std::max(1, p_.chunk / p_.block);
         for (auto* one : {&s.places, &s.angles}) one->resize(blocks + 1);
-        s.decided.resize(p_.payload);
+        s.decided.resize(symbols(lengths_.longest()));
         return s;
     }
 
@@ -205,11 +258,12 @@ class Linear final : public Modem {
     }
 
     // The payload's points, straightened, in blocks and chunks; false where this cannot be a burst.
-    bool follow(Samples samples, double begin, double phase, double frequency, Sample* points, Scratch& s) const {
+    bool follow(Samples samples, const Track& track, int payload, Sample* points, Scratch& s) const {
+        const double begin = track.begin, phase = track.phase, frequency = track.frequency;
         const int order = p_.order;
         double late = 0, known_at = (p_.preamble - 1) / 2.0, known = 0;
-        for (int first = 0; first < p_.payload; first += p_.chunk) {
-            const int count = std::min(p_.chunk, p_.payload - first), symbol = first + p_.preamble;
+        for (int first = 0; first < payload; first += p_.chunk) {
+            const int count = std::min(p_.chunk, payload - first), symbol = first + p_.preamble;
             const double at = begin + late + static_cast<double>(symbol) * p_.sps;
             if (!(std::abs(late) < kFar)) return false;
             between(samples, at, count, s.raw.data());
@@ -231,7 +285,7 @@ class Linear final : public Modem {
             }
             known_at = symbol + count - 1;
             known = s.drift[count - 1];
-            if (first + count < p_.payload) late += chunk_lateness(samples, at, points + first, count, s);
+            if (first + count < payload) late += chunk_lateness(samples, at, points + first, count, s);
         }
         return true;
     }
@@ -303,22 +357,22 @@ class Linear final : public Modem {
     }
 
     // Points made as large as the constellation's, and their soft bits.
-    void decide(Sample* points, float* soft, Scratch& s) const {
+    void decide(Sample* points, int payload, float* soft, Scratch& s) const {
         double energy = 0, alike = 0, rest = 0;
-        for (int k = 0; k < p_.payload; k++) {
+        for (int k = 0; k < payload; k++) {
             s.decided[k] = points_.nearest(points[k]);
             const Sample decided = points_.point(s.decided[k]);
             energy += square(decided);
             alike += mul_conj(points[k], decided).real();
         }
         const double gain = std::max(alike / std::max(energy, 1e-20), 1e-20);
-        for (int k = 0; k < p_.payload; k++)
+        for (int k = 0; k < payload; k++)
             rest += square(points[k] - points_.point(s.decided[k]) * static_cast<float>(gain));
-        const double noise = rest / p_.payload / (gain * gain);
+        const double noise = rest / payload / (gain * gain);
         const auto sharpness = static_cast<float>(1 / std::max(noise, kSmallestNoise * points_.power()));
         const auto inverse = static_cast<float>(1 / gain);
         float likely[64];
-        for (int k = 0; k < p_.payload; k++) {
+        for (int k = 0; k < payload; k++) {
             points[k] *= inverse;
             for (int q = 0; q < p_.order; q++) likely[q] = points_.likelihood(points[k], q) * sharpness;
             points_.soft_of(likely, soft + static_cast<size_t>(k) * p_.point_bits);
@@ -326,9 +380,9 @@ class Linear final : public Modem {
     }
 
     // Bits that are 1 where a phase is that of the symbol before; the first one's before is the preamble's last.
-    void differ(float* soft) const {
+    void differ(float* soft, int payload) const {
         float before = p_.last_one ? INFINITY : -INFINITY;
-        for (int k = 0; k < p_.payload; k++) {
+        for (int k = 0; k < payload; k++) {
             const float here = soft[k], least = std::min(std::abs(here), std::abs(before));
             soft[k] = here == 0 || before == 0 ? 0.0f : (here > 0) == (before > 0) ? least : -least;
             before = here;
@@ -336,6 +390,8 @@ class Linear final : public Modem {
     }
 
     LinearParameters p_;  // its numbers; arrays are copied below
+    Lengths lengths_;
+    std::vector<float> signs_;
     std::vector<float> steps_;
     std::vector<Sample> known_, explained_;
     Constellation points_;

@@ -30,6 +30,8 @@ class Lora final : public Modem {
    public:
     explicit Lora(const LoraParameters& p)
         : p_(p),
+          lengths_(p.shortest, p.longest, p.frame_bits),
+          telling_(p.telling, p.telling + static_cast<size_t>(p.before) * lengths_.count()),
           down_(p.down_chirp, p.down_chirp + p.chips),
           up_(p.up_chirp, p.up_chirp + p.chips),
           tapered_(p.tapered, p.tapered + p.chips),
@@ -78,34 +80,79 @@ class Lora final : public Modem {
     }
 
     int64_t end(Samples samples, int64_t start) const override {
-        const Place place = look(samples, start, prepared());
-        // What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
-        if (!place.found) return start + static_cast<int64_t>(p_.head + 1) * p_.chips;
-        return static_cast<int64_t>(place.begin) + static_cast<int64_t>(p_.symbols) * p_.chips - p_.sinc;
+        Scratch& s = prepared();
+        const Place place = look(samples, start, s);
+        // What is no burst need not be waited for.
+        if (!place.found) return start + static_cast<int64_t>(p_.head + 1 + (p_.before ? p_.before + 1 : 0)) * p_.chips;
+        straighten(place, s);
+        return ending(place, said(samples, place, s));
     }
 
-    bool read(Samples samples, int64_t start, float* soft, Sample* points, double* snr) const override {
+    bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
         Scratch& s = prepared();
         const Place place = look(samples, start, s);
         if (!place.found) return false;
-        *snr = place.snr;
         const int chips = p_.chips;
-        Rotation(0, -kTau * place.carrier / chips).fill(s.turned.data(), chips);
-        for (int k = 0; k < chips; k++) s.turned[k] = mul(s.turned[k], down_[k]);
-        double begin = place.begin, pace = 0;
-        for (int first = 0; first < p_.symbols; first += p_.step) {
-            const int count = std::min(p_.step, p_.symbols - first);
+        straighten(place, s);
+        const int length = said(samples, place, s), payload = symbols(length);
+        *report = {place.snr, ending(place, length), length, static_cast<int64_t>(payload / p_.code_bits) *
+                   p_.spreading_factor * kNibble, payload};
+        double begin = place.begin + static_cast<double>(p_.before) * chips, pace = 0;
+        for (int first = 0; first < payload; first += p_.step) {
+            const int count = std::min(p_.step, payload - first);
             delayed(samples, begin + static_cast<double>(first) * chips, count * chips, s);
             chirp_bits(count, points + first, &s.soft[static_cast<size_t>(first) * p_.spreading_factor], s);
             const double late = lateness(count, s);
             pace -= p_.pace_gain * late;
             begin += pace - p_.gain * late;
         }
-        collect(s.soft.data(), soft);
+        collect(s.soft.data(), payload, soft);
         return true;
     }
 
    private:
+    // Chirps of the payload.
+    int symbols(int length) const {
+        const int block = kNibble * p_.spreading_factor;
+        return (lengths_.bits(length) + block - 1) / block * p_.code_bits;
+    }
+
+    // Of a burst clocks and channel may keep back a few samples.
+    int64_t ending(const Place& place, int length) const {
+        return std::llrint(place.begin) + static_cast<int64_t>(p_.before + symbols(length)) * p_.chips - p_.sinc;
+    }
+
+    // Into `turned` what makes tones of chirps.
+    void straighten(const Place& place, Scratch& s) const {
+        Rotation(0, -kTau * place.carrier / p_.chips).fill(s.turned.data(), p_.chips);
+        for (int k = 0; k < p_.chips; k++) s.turned[k] = mul(s.turned[k], down_[k]);
+    }
+
+    // Bytes of the packet, from the chirps before the payload.
+    int said(Samples samples, const Place& place, Scratch& s) const {
+        if (!p_.before) return lengths_.longest();
+        const int chips = p_.chips;
+        s.heights.resize(static_cast<size_t>(std::max(p_.before, p_.step)) * chips);
+        for (int chirp = 0; chirp < p_.before; chirp++) {
+            delayed(samples, place.begin + static_cast<double>(chirp) * chips, chips, s);
+            std::copy_n(s.tones.begin(), chips, s.row.begin());
+            fft_.run(s.row.data(), s.spare.data());
+            for (int k = 0; k < chips; k++) s.heights[static_cast<size_t>(chirp) * chips + k] = std::sqrt(square(s.row[k]));
+        }
+        int best = 0;
+        float most = -1;
+        const int32_t* places = telling_.data();
+        for (int row = 0; row < lengths_.count(); row++, places += p_.before) {
+            float sum = 0;
+            for (int chirp = 0; chirp < p_.before; chirp++) sum += s.heights[static_cast<size_t>(chirp) * chips + places[chirp]];
+            if (sum > most) {
+                most = sum;
+                best = row;
+            }
+        }
+        return lengths_.shortest() + best;
+    }
+
     Scratch& prepared() const {
         Scratch& s = scratch();
         const size_t chips = p_.chips, fine = static_cast<size_t>(p_.fine) * chips, chunk = p_.step * chips;
@@ -118,7 +165,7 @@ class Lora final : public Modem {
         s.places.resize(p_.step);
         s.peaks.resize(p_.step);
         s.padded.resize(chunk + 2 * p_.sinc);
-        s.soft.resize(static_cast<size_t>(p_.symbols) * p_.spreading_factor);
+        s.soft.resize(static_cast<size_t>(symbols(lengths_.longest())) * p_.spreading_factor);
         return s;
     }
 
@@ -353,9 +400,9 @@ class Lora final : public Modem {
     }
 
     // Soft bits of chirps to those of the frame, through the likeliest code words.
-    void collect(const float* soft, float* out) const {
+    void collect(const float* soft, int payload, float* out) const {
         const int sf = p_.spreading_factor;
-        for (int block = 0; block < p_.symbols / p_.code_bits; block++, soft += p_.code_bits * sf) {
+        for (int block = 0; block < payload / p_.code_bits; block++, soft += p_.code_bits * sf) {
             for (int word = 0; word < sf; word++, out += kNibble) {
                 float coded[kMostCodeBits], likely[kWords];
                 for (int j = 0; j < p_.code_bits; j++) coded[j] = soft[j * sf + (word + sf * kMostCodeBits - j) % sf];
@@ -377,6 +424,8 @@ class Lora final : public Modem {
     }
 
     LoraParameters p_;  // its numbers; arrays are copied below
+    Lengths lengths_;
+    std::vector<int32_t> telling_;
     std::vector<Sample> down_, up_, tapered_;
     std::vector<int32_t> words_;
     std::vector<Sample> roots_;

@@ -25,6 +25,50 @@ struct Search {
     int64_t start;  // kNone: no burst (yet)
 };
 
+// What a burst says of itself beside its bits.
+struct Report {
+    double snr;
+    int64_t end;           // index behind its last sample that was needed
+    int64_t length;        // bytes of the packet
+    int64_t soft, points;  // how many of each
+};
+
+// The lengths that packets may have, `shortest` to `longest` bytes, and the bits of each on the air. Where there is only one
+// nothing tells it.
+class Lengths {
+   public:
+    Lengths(int32_t shortest, int32_t longest, const int32_t* bits)
+        : shortest_(shortest), bits_(bits, bits + (longest - shortest + 1)) {}
+
+    bool fixed() const { return bits_.size() == 1; }
+    int count() const { return static_cast<int>(bits_.size()); }
+    int longest() const { return shortest_ + count() - 1; }
+    int shortest() const { return shortest_; }
+    int row(int length) const { return length - shortest_; }
+    int bits(int length) const { return bits_[row(length)]; }
+
+   private:
+    int32_t shortest_;
+    std::vector<int32_t> bits_;
+};
+
+constexpr int kWordBits = 32;
+
+// The row of signs that soft bits of a word are most alike: gr_ros2/phy/length_word.py.
+inline int likeliest_word(const float* signs, int count, const float* soft) {
+    int best = 0;
+    float most = 0;
+    for (int row = 0; row < count; row++, signs += kWordBits) {
+        float sum = 0;
+        for (int bit = 0; bit < kWordBits; bit++) sum += signs[bit] * soft[bit];
+        if (row == 0 || sum > most) {
+            most = sum;
+            best = row;
+        }
+    }
+    return best;
+}
+
 class Modem {
    public:
     virtual ~Modem() = default;
@@ -34,12 +78,13 @@ class Modem {
     // Index behind the last sample that `read` needs.
     virtual int64_t end(Samples samples, int64_t start) const = 0;
 
-    // Soft bits, points and SNR of a burst; false where there is none after all.
-    virtual bool read(Samples samples, int64_t start, float* soft, Sample* points, double* snr) const = 0;
+    // Soft bits, points and what else a burst says; false where there is none after all.
+    virtual bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const = 0;
 
-    // The samples of a burst, from the bits of a frame; false where numpy does it as well.
-    virtual bool modulate(const uint8_t* bits, Sample* out) const {
-        (void)bits, (void)out;
+    // The samples of the burst of a packet of so many bytes, from the bits of its frame; false where numpy does it as
+    // well.
+    virtual bool modulate(const uint8_t* bits, int32_t length, Sample* out) const {
+        (void)bits, (void)length, (void)out;
         return false;
     }
 };
@@ -47,28 +92,32 @@ class Modem {
 // In each, numbers come before arrays, and `kernels/modem.py` has the same fields in the same order.
 
 struct OfdmParameters {
-    int32_t size, prefix, symbols, repeat, frame_bits, degrees, chunk, carrier_count, data_count, pilot_count, once_count,
-        twice_count, shift_count, point_count, point_bits;
+    int32_t shortest, longest;
+    int32_t size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count, once_count, twice_count,
+        shift_count, point_count, point_bits;
     double level, alike, energy, power, pair_weight, word_weight_sum, pace_gain, memory, reach, doubt;
-    const int32_t *carriers, *data, *pilots, *once, *twice, *shifts;
-    const Sample *words, *known, *turns, *whole, *smooth, *smooth_words, *crosswise, *header, *points;
+    const int32_t *frame_bits, *carriers, *data, *pilots, *once, *twice, *shifts;
+    const Sample *words, *known, *turns, *whole, *smooth, *smooth_words, *crosswise, *points;
     const float* word_weight;
-    const uint8_t* marks;
+    const uint8_t *marks, *headers, *header_mask;
 };
 
 struct LinearParameters {
-    int32_t sps, order, point_bits, payload, preamble, chunk, block, rise, edge, slack, unknowns, differential, last_one;
+    int32_t shortest, longest;
+    int32_t sps, order, point_bits, preamble, chunk, block, rise, edge, slack, unknowns, differential, last_one;
     double turn, clean_energy, threshold, alike;
-    const float* steps;
+    const int32_t* frame_bits;
+    const float *signs, *steps;
     const Sample *known, *explained, *points;
     const uint8_t* marks;
 };
 
 struct LoraParameters {
-    int32_t chips, spreading_factor, code_bits, symbols, step, look, head, sync, down, fine, sinc;
+    int32_t shortest, longest;
+    int32_t before, chips, spreading_factor, code_bits, step, look, head, sync, down, fine, sinc;
     double median_share, limit, threshold, gain, pace_gain, certain;
+    const int32_t *frame_bits, *telling, *words;
     const Sample *down_chirp, *up_chirp, *tapered;
-    const int32_t* words;
 };
 
 std::unique_ptr<Modem> make_ofdm(const OfdmParameters& given);

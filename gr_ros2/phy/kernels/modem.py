@@ -32,21 +32,23 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "ofdm": (
         0,
         _fields(
-            int32="size prefix symbols repeat frame_bits degrees chunk carrier_count data_count pilot_count once_count "
+            int32="shortest longest size prefix repeat degrees chunk carrier_count data_count pilot_count once_count "
             "twice_count shift_count point_count point_bits",
             float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
-            int32s="carriers data pilots once twice shifts",
-            complex64s="words known turns whole smooth smooth_words crosswise header points",
+            int32s="frame_bits carriers data pilots once twice shifts",
+            complex64s="words known turns whole smooth smooth_words crosswise points",
             float32s="word_weight",
-            uint8s="marks",
+            uint8s="marks headers header_mask",
         ),
     ),
     "linear": (
         1,
         _fields(
-            int32="sps order point_bits payload preamble chunk block rise edge slack unknowns differential last_one",
+            int32="shortest longest sps order point_bits preamble chunk block rise edge slack unknowns differential "
+            "last_one",
             float64="turn clean_energy threshold alike",
-            float32s="steps",
+            int32s="frame_bits",
+            float32s="signs steps",
             complex64s="known explained points",
             uint8s="marks",
         ),
@@ -54,15 +56,27 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "lora": (
         2,
         _fields(
-            int32="chips spreading_factor code_bits symbols step look head sync down fine sinc",
+            int32="shortest longest before chips spreading_factor code_bits step look head sync down fine sinc",
             float64="median_share limit threshold gain pace_gain certain",
+            int32s="frame_bits telling words",
             complex64s="down_chirp up_chirp tapered",
-            int32s="words",
         ),
     ),
 }
 """Number of each kernel, and what it has to be told."""
 _NUMBERS = {"int32": ctypes.c_int32, "float64": ctypes.c_double}
+
+
+class _Report(ctypes.Structure):
+    """That of ``modem.h``."""
+
+    _fields_ = (
+        ("snr", ctypes.c_double),
+        ("end", ctypes.c_int64),
+        ("length", ctypes.c_int64),
+        ("soft", ctypes.c_int64),
+        ("points", ctypes.c_int64),
+    )
 
 
 class CompiledModem(BurstModem):
@@ -73,7 +87,7 @@ class CompiledModem(BurstModem):
     """
 
     def __init__(self, reference: BurstModem) -> None:
-        super().__init__(reference.frame)
+        super().__init__(reference.frames)
         constants = reference.constants()
         assert constants is not None
         self._reference = reference
@@ -82,14 +96,12 @@ class CompiledModem(BurstModem):
         self._kernel = _new(self._functions, constants)
         weakref.finalize(self, self._functions.modem_free, self._kernel)
         self._soft, self._points = constants.soft_bits, constants.points
-        self._fixed_span = reference.span if type(reference).end is BurstModem.end else None
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
 
-    @property
-    def burst_samples(self) -> int:
-        return self._reference.burst_samples
+    def samples_of(self, packet_len: int) -> int:
+        return self._reference.samples_of(packet_len)
 
     @property
     def span(self) -> int:
@@ -104,9 +116,9 @@ class CompiledModem(BurstModem):
         return self._reference.peak_samples
 
     def modulate(self, packet: bytes) -> Samples:
-        bits = self.frame.wrap(packet)
-        out = np.empty(self.burst_samples, np.complex64)
-        if _done(self._functions.modem_modulate(self._kernel, _address(bits), _address(out))):
+        bits = self.frames.of(len(packet)).wrap(packet)
+        out = np.empty(self.samples_of(len(packet)), np.complex64)
+        if _done(self._functions.modem_modulate(self._kernel, _address(bits), len(packet), _address(out))):
             return out
         return self._reference.modulate(packet)
 
@@ -117,19 +129,17 @@ class CompiledModem(BurstModem):
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
     def end(self, samples: Samples, start: int) -> int:
-        if self._fixed_span is not None:
-            return start + self._fixed_span
         samples = np.ascontiguousarray(samples, np.complex64)
         return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
 
     def read(self, samples: Samples, start: int) -> Reading | None:
         samples = np.ascontiguousarray(samples, np.complex64)
         soft, points = np.empty(self._soft, np.float32), np.empty(self._points, np.complex64)
-        snr = ctypes.c_double()
-        given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(snr))
+        report = _Report()
+        given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(report))
         if not _done(self._functions.modem_read(self._kernel, *given)):
             return None
-        return Reading(soft, points, snr.value)
+        return Reading(report.length, soft[: report.soft], points[: report.points], report.snr, report.end)
 
 
 def _new(functions: Any, constants: Constants) -> int:

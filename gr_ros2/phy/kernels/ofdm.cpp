@@ -8,6 +8,7 @@ namespace {
 
 constexpr double kTiny = 1e-20;
 constexpr int kHead = 3;          // two sync words and the header
+constexpr int kFieldBits = 12;     // of the header: length, number
 constexpr int kToneSize = 1024;   // the finest grid of `tone`
 constexpr float kSmallestNoise = 1e-6f;
 constexpr double kFar = 1e6;         // samples that no burst can be late
@@ -30,7 +31,7 @@ struct Scratch {
     std::vector<Sample> gains, before, sum, step, known;           // per used carrier
     std::vector<float> weight, total;
     std::vector<Sample> inverse;                                   // per data carrier
-    std::vector<float> sharpness;
+    std::vector<float> sharpness, header;
     std::vector<Sample> tone, straight;                            // per symbol
     Received seen;
 };
@@ -67,6 +68,7 @@ class Ofdm final : public Modem {
    public:
     explicit Ofdm(const OfdmParameters& p)
         : p_(p),
+          lengths_(p.shortest, p.longest, p.frame_bits),
           symbol_(p.size + p.prefix),
           half_(p.size / 2),
           window_(symbol_ - p.size / 2),
@@ -85,12 +87,14 @@ class Ofdm final : public Modem {
           smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
           smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
           crosswise_(copied(p.crosswise, 2 * p.twice_count)),
-          header_(copied(p.header, p.data_count)),
+          headers_(copied(p.headers, static_cast<size_t>(lengths_.count()) * kWordBits)),
+          header_mask_(copied(p.header_mask, p.data_count)),
           word_weight_(copied(p.word_weight, used_)),
           points_(p.points, p.point_count, p.point_bits, p.marks),
           bpsk_(bpsk()),
           fft_(p.size),
           roots_(kToneSize) {
+        for (uint8_t bit : headers_) signs_.push_back(bit ? 1.0f : -1.0f);
         for (int carrier : carriers_) bins_.push_back((carrier + p.size) % p.size);
         for (int k = 0; k < kToneSize; k++) roots_[k] = unit(-kTau * k / kToneSize);
     }
@@ -137,18 +141,27 @@ class Ofdm final : public Modem {
         return {positions, kNone};
     }
 
-    int64_t end(Samples, int64_t start) const override { return start + p_.symbols * symbol_ - back_; }
+    int64_t end(Samples samples, int64_t start) const override {
+        if (lengths_.fixed()) return start + needed(lengths_.longest());
+        Scratch& s = prepared();
+        const Place place = look(samples, start, s);
+        spectra(samples, {static_cast<double>(place.begin), 0.0}, place.frequency, 0, kHead, s);
+        return start + needed(head(s, first_estimate(s)));
+    }
 
-    bool read(Samples samples, int64_t start, float* soft, Sample* seen, double* snr) const override {
+    bool read(Samples samples, int64_t start, float* soft, Sample* seen, Report* report) const override {
         Scratch& s = prepared();
         const Place place = look(samples, start, s);
         Clock clock{static_cast<double>(place.begin), 0.0};
         spectra(samples, clock, place.frequency, 0, kHead, s);
         const float noise = first_estimate(s);
-        *snr = signal_to_noise(s);
-        std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
-        decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
-        const int count = p_.symbols - kHead, all = (p_.frame_bits + p_.point_bits - 1) / p_.point_bits;
+        report->snr = signal_to_noise(s);
+        const int length = head(s, noise);
+        const int count = symbols(length) - kHead, all = (lengths_.bits(length) + p_.point_bits - 1) / p_.point_bits;
+        report->length = length;
+        report->end = start + needed(length);
+        report->points = all;
+        report->soft = static_cast<int64_t>(all) * p_.point_bits;
         int done = 0;
         for (int first = 0; first < count; first += p_.chunk) {
             const int rows = std::min(p_.chunk, count - first);
@@ -165,20 +178,22 @@ class Ofdm final : public Modem {
         return true;
     }
 
-    bool modulate(const uint8_t* bits, Sample* out) const override {
+    bool modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
         Scratch& s = prepared();
+        const int frame_bits = lengths_.bits(length), count = symbols(length);
+        const uint8_t* header = &headers_[static_cast<size_t>(lengths_.row(length)) * kWordBits];
         int taken = 0;
-        for (int symbol = 0; symbol < p_.symbols; symbol++, out += symbol_) {
+        for (int symbol = 0; symbol < count; symbol++, out += symbol_) {
             Sample* grid = s.first.data();
             std::fill_n(grid, p_.size, Sample());
             const Sample* word = symbol < 2 ? &words_[symbol * used_] : known_.data();
             for (int c = 0; c < used_; c++) grid[bins_[c]] = word[c];
             for (int d = 0; symbol >= 2 && d < p_.data_count; d++) {
                 Sample& at = grid[bins_[data_[d]]];
-                if (symbol == 2) at = header_[d];
-                else if (taken < p_.frame_bits) {
+                if (symbol == 2) at = (d < kWordBits ? header[d] : 0) ^ header_mask_[d] ? 1.0f : -1.0f;
+                else if (taken < frame_bits) {
                     int value = 0;
-                    for (int bit = 0; bit < p_.point_bits && taken < p_.frame_bits; bit++) value |= bits[taken++] << bit;
+                    for (int bit = 0; bit < p_.point_bits && taken < frame_bits; bit++) value |= bits[taken++] << bit;
                     at = points_.point(value);
                 }
             }
@@ -192,6 +207,59 @@ class Ofdm final : public Modem {
     }
 
    private:
+    int symbols(int length) const {
+        const int each = p_.point_bits * p_.data_count;
+        return kHead + (lengths_.bits(length) + each - 1) / each;
+    }
+
+    // Samples from the reference sample on.
+    int64_t needed(int length) const { return static_cast<int64_t>(symbols(length)) * symbol_ - back_; }
+
+    // What the header tells once the sync words have told the channel: bytes of the packet, and more of the channel.
+    int head(Scratch& s, float noise) const {
+        std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
+        decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
+        if (lengths_.fixed()) return lengths_.longest();
+        s.header.resize(p_.data_count);
+        bpsk_.soft(s.seen, p_.data_count, s.header.data());
+        for (int bit = 0; bit < kWordBits; bit++) s.header[bit] = header_mask_[bit] ? -s.header[bit] : s.header[bit];
+        return said(s.header.data());
+    }
+
+    // The length that a header says: of GNU Radio's blocks too, which count frames and send the longest only.
+    int said(const float* soft) const {
+        uint32_t hard = 0;
+        for (int bit = 0; bit < kWordBits; bit++) hard |= static_cast<uint32_t>(soft[bit] > 0) << bit;
+        const int last = lengths_.count() - 1;
+        if (field(hard) == field(own(last)) && hard >> 2 * kFieldBits == crc8(hard)) {
+            for (int row = last; row >= 0 && field(own(row)) == field(hard); row--)
+                if (own(row) == hard) return lengths_.shortest() + row;
+            return lengths_.longest();
+        }
+        return lengths_.shortest() + likeliest_word(signs_.data(), lengths_.count(), soft);
+    }
+
+    static uint32_t field(uint32_t header) { return header & ((1u << kFieldBits) - 1); }
+
+    // The header of a length, by its row.
+    uint32_t own(int row) const {
+        uint32_t bits = 0;
+        for (int bit = 0; bit < kWordBits; bit++)
+            bits |= static_cast<uint32_t>(headers_[static_cast<size_t>(row) * kWordBits + bit]) << bit;
+        return bits;
+    }
+
+    // Of length and number, each as 16 bits with the lower 8 first: polynomial 0x07, start 0xff.
+    static uint32_t crc8(uint32_t header) {
+        const uint32_t length = field(header), number = field(header >> kFieldBits);
+        uint32_t crc = 0xff;
+        for (uint32_t byte : {length & 0xff, length >> 8, number & 0xff, number >> 8}) {
+            crc ^= byte;
+            for (int bit = 0; bit < 8; bit++) crc = (crc << 1 ^ (crc & 0x80 ? 0x07 : 0)) & 0xff;
+        }
+        return crc;
+    }
+
     Scratch& prepared() const {
         Scratch& s = scratch();
         for (auto* one : {&s.rotation, &s.first, &s.second, &s.profile, &s.spare}) one->resize(p_.size);
@@ -522,9 +590,12 @@ class Ofdm final : public Modem {
     }
 
     OfdmParameters p_;  // its numbers; arrays are copied below
+    Lengths lengths_;
     int symbol_, half_, window_, back_, used_;
     std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
-    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_, header_;
+    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_;
+    std::vector<uint8_t> headers_, header_mask_;
+    std::vector<float> signs_;
     std::vector<float> word_weight_;
     Constellation points_, bpsk_;
     Fft fft_;

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pytest
 
 from gr_ros2.phy import PHY
@@ -77,10 +76,3 @@ def hear(modem: BurstModem, samples: Samples, cuts: list[int]) -> Heard:
         number += 1
         packets += [(at, packet) for packet in engine.feed(piece)]
     return Heard(packets, engine.damaged)
-
-
-def received(phy: Any, samples: np.ndarray) -> Samples:
-    """Samples as a modem gets them."""
-    if phy.receiver_taps is not None:
-        samples = np.convolve(samples, phy.receiver_taps)
-    return samples.astype(np.complex64)

@@ -17,8 +17,9 @@ import numpy as np
 from gr_ros2.phy.burst import BurstModem, Constants, Samples
 from gr_ros2.phy.kernels.modem import KERNELS
 from tests.once import once
-from tests.phy.kernels.support import IDS, SETTINGS, make, received
+from tests.phy.kernels.support import IDS, SETTINGS, make
 from tests.phy.test_burst import bursts, noise
+from tests.phy.test_burst import received_by as received
 
 ROOT = Path(__file__).resolve().parents[3]
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
@@ -83,13 +84,15 @@ def test_same_as_numpy(name: str, options: dict[str, Any], program: list[str], t
     out = subprocess.run([*program, str(tmp_path / "burst")], capture_output=True, check=True).stdout
     searched, start, end, read = np.frombuffer(out, "<i8", 4).tolist()
     snr = float(np.frombuffer(out, "<f8", 1, 32)[0])
-    soft = np.frombuffer(out, "<f4", constants.soft_bits, 40)
+    told = np.frombuffer(out, "<i8", 4, 40).tolist()
+    soft = np.frombuffer(out, "<f4", told[2], 72)
     found = modem.find(stream)
     assert found.start is not None
     wanted = modem.read(stream, found.start)
     assert wanted is not None
     assert (searched, start, end) == (found.searched, found.start, modem.end(stream, found.start))
     assert read == 1
+    assert told == [wanted.end, wanted.length, len(wanted.soft), len(wanted.points)]
     assert snr == pytest.approx(wanted.snr, rel=EXACT)
     assert np.abs(soft - wanted.soft).max() <= EXACT * float(np.abs(wanted.soft).mean())
-    assert phy.modem.frame.unwrap(soft) == packets[0]
+    assert phy.modem.frames.of(wanted.length).unwrap(soft) == packets[0]

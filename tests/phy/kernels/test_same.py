@@ -16,8 +16,9 @@ import numpy as np
 
 from gr_ros2.phy.burst import BurstModem, Samples
 from gr_ros2.phy.theory import half_point
-from tests.phy.kernels.support import IDS, SETTINGS, VARIANTS, hear, make, received, variant, with_kernel
+from tests.phy.kernels.support import IDS, SETTINGS, VARIANTS, hear, make, variant, with_kernel
 from tests.phy.test_burst import bursts, delayed, noise
+from tests.phy.test_burst import received_by as received
 
 NAMES: list[tuple[str, dict[str, Any]]] = [("ofdm", {}), ("psk", {}), ("gfsk", {}), ("lora", {})]
 EXACT = 1e-3
@@ -95,6 +96,26 @@ def test_same_soft_bits_within_rounding(
             assert found.snr == pytest.approx(wanted.snr, rel=EXACT)
             read += 1
     assert read >= 3
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_same_with_packets_of_all_lengths(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    draw = random.Random(8)
+    packets = [draw.randbytes(length) for length in (1, 64, 13, 40, 2)]
+    parts = [part for packet in packets for part in (phy.modem.modulate(packet), np.zeros(phy.gap))]
+    for packet in packets:
+        wanted = phy.modem.modulate(packet)
+        assert fast.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+    samples = delayed(np.concatenate((np.zeros(400), *parts, np.zeros(400))), 0.3)
+    for snr_db in (half_point(phy.computed_pdr), 40):
+        stream = received(phy, samples + noise(len(samples), snr_db, 3) * phy.burst_power() ** 0.5)
+        cuts = [draw.randrange(1, 3000) for _ in range(20)]
+        heard = hear(phy.modem, stream, cuts)
+        assert hear(fast, stream, cuts) == heard
+    assert [packet for _, packet in heard.packets] == packets
 
 
 @pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
