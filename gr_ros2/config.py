@@ -1,6 +1,6 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Laws: a name is introduced by one dataclass, which others inherit from; what is left to the program is spelt ``auto``,
+Invariants: a name is introduced by one dataclass, which others inherit from; what is derived is spelt ``auto``;
 durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the value and what
 is allowed.
 """
@@ -132,10 +132,18 @@ class Agreed(Packets):
 
     :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
     :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
+    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
+        forge; with one, sealed packets alone are taken
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts and says what was heard before a restart (version 1); '' keeps it
+        in the user's state folder
     """
 
     registry: Annotated[Text, Field(title="Registry CSV")]
     version: Annotated[WireVersion, Field(title="Version of the wire format")] = 0
+    key: Annotated[str, Field(title="Keys of the fleet")] = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: Annotated[str, Field(title="State file")] = ""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -223,7 +231,7 @@ class SourceConfig(Queued, EndConfig):
     :param dst_id: destination id, 255 broadcast
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
-    :param flush_timeout_s: s a partly filled packet waits for company; 0 = goes at once
+    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
     :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
     :param hop: initial hop count (TTL) 0..15
     :param packet_rate: packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number

@@ -1,7 +1,7 @@
 """What is wrong with settings, in one line: key, value, what is allowed, and what the key is for.
 
-Laws: a value that a union refuses is one complaint, however many members the union has; a name or a value of old is
-answered with the one of today.
+Invariants: a value that a union refuses is one complaint, however many members the union has; an old name or value is
+answered with the new one.
 """
 
 from __future__ import annotations

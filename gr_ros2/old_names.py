@@ -1,6 +1,6 @@
 """Settings that had another name once: what a file that still has the old one is told.
 
-Law: a row's new name exists, in the class that the old one stood in; a name that is in use again is no row.
+Invariant: a row's new name exists, in the class that the old one stood in; a name that is in use again is no row.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What a settings class says of each of its fields: meaning, default, range, choices, label.
 
-Law: everything that shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads it here,
-so that a new setting is one field of a dataclass and its line in the docstring.
+Invariant: what shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads them here, so
+that a new setting is one field of a dataclass and its line in the docstring.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How much later than due things happen, where a computer has to keep up with a clock.
 
-Law: what was late by ``LATE_S`` or more is kept as a moment, from when it was due until it happened; moments that touch
-are one, so that there are no more than the time that passes has room for.
+Invariant: what was late by ``LATE_S`` or more is kept as a moment, from when it was due until it happened; moments that
+touch are one, so that there are no more than the time that passes has room for.
 """
 
 from __future__ import annotations

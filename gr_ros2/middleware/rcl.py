@@ -1,6 +1,6 @@
-"""What rclpy leaves to its environment: how rcl is told a setting, and what its errors become.
+"""Helpers around rclpy: a setting that rcl reads from the environment, and the translation of its errors.
 
-Law: nothing here imports rclpy.
+Invariant: nothing here imports rclpy.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _environment = threading.Lock()
 
 @contextlib.contextmanager
 def told(localhost_only: bool | Auto) -> Iterator[None]:
-    """ROS_LOCALHOST_ONLY as given: rcl reads it when a context is initialised, and has no other way to be told."""
+    """Set ROS_LOCALHOST_ONLY: rcl reads it when a context is initialised, and offers no other interface for it."""
     if localhost_only == AUTO:
         yield
         return
@@ -35,7 +35,7 @@ def told(localhost_only: bool | Auto) -> Iterator[None]:
 
 
 class translated(contextlib.AbstractContextManager[None]):
-    """RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
+    """Raises RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
 
     def __init__(self, what: str) -> None:
         self._what = what

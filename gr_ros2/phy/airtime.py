@@ -1,7 +1,7 @@
-"""The gate in front of a simulated transmitter: packets pass at the pace of the air, and credits flow back.
+"""The gate in front of a simulated transmitter: packets pass one per airtime, and credits flow back.
 
-Laws: no packet passes before its airtime is over, or ``early`` before that where a device spends the time (`throttle`
-would let bursts through); the queue is unbounded and counted; samples are never touched.
+Invariants: no packet passes before its airtime is over, or ``early`` before that where a device spends the time
+(`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 
 _JOIN_S = 1.0
 _ONE = pmt.from_long(1)
@@ -56,7 +56,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._changed = threading.Condition()
         self._running = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.message_port_register_out(CREDIT)
@@ -68,8 +68,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return self._clock.backlog
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         with self._changed:
             self._running = True
         self._thread = threading.Thread(target=self._run, name="gr-ros2-airtime", daemon=True)
@@ -83,7 +83,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def _arrive(self, pdu: Any) -> None:
@@ -105,7 +105,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 self.message_port_pub(CREDIT, _ONE)
 
     def _step(self) -> tuple[list[Any], int]:
-        """What is due, after waiting for it if nothing is yet."""
+        """What is due; waits until something is due."""
         now = time.monotonic()
         due = self._clock.first_due
         pdus, credits = self._clock.due(now), self._clock.grants(now)

@@ -1,7 +1,7 @@
 """One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, sink.
 
-Laws: any PHY of the table goes in; one without samples skips transmitter, channel and receiver; no block stands here
-that does nothing, since each Python block costs a packet as much as source or sink do.
+Invariants: any PHY of the table works here; a PHY without samples skips transmitter, channel and receiver; a block that
+would do nothing is left out, since each Python block costs as much time per packet as source or sink.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ class LoopbackLink(PacketPath, Flowgraph):
     """A flowgraph from a source's message port `pdus` to a sink's.
 
     :param phy: which physical layer
-    :param source: block with message ports `pdus` out, whose PDUs it counts in ``emitted``, and `credit` in
-    :param sink: block with message port `pdus` in, which counts the PDUs it is done with in ``handled``
+    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
+    :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
     :param throttled: packets pass at the pace of the air (:class:`AirtimeGate`); False lets them pass as fast as the
         flowgraph takes them (:class:`CreditWindow`)
-    :param paced: either grants credits to the source; False for a source without port `credit`. With a PHY without
-        samples there is nothing to pace by where packets pass at the pace of the air
-    :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, a channel
-        that can be changed, and taps for spectrum and constellation
+    :param paced: either grants credits to the source; False for a source without port `credit`. A PHY without samples
+        has no airtime to pace by
+    :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
+        changed, and taps for spectrum and constellation
     :raises ConfigError: for a channel that this PHY cannot have
     """
 
@@ -62,7 +62,8 @@ class LoopbackLink(PacketPath, Flowgraph):
             faded = instrumented or bool(self.channel.on_samples()) or phy.leaves_tags()
             self._receive(self._transmit(last), faded=faded, shown=instrumented)
             last = self._receiver
-            # A hier block with message ports holds itself, and 60 of the system's 4096 shared memory segments for OFDM.
+            # A hier block with message ports keeps itself alive, and with it, for OFDM, 60 of the system's 4096 shared
+            # memory segments.
             for hier_block in (self._transmitter, self._receiver):
                 if hier_block is not None:
                     weakref.finalize(self, hier_block.release)
@@ -70,7 +71,7 @@ class LoopbackLink(PacketPath, Flowgraph):
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)
         self._follow(last, sink)
-        # Kept, since GNU Radio holds no reference to a Python block.
+        # Keep a reference, since GNU Radio holds none to a Python block.
         self._pacer = self._gate if throttled else CreditWindow(self._progress)
         if paced and self._pacer is not None:
             source.use_credit()
@@ -82,7 +83,7 @@ class LoopbackLink(PacketPath, Flowgraph):
             self.phy.prefer_latency()
 
     def run_began(self, now: float) -> None:
-        """Let the channel's outages count from now, s, monotonic, and not from the start of the flowgraph."""
+        """Count the channel's outages from ``now`` (s, monotonic) instead of from the start of the flowgraph."""
         if self._loss is not None:
             self._loss.epoch = now
 
@@ -101,7 +102,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         return int(self.sink.handled)
 
     def _progress(self) -> int:
-        """Packets that are through, as far as a window has to know."""
+        """Packets that have passed the link, for the credit window."""
         if self._transmitter is None:
             return self._handled() + (0 if self._loss is None else self._loss.dropped.total())
         return int(self._transmitter.packets_sent())

@@ -1,7 +1,7 @@
 """What `gr-ros2 link` is told: one robot's end of a link as one YAML file.
 
-Law: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level; whatever
-a front end needs stands under `front_end`, and its sample rate is the PHY's.
+Invariant: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level;
+whatever a front end needs stands under `front_end`, and its sample rate is the PHY's.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, build
+from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, WireVersion, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings_file import ENDS, SHARED_KEYS, read_settings, with_shared
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
@@ -28,6 +28,8 @@ class LinkConfig(AnyLink):
     """One robot's end: its ROS graph -> RosSource -> PHY -> front end, and back the same way.
 
     :param name: what errors and the status line call it
+    :param registry: CSV path, relative to the YAML file, or the name of a built-in one: the topics that are sent; with
+        version 0 the same at every robot, with version 1 each announces its own, and '' sends none
     :param ros_source: the sending block; its robot_id must be another at every robot
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
     :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings
@@ -37,13 +39,17 @@ class LinkConfig(AnyLink):
     :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
     """
 
+    registry: str = ""
     name: Text = "link"
+    version: WireVersion = 1
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
     record: Annotated[str, Field(title="Recording of what is received")] = ""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
 
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:
+        if not self.registry and not self.version:
+            raise ValueError("registry is missing, and version 0 needs the same one at every robot")
         if "name" not in self.front_end:
             raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
         for key, name, table in (
@@ -75,6 +81,8 @@ class LinkConfig(AnyLink):
         :raises RegistryError: file, line, what is wrong
         :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
+        if not self.registry:
+            return Registry.empty()
         registry = Registry.from_csv(self.registry)
         check_outputs(registry, self.ros_sink)
         return registry
@@ -86,8 +94,12 @@ def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
     :param where: what to call the mapping in errors, for instance its file name
     :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; names it
     """
+    values = {"version": 1, **values}
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
-    return build(LinkConfig, {**values, **with_shared(values, shared, f"{where}: " if where else "")}, where)
+    values |= with_shared(values, shared, f"{where}: " if where else "")
+    if values["version"] == 1:
+        values |= {end: {"compression": True, **values[end]} for end in ENDS if isinstance(values.get(end), Mapping)}
+    return build(LinkConfig, values, where)
 
 
 def load_link(path: str | Path, overrides: Sequence[str] = ()) -> LinkConfig:

@@ -16,7 +16,7 @@ from gr_ros2.config import STRICT, Text
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import LENGTH_TAG
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
-from gr_ros2.radio.events import UsrpEvents
+from gr_ros2.radio.stream_events import UsrpEvents
 from gr_ros2.setting import AUTO
 
 _CHANNEL = 0

@@ -1,8 +1,8 @@
 """What a run that keeps up with a clock says of the computer: how late it was, and what was lost after that.
 
-Laws: lateness is measured, never inferred from losses; a loss is said to follow a late moment where its message was
-submitted in that moment or up to ``AFTER_S`` after it, which is an observation and no proof: the share of all messages
-that do stands beside it.
+Invariants: lateness is measured, never inferred from losses; a loss is said to follow a late moment where its message
+was submitted in that moment or up to ``AFTER_S`` after it, which is an observation and no proof: the share of all
+messages that do stands beside it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import LatenessResult
 from gr_ros2.record.trace import Floats, Trace
 
@@ -63,7 +63,7 @@ def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: 
     sent = lost = sent_after = lost_after = 0
     for messages in trace.messages():
         submitted = ~np.isnan(messages.t_sent)
-        gone = submitted & (messages.row != Row.DELIVERED) & (messages.row != Row.IN_FLIGHT)
+        gone = submitted & (messages.row != LedgerRow.DELIVERED) & (messages.row != LedgerRow.IN_FLIGHT)
         after = np.zeros(len(submitted), dtype=bool)
         for due, happened in moments:
             after |= (messages.t_sent >= due) & (messages.t_sent <= happened + AFTER_S)

@@ -1,6 +1,6 @@
 """Watches one run and turns what it saw into results: the loss ledger, the paths and the numbers of every topic.
 
-Law: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
+Invariant: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
 lock and the reading of one position; what it keeps of a message or packet are numbers in arrays.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 from gr_ros2.link.events import Accepted, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.record.ledger import Ledger, TopicLedger
 from gr_ros2.record.metrics import TopicMetrics, topic_metrics
-from gr_ros2.record.path import path_error, rms_error
+from gr_ros2.record.path_error import path_error, rms_error
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
 from gr_ros2.record.trace import Floats, PacketLog, Trace, Track, make_trace

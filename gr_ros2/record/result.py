@@ -1,6 +1,6 @@
 """`result.json`: what an experiment found, as values and as a file.
 
-Laws: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
+Invariants: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
 reading gives back what was written, and refuses anything else with one line that says why. Keys this version does
 not know are ignored when reading, so that results of later versions can still be tabulated.
 """

@@ -4,7 +4,7 @@
     packets.parquet                  one line per entry of every packet sent, in the order of sending
     paths.parquet                    one line per position sent or received, where a topic has positions
 
-Laws: times are s since submission began, on the run's clock; what did not happen is null (a message that was not
+Invariants: times are s since submission began, on the run's clock; what did not happen is null (a message that was not
 delivered has no t_delivered); a file appears whole or not at all; reading refuses anything else with one line that
 names the file. While a run lasts a message costs about 33 bytes and an entry 16, in arrays.
 """

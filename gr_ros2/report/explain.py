@@ -1,6 +1,6 @@
 """Why a run came out as it did, in sentences computed from its ledger and its trace.
 
-Law: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
+Invariant: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
 apply is left out.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gr_ros2.link.lateness import LATE_S
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.figures import row_order
@@ -46,7 +46,7 @@ def _outcome(result: Result) -> Iterator[str]:
         return
     parts = [
         f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {ROWS[row].words if row in ROWS else row.replace('_', ' ')}"
-        for row in dict.fromkeys([Row.DELIVERED, *row_order([ledger])])
+        for row in dict.fromkeys([LedgerRow.DELIVERED, *row_order([ledger])])
     ]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
@@ -56,7 +56,9 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     airtime = result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
-    needed = sum((m.row != Row.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
+    needed = sum(
+        (m.row != LedgerRow.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages()
+    )
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
     channels = result.phy.get("channels", 1)
     share = needed * airtime / result.duration_s / channels
@@ -103,7 +105,7 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
     waiting = under_way = gone = 0
     counts = Counter(zip(packets.src_id.tolist(), packets.serial.tolist(), strict=True))
     for messages in trace.messages():
-        for serial in messages.serial[messages.row == Row.IN_FLIGHT].tolist():
+        for serial in messages.serial[messages.row == LedgerRow.IN_FLIGHT].tolist():
             key = (messages.src_id, serial)
             sent = counts.get(key, 0)
             if not sent:

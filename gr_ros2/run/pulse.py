@@ -1,7 +1,7 @@
 """How late threads of this process come to work: one that wakes up again and again, and looks when it does.
 
-Law: it does nothing else, so what it is late by is the computer's doing: busy with other programs, or with this one's
-other threads.
+Invariant: it does nothing else, so what it is late by is the computer's doing: busy with other programs, or with this
+one's other threads.
 """
 
 from __future__ import annotations

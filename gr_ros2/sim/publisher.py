@@ -1,6 +1,6 @@
 """Plays simulated robots on ROS graphs in real time.
 
-Laws: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
+Invariants: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
 moves no later one; ``stop`` takes effect before the next message; an error of the graph ends the play and is
 raised by ``stop``, never lost.
 """

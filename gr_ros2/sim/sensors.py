@@ -1,6 +1,6 @@
 """What one robot's sensors say: true motion and a generator in, serialized ROS 2 messages out.
 
-Laws: payloads are CDR, little endian, with the 4-byte encapsulation header; every topic draws from its own
+Invariants: payloads are CDR, little endian, with the 4-byte encapsulation header; every topic draws from its own
 generator, so the bytes of one do not depend on the rate of another; stamps are nanoseconds handed in.
 Frame names are those of REP 105; with them an Odometry is 724 B and an Imu 324 B, as in common recordings.
 """

@@ -1,6 +1,6 @@
 """Settings of the simulator.
 
-Law: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
+Invariant: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Where a robot's frames are, as robots tell it on ``/tf`` and ``/tf_static`` (REP 105).
 
-Laws: what moves is what the robot's odometry says; everything else is fixed. The odometry starts at the true place, so
-``odom`` lies on ``map``; laser and IMU are in the middle of the robot.
+Invariants: what moves is what the robot's odometry says; everything else is fixed. The odometry starts at the true
+place, so ``odom`` lies on ``map``; laser and IMU are in the middle of the robot.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.lateness import AFTER_S, lateness_result, modem_lateness
 from gr_ros2.record.ledger import TopicLedger
 from gr_ros2.record.trace import Trace, make_trace
@@ -23,12 +23,12 @@ def late(*moments: tuple[float, float]) -> Lateness:
     return made
 
 
-def trace(*messages: tuple[float, Row]) -> Trace:
+def trace(*messages: tuple[float, LedgerRow]) -> Trace:
     """Of messages submitted at these times, s since the begin."""
     book = TopicLedger(1, 0)
     for number, (t, row) in enumerate(messages):
         book.t_sent.append(BEGIN + t)
-        book.t_delivered.append(BEGIN + t + 0.1 if row is Row.DELIVERED else nan)
+        book.t_delivered.append(BEGIN + t + 0.1 if row is LedgerRow.DELIVERED else nan)
         book.size.append(100)
         book.serial.append(number)
         book.row.append(0)
@@ -39,13 +39,13 @@ def trace(*messages: tuple[float, Row]) -> Trace:
 def test_losses_in_a_late_moment_and_shortly_after_it_follow_it() -> None:
     moment = (BEGIN + 2, BEGIN + 2.5)
     messages = trace(
-        (1.9, Row.QUEUE_BOUND),  # before
-        (2.0, Row.QUEUE_BOUND),
-        (2.4, Row.DELIVERED),
-        (2.5 + AFTER_S, Row.LOST_FRAGMENTS),
-        (2.6 + AFTER_S, Row.LOST_FRAGMENTS),  # long after
-        (2.2, Row.IN_FLIGHT),  # not lost
-        (nan, Row.TOO_LARGE),  # never submitted
+        (1.9, LedgerRow.QUEUE_BOUND),  # before
+        (2.0, LedgerRow.QUEUE_BOUND),
+        (2.4, LedgerRow.DELIVERED),
+        (2.5 + AFTER_S, LedgerRow.LOST_FRAGMENTS),
+        (2.6 + AFTER_S, LedgerRow.LOST_FRAGMENTS),  # long after
+        (2.2, LedgerRow.IN_FLIGHT),  # not lost
+        (nan, LedgerRow.TOO_LARGE),  # never submitted
     )
     found = lateness_result({"threads": [late(moment)], "gate": []}, BEGIN, END, messages)
     assert (found.lost, found.lost_after, found.sent, found.sent_after) == (4, 2, 6, 4)

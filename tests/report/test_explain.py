@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.record.result import LatenessResult
 from gr_ros2.report.explain import explanation
 from tests.record.results import RESULT
@@ -88,4 +88,4 @@ def test_every_row_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     everything = replace(run.result.topics[0], ledger=dict.fromkeys(ROWS, 1), sent=len(ROWS))
     outcome, *_ = explanation(replace(run.result, topics=(everything,)), run.trace)
-    assert all(row.words in outcome for row in Row)
+    assert all(row.words in outcome for row in LedgerRow)
