@@ -39,7 +39,7 @@ def test_each_is_ready_to_run(name: str) -> None:
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
     domains = {scenario.ros_source.domain_id, scenario.ros_sink.domain_id}
     if name == "one-graph":
-        assert domains == {-1}, "that of the shell"
+        assert domains == {"auto"}, "that of the shell"
     else:
         assert len(domains) == 2
         assert min(domains) > 0
