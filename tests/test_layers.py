@@ -18,7 +18,7 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 
 LAYERS = (
     {"errors"},
-    {"wire", "names", "yaml_bounds"},
+    {"wire", "names", "yaml_bounds", "files"},
     {"yaml_text"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},
