@@ -118,6 +118,10 @@ class SourceConfig:
     :param dst_id: destination id, 255 broadcast
     :param packet_len: bytes on the wire, 14..4095; 40 or more with version 1
     :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same on both ends
+    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
+        forge
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts (version 1); '' takes one of its own in the user's state folder
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
     :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
@@ -147,6 +151,9 @@ class SourceConfig:
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
     version: WireVersion = 0
+    key: str = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: str = ""
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
     flush_timeout_s: Seconds = 0.0
@@ -209,6 +216,9 @@ class SinkConfig:
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
     :param packet_len: bytes on the wire, 14..4095, the same on both ends
     :param version: of the wire format, the same on both ends
+    :param key: file of the fleet's keys, with version 1; sealed packets alone are taken then
+    :param seal: how packets of this robot are sealed
+    :param state: file of what was heard before a restart (version 1), see :class:`SourceConfig`
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
@@ -232,6 +242,9 @@ class SinkConfig:
     registry: str = ""
     packet_len: PacketLen = 220
     version: WireVersion = 0
+    key: str = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: str = ""
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Count = 10
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0

@@ -16,7 +16,7 @@ from typing import overload
 from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
-from gr_ros2.wire import FORMATS
+from gr_ros2.wire import FORMATS, TableRow
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
@@ -96,6 +96,13 @@ class Registry(Sequence[Topic]):
         self._by_name = names
 
     @classmethod
+    def empty(cls) -> Registry:
+        """No topics: of a robot that sends nothing, and takes what others announce."""
+        made = cls.__new__(cls)
+        made._topics, made._by_name = (), {}
+        return made
+
+    @classmethod
     def from_rows(cls, rows: Mapping[str, str] | Sequence[tuple[str, str]]) -> Registry:
         """A registry written in code: ``Registry.from_rows({"odom": "nav_msgs/Odometry"})``."""
         pairs = list(rows.items()) if isinstance(rows, Mapping) else list(rows)
@@ -154,8 +161,10 @@ class Registry(Sequence[Topic]):
         """The same rows with configured options over the registry's own; only settings that differ from the
         default override.
 
-        :raises ConfigError: for a topic that is not registered
+        :raises ConfigError: for a topic that is not registered, unless none is
         """
+        if not self:
+            return self
         topics = list(self._topics)
         for name, override in options.items():
             topic = self.named(name)
@@ -170,6 +179,24 @@ class Registry(Sequence[Topic]):
         """16 hex digits over what both ends must agree on: ids, names and types."""
         text = "\n".join(f"{topic.topic_id},{topic.name.lstrip('/')},{topic.type_name}" for topic in self)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
+    """What a sender has announced of one of its topics.
+
+    :param options: configured ones by topic name, which go over it
+    :raises ConfigError: for a name or a type that ROS does not allow
+    """
+    if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
+        raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
+    known = {name.lstrip("/"): value for name, value in options.items()}.get(row.name.lstrip("/"), DEFAULT_OPTIONS)
+    said = {
+        "durability": "transient_local" if row.latched else "volatile",
+        "depth": row.depth or None,
+    }
+    chosen = {name: value for name, value in said.items() if getattr(known, name) is None}
+    merged = build(TopicOptions, {**asdict(known), **chosen})
+    return Topic(row.topic_id, row.name, normalize_type(row.type_name), merged)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:

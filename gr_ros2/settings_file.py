@@ -19,8 +19,11 @@ from gr_ros2.yaml_text import parse_yaml
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Folder of the built-in scenarios and registries."""
 
-SHARED_KEYS = ("registry", "packet_len", "version")
+SHARED_KEYS = ("registry", "packet_len", "version", "key", "seal", "state")
 """Settings both ends of a link must agree on."""
+
+_FILES = ("key", "state")
+"""Those that are files, which need not be there yet."""
 
 ENDS = ("ros_source", "ros_sink")
 """The blocks at the ends of a link."""
@@ -48,6 +51,9 @@ def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str]
     values = dict(values)
     if isinstance(values.get("registry"), str):
         values["registry"] = find_registry(values["registry"], directory)
+    for name in _FILES:
+        if isinstance(values.get(name), str) and values[name]:
+            values[name] = str(directory / Path(values[name]).expanduser())
     for override in overrides:
         keys, value = parse_override(override)
         if keys == ("registry",):

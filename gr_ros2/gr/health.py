@@ -20,6 +20,14 @@ Stats = Mapping[str, Any]
 
 _NO_LOSS = {"bursts_in", "bursts_out", "blanked"}
 """Of what a front end counts: what passed, and what half duplex costs by design."""
+_LOCKED = {
+    "no_key": "sealed, and no key is configured here",
+    "not_sealed": "not sealed, where a key is configured",
+    "wrong_key": "sealed with a key that is not accepted here",
+    "replayed": "replays of what was heard before",
+    "tag": "damaged, or forged",
+}
+"""Why packets are refused that may be somebody's attack, or somebody's wrong configuration."""
 
 
 class Level(IntEnum):
@@ -75,6 +83,7 @@ class _Look(NamedTuple):
     unpublished: int
     topics: dict[str, tuple[int, int]]
     front_end: dict[str, int]
+    locked: dict[str, int]
 
 
 class LinkHealth:
@@ -106,6 +115,8 @@ class LinkHealth:
         topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
         receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
         first = before is look
+        for kind, count in look.locked.items():
+            receiver.warn(f"packets refused: {_LOCKED[kind]}", count, 0 if first else before.locked.get(kind, 0))
         receiver.warn("messages not published", look.unpublished, 0 if first else before.unpublished)
         transmitter.warn("messages lost on the ROS graph", look.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *topics]
@@ -192,6 +203,7 @@ def _look(stats: Stats, now: float) -> _Look:
         unpublished=sink[LedgerRow.PUBLISH_FAILED],
         topics=topics,
         front_end=front_end,
+        locked={kind: count for kind, count in sink["rejected"].items() if kind in _LOCKED},
     )
 
 

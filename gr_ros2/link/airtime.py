@@ -77,6 +77,11 @@ class AirtimeClock(Generic[T]):
         return min(times) if times else None
 
     @property
+    def first_due(self) -> float | None:
+        """When the first packet here may leave, None where there is none."""
+        return self._queue[0][0] if self._queue else None
+
+    @property
     def backlog(self) -> int:
         """Packets that have not left."""
         return len(self._queue)

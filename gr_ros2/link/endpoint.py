@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig
+from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
@@ -96,6 +96,9 @@ class Endpoint(Protocol):
         :raises ConfigError: for a value out of range or a setting that cannot change
         """
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """How long an incomplete message waits for its next fragment, s; version 1 waits while it may be repaired."""
+
     def unpublished(self, event: Delivered) -> Lost:
         """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
 
@@ -117,9 +120,12 @@ class Endpoint(Protocol):
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Do what is due by ``now``; the events it causes, in order. ``next_packet`` is a separate question."""
 
+    def next_departure(self) -> float | None:
+        """Earliest time at which ``next_packet`` may have something without a further call; None where only a call can
+        change that."""
+
     def next_timeout(self) -> float | None:
-        """Earliest time at which ``next_packet`` or ``handle_timeout`` may have something without a further call; None
-        where only a call can change that."""
+        """The same of ``handle_timeout``."""
 
 
 class EndpointV0:
@@ -210,6 +216,11 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         self._half().reconfigure(**changes)
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """See :class:`Endpoint`."""
+        if self._receiver is not None:
+            self._receiver.config = replaced(self._receiver.config, reassembly_timeout_s=timeout_s)
+
     def unpublished(self, event: Delivered) -> Lost:
         """See :class:`Endpoint`."""
         assert self._receiver is not None
@@ -250,8 +261,10 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         return [] if self._receiver is None else self._receiver.handle_timeout(now)
 
+    def next_departure(self) -> float | None:
+        """See :class:`Endpoint`."""
+        return None if self._sender is None else self._sender.next_timeout()
+
     def next_timeout(self) -> float | None:
         """See :class:`Endpoint`."""
-        halves = (self._sender, self._receiver)
-        times = [at for half in halves if half is not None and (at := half.next_timeout()) is not None]
-        return min(times, default=None)
+        return None if self._receiver is None else self._receiver.next_timeout()

@@ -25,7 +25,7 @@ from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.registry import Registry, Topic
-from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
+from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
@@ -57,7 +57,11 @@ class Sender:
     ) -> None:
         self.config = config
         if len(registry) > V0.max_topics:
-            raise ConfigError(f"{len(registry)} topics; version 0 carries {V0.max_topics}, version 1 up to 240")
+            beyond = registry[V0.max_topics]
+            raise ConfigError(
+                f"topic {V0.max_topics + 1}, {beyond.name!r}: version 0 carries {V0.max_topics} topics; leave some "
+                f"out, or set version: 1, which carries {FORMATS[1].max_topics}"
+            )
         self.registry = registry.with_options(config.topic_options)
         self.src_id = config.src_id()
         self.stats = SenderStats()

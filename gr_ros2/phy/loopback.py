@@ -7,10 +7,12 @@ would do nothing is left out, since each Python block costs as much time per pac
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import PacketLoss
@@ -58,7 +60,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         self._pace = pace
         last = source
         if phy.has_samples and pace == "airtime":
-            self._gate = AirtimeGate(phy.airtime(), airtime_of=phy.airtime if phy.any_length else None)
+            airtime_of = phy.airtime if phy.any_length else None
+            self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)
         if phy.has_samples:
             # The channel also stops tags.
@@ -89,6 +92,14 @@ class LoopbackLink(PacketPath, Flowgraph):
         """Count the channel's outages from ``now`` (s, monotonic) instead of from the start of the flowgraph."""
         if self._loss is not None:
             self._loss.epoch = now
+
+    def gate_lateness(self) -> Lateness | None:
+        """Of the gate; None where there is none."""
+        return None if self._gate is None else self._gate.lateness
+
+    def passed_at(self) -> Sequence[float]:
+        """s, monotonic, when each packet passed the gate; () where there is none."""
+        return () if self._gate is None else self._gate.passed_at
 
     def _offered(self) -> int:
         return int(self.source.emitted)

@@ -16,7 +16,7 @@ from gr_ros2.record.metrics import TopicMetrics, topic_metrics
 from gr_ros2.record.path_error import path_error, rms_error
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
-from gr_ros2.record.trace import PacketLog, Trace, Track, make_trace
+from gr_ros2.record.trace import Floats, PacketLog, Trace, Track, make_trace
 from gr_ros2.registry import Registry, Topic
 
 
@@ -112,6 +112,10 @@ class Recorder:
             if total is not None and self._delivered_bytes
             else None,
         }
+
+    def received_at(self, src_id: int) -> Floats:
+        """s on the run's clock, when each packet of a source reached the sink; NaN for those that did not."""
+        return self._packets[src_id].received_at()
 
     def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
         """Every message, packet and position. To be asked after :meth:`finish`.

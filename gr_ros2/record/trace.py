@@ -124,6 +124,10 @@ class PacketLog:
         """The packet of this number, from 0, reached the sink."""
         self._t_received[number] = now
 
+    def received_at(self) -> Floats:
+        """s on the run's clock, when each packet reached the sink; NaN for those that did not."""
+        return _copied(self._t_received, len(self._t_received))
+
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
         """The columns of table `packets`; the topics by name."""
         # A run that is stopped may still be sending: these are the packets that are complete now.

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gr_ros2.link.lateness import LATE_S
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Ints, Packets, Trace
@@ -31,6 +32,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *_packets(result, packets),
         *_in_flight(trace, packets),
         *_trend(trace),
+        *_lateness(result),
     ]
 
 
@@ -138,6 +140,25 @@ def _trend(trace: Trace) -> Iterator[str]:
         yield text + "the wait became shorter."
     else:
         yield text + "it stayed the same."
+
+
+def _lateness(result: Result) -> Iterator[str]:
+    """Whether the computer kept up with the run's clock."""
+    late = result.lateness
+    if late is None or not late.moments:
+        return
+    part, worst = max(late.worst_s.items(), key=lambda item: item[1])
+    others = ", ".join(f"{name} {_seconds(value)}" for name, value in late.worst_s.items() if name != part)
+    text = (
+        f"The computer was up to {_seconds(worst)} late ({part}{'; ' + others if others else ''}), {late.moments:,} "
+        f"times by {milliseconds(LATE_S)} ms or more, {_percent(min(late.share, 1.0))} of the run"
+    )
+    if late.lost:
+        text += (
+            f"; {_percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
+            f"{_percent(late.sent_after / late.sent)} of all messages"
+        )
+    yield text + "."
 
 
 def _entries_per_message(packets: Packets, topic: str) -> float:

@@ -18,17 +18,20 @@ from typing import Any
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.files import make_folder, write_whole
 from gr_ros2.guard import Guard, one_line
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
-from gr_ros2.record.result import RESULT_FILE, Result, write_result
-from gr_ros2.record.trace import write_trace
+from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
+from gr_ros2.record.trace import Trace, make_folder, write_trace, write_whole
 from gr_ros2.run.direction import Direction, open_graph
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulated_runner import run_simulated
@@ -171,6 +174,8 @@ class _Run:
         self.recorder = Recorder(self.registry, namespaces, topics)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
+        self.pulse = Pulse()
+        stack.callback(self.pulse.close)
         self.interrupted = False
         self.listener: DeliveryRecorder | None = None
         self.sim: SimPublisher | None = None
@@ -237,6 +242,7 @@ class _Run:
                 way.link.start()
             self._wait_matched()
             begin = end = time.monotonic()
+            self.pulse.start()
             for way in self.directions:
                 way.link.run_began(begin)
             (self.sim or self.directions[0].input).start()
@@ -253,6 +259,8 @@ class _Run:
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
         drained = not self.interrupted and self._empty()
+        self.pulse.close()
+        stopped = time.monotonic()
         for way in self.directions:
             way.link.stop()
         self.run_observers.settle()
@@ -261,6 +269,10 @@ class _Run:
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
         topics = self.recorder.finish(played, end, drained)
+        names = {
+            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
+        }
+        trace = self.recorder.trace(begin, end, names)
         result = Result(
             scenario=scenario.name,
             seed=scenario.seed,
@@ -272,12 +284,22 @@ class _Run:
             wall_s=time.monotonic() - wall,
             interrupted=self.interrupted,
             counters=self._counters(),
+            lateness=self._lateness(begin, stopped, trace),
             incomplete=tuple(self._incomplete()),
         )
-        names = {
-            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
-        }
-        return Outcome(result, self.recorder.trace(begin, end, names))
+        return Outcome(result, trace)
+
+    def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
+        """How late the computer was; None where the link waits for it."""
+        if self.scenario.pace == "flow":
+            return None
+        parts: dict[str, list[Lateness]] = {"threads": [self.pulse.lateness], "gate": [], "modem": []}
+        for way in self.directions:
+            gate = way.link.gate_lateness()
+            if gate is not None:
+                parts["gate"].append(gate)
+                parts["modem"].append(modem_lateness(way.link.passed_at(), self.recorder.received_at(way.src_id)))
+        return lateness_result(parts, begin, end, trace)
 
     def _wait_matched(self) -> None:
         """Wait until every end of both graphs has found the other, so that no message goes unheard."""

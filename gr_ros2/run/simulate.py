@@ -311,7 +311,7 @@ class LinkDirection:
 
     def wake(self, now: float) -> None:
         """The sending end has been called: it may have something earlier than it said."""
-        at = self.sender.endpoint.next_timeout()
+        at = self.sender.endpoint.next_departure()
         if at is not None and (self.due < inf or self.sender.endpoint.answers):
             self.due = min(self.due, max(now, at))
             self.over = False
@@ -366,7 +366,7 @@ class LinkDirection:
             return inf
         clock = self._clock.next_timeout(now) if self._clock is not None else None
         delayed = self._delayed[0][0] if self._delayed else None
-        times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_timeout())
+        times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_departure())
         soonest = min((at for at in times if at is not None), default=inf)
         if soonest == inf and now < self.duration_s:
             soonest = self.duration_s  # nothing more to come before the end of the run

@@ -220,6 +220,9 @@ class Endpoint:
         """Memory in use for incomplete messages."""
         return sum(neighbour.inbox.held for neighbour in self.neighbours)
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """Nothing: an incomplete message is kept while it may be repaired."""
+
     def unpublished(self, event: Delivered) -> Lost:
         """Book a message that was given out but did not come onto the ROS graph. It may come again when it is kept."""
         neighbour = self.neighbours.get(event.src_id)
@@ -309,30 +312,35 @@ class Endpoint:
         return events
 
     def next_timeout(self) -> float | None:
-        """When ``next_packet`` or ``handle_timeout`` may have something to do without a further call."""
-        now = self._now
+        """When ``handle_timeout`` has something to do, if nothing is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
-        if self._credits != 0 and self._speaks:
-            leaving = [self._talk.due]
-            waiting = self.outbox.next_timeout(now)
-            if waiting is not None:
-                leaving.append(waiting)
-            if self.settings.hears:
-                leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
-            if self._repeat_at < inf:
-                leaving.append(self._repeat_at)
-            if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
-                leaving.append(now if self._mode() == "idle" else now + _POLL_S)
-            times.append(max(min(leaving), self._slot))
-        return min(times) if times else None
+        return min(times, default=None)
+
+    def next_departure(self) -> float | None:
+        """When ``next_packet`` may have something, if nothing is called before."""
+        now = self._now
+        if self._credits == 0 or not self._speaks:
+            return None
+        leaving = [self._talk.due]
+        waiting = self.outbox.next_timeout(now)
+        if waiting is not None:
+            leaving.append(waiting)
+        if self.settings.hears:
+            leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+        if self._repeat_at < inf:
+            leaving.append(self._repeat_at)
+        if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
+            leaving.append(now if self._mode() == "idle" else now + _POLL_S)
+        return max(min(leaving), self._slot)
 
     # ---- what leaves
 
     def _compose(self, now: float) -> bytes | None:
         if not self._started:
             self._start(now)
-        if self._talk.urgent(now, idle=self.outbox.idle):
+        idle, latency, heard = self.outbox.idle, self.outbox.urgent, bool(self.window.receivers())
+        if self._talk.urgent(now, idle=idle, latency=latency, heard=heard):
             return self._hello(now)
         if now >= self._repeat_at:
             self._repeat_at = now + self.settings.repeat_s
