@@ -51,7 +51,7 @@ def _outcome(result: Result) -> Iterator[str]:
 
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """What carrying everything would have needed, against what the air has."""
-    airtime = result.phy.get("airtime_s")
+    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("pace") == "flow" or not len(packets.packet):
         return
     needed = sum((m.row != Row.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
