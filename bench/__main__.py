@@ -11,11 +11,12 @@ from importlib import import_module
 
 from rich.console import Console
 
-from bench.report import Row, table
+from bench.rows import Row, table
 
 BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
+    "saturated": "bench.saturated",
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
     "port": "bench.port",

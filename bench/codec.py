@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from bench.report import Row, median_of
+from bench.rows import Row, median_of
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
 PACKET_LEN, PACKETS, REPEATS = 64, 20_000, 9

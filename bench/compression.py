@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from statistics import mean
 
-from bench.report import Row, median_of
+from bench.rows import Row, median_of
 from gr_ros2.compression import LinkCodec
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.registry import Registry

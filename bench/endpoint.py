@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import time
 
-from bench.report import Row, median_of
+from bench.rows import Row, median_of
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.sealing import Keys

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from bench.report import Row
+from bench.rows import Row
 from fuzz.loop import inputs
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ReplayedError

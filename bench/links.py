@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bench.report import Row
+from bench.rows import Row
 from bench.runs import DOMAINS, DRIVE
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.outcome import Outcome

@@ -17,7 +17,7 @@ import pmt
 from gnuradio import gr
 
 from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait
-from bench.report import Row
+from bench.rows import Row
 from bench.runs import DRIVE
 from gr_ros2.config import ChannelConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
@@ -26,7 +26,7 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated
-from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.phy.window import WINDOW
 from gr_ros2.registry import Registry
 
@@ -125,9 +125,9 @@ def _phy(name: str, packet_len: int = PACKET_LEN, **settings: Any) -> Phy:
 
 def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """Packets/s, and s for a single one, from Python block to Python block."""
-    quicken_threads()
+    shorten_switch_interval()
     poster, taker, graph = _Poster(), _Taker(), gr.top_block()
-    transmitter, receiver = phy.transmitter(), phy.receiver(aside=True)
+    transmitter, receiver = phy.transmitter(), phy.receiver(own_process=True)
     graph.msg_connect(poster, "out", transmitter, "pdus")
     graph.connect(transmitter, receiver)
     graph.msg_connect(receiver, "pdus", taker, "in")

@@ -14,11 +14,11 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
-from bench.report import Row
+from bench.rows import Row
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.base import MessageCallback
-from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.registry import Registry
 
 PACKET_LEN, REPEATS = 64, 5
@@ -106,7 +106,7 @@ def _wait(what: Any, until: int) -> None:
 
 def bare_rate() -> float:
     """PDUs/s from one Python block to another."""
-    quicken_threads()
+    shorten_switch_interval()
     poster, taker = _Poster(), _Taker()
     graph = gr.top_block()
     graph.msg_connect(poster, "out", taker, "in")

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from gnuradio import blocks, digital, gr
 
-from bench.report import Row
+from bench.rows import Row
 from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
 from gr_ros2.phy.kernels import which
 from gr_ros2.phy.theory import half_point
-from gr_ros2.phy.threads import run_through
+from gr_ros2.phy.threads import run_flowgraph
 
 SNR_DB = 30.0
 PACKETS, LONG_PACKETS = 60, 12
@@ -101,7 +101,7 @@ def _flowgraph(samples: Samples, parts: list[Any]) -> float:
     top = gr.top_block()
     top.connect(blocks.vector_source_c(samples), *parts)
     begin = time.process_time()
-    run_through(top)
+    run_flowgraph(top)
     took = time.process_time() - begin
     for part in parts:
         if hasattr(part, "release"):

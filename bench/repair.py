@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Literal
 
-from bench.report import Row
+from bench.rows import Row
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import Endpoint

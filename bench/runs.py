@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.report import Row
+from bench.rows import Row
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import DELIVERED_BAG, run_scenario

@@ -13,7 +13,7 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
-from bench.report import Row
+from bench.rows import Row
 from bench.runs import DOMAINS
 from gr_ros2.record.result import read_result
 

@@ -9,11 +9,11 @@ from tempfile import TemporaryDirectory
 
 import yaml
 
-from bench.report import Row
-from gr_ros2.run.losstable import PACKETS
+from bench.rows import Row
+from gr_ros2.run.loss_table import PACKETS
 from gr_ros2.study.sweep.definition import load_sweep
 from gr_ros2.study.sweep.run import run_sweep
-from gr_ros2.study.sweep.table import ALL, Summary, rows_of, summaries
+from gr_ros2.study.sweep.summaries import ALL, Summary, rows_of, summaries
 
 WORKERS = 2
 CELLS = {

@@ -20,13 +20,13 @@ from unittest.mock import patch
 from urllib.request import urlopen
 
 from fuzz.loop import KEPT, main
-from gr_ros2.cli.doorbell import receive
-from gr_ros2.dashboard import door
+from gr_ros2.cli.control_socket import receive
+from gr_ros2.dashboard import admission
 from gr_ros2.dashboard.server import Dashboard
 
 _PATIENCE_S = 60.0
 BASE_S, BYTE_S = 0.4, 1e-5
-"""s of processor time that one visitor's bytes may take the server, and more for each byte. Drawing a page for the
+"""s of processor time that one client's bytes may take the server, and more for each byte. Drawing a page for the
 first time takes 0.13 s; how often that may be asked for is left out here."""
 _CUT = b"\x1e"
 _TEXT, _BINARY, _CLOSE = 1, 2, 8
@@ -48,7 +48,7 @@ class _Served:
     """One server, and a viewer that stays so that its page does."""
 
     def __init__(self) -> None:
-        KEPT.enter_context(patch.object(door, "SHARE", math.inf))
+        KEPT.enter_context(patch.object(admission, "SHARE", math.inf))
         self.dashboard = KEPT.enter_context(Dashboard(port=0))
         self.tracebacks = _Tracebacks()
         logging.getLogger().addHandler(self.tracebacks)
@@ -88,7 +88,7 @@ class _Served:
 
 
 def dashboard(data: bytes) -> None:
-    """One visitor's bytes, then a visitor who asks whether it is there."""
+    """One client's bytes, then a client who asks whether it is there."""
     served = _served()
     before = served.spent_s
     where, rest = (data[0] if data else 0) % 3, data[1:]

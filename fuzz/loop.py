@@ -1,6 +1,6 @@
 """Feeds a harness: by atheris (coverage-guided) where it is installed, otherwise by a seeded mutation loop of our own.
 
-Law: the same seed gives the same inputs; an input that fails is named in hex, so that it can be replayed.
+Invariant: the same seed gives the same inputs; an input that fails is named in hex, so that it can be replayed.
 """
 
 from __future__ import annotations

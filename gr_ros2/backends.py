@@ -1,8 +1,8 @@
 """Lazy tables of back-ends: name -> where its class lives and what must be installed for it.
 
-Laws: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS 2 or a
-DDS; packages of others add rows by entry points, which are read only when a name is not one of ours, or all names are
-asked for; one of these that is broken harms nobody but who chooses it.
+Invariants: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS
+2 or a DDS; other packages add rows by entry points; these are read only when a name is not in this package's table, or
+when all names are listed; a broken entry point fails only for the user who chooses it.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ RowT = TypeVar("RowT", bound=Backend)
 
 
 class BackendTable(Mapping[str, RowT], Generic[RowT]):
-    """A family of back-ends (middleware, PHY, …), read by CLI, YAML, GRC options and docs alike.
+    """A family of back-ends (middleware, PHY, …). CLI, YAML, GRC options and docs all read this table.
 
     Other packages add to it by entry points of the group ``gr_ros2.FAMILY``, in their ``pyproject.toml`` for instance::
 
         [project.entry-points."gr_ros2.phy"]
         ook = "my_package.ook:OokPhy"
 
-    The entry point names the class, for which the row then has its defaults, or a row.
+    The entry point names either the class (the row then has default values) or a row.
 
     :param family: what errors call a row, and the last part of the group
-    :param rows: ours, by name; no entry point can replace one
+    :param rows: the rows of this package, by name; an entry point cannot replace them
     :param kind: of a row
     """
 
@@ -111,7 +111,7 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
         try:
             with uninterrupted():
                 loaded = entry.load()
-        except Exception as error:  # whatever code of others raises, it is to be said in one line
+        except Exception as error:  # code of another package may raise anything; the user gets one line
             raise BackendMissingError(
                 f"{self.family} {entry.name!r}: package {package} has it as {entry.value}, which cannot be loaded "
                 f"({type(error).__name__}: {error}); mend or remove that package"
@@ -128,10 +128,11 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until what is inside is done, for instance an import.
+    """Delay Ctrl-C and SIGTERM until the body of the ``with`` statement is done, for instance an import.
 
     KeyboardInterrupt inside a C extension that is being loaded comes out as ImportError or RuntimeError, or leaves it
-    half loaded. Where it is not the main thread that asks, nothing is to be done: signals are handled there alone.
+    half loaded. In any other thread than the main thread this does nothing: Python handles signals in the main thread
+    only.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,7 +1,7 @@
-"""Work that may be done later: a bounded queue and one thread that works it off.
+"""Work that may be done later: a bounded queue and one thread that processes it.
 
-Laws: :meth:`Backlog.offer` never waits, and refuses what does not fit; work is done in the order in which it came, in
-one thread; a work that never returns holds up nobody but those behind it.
+Invariants: :meth:`Backlog.offer` never waits, and refuses what does not fit; work is done in the order in which it
+came, in one thread; a call that never returns delays only the work behind it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable
 
 _GATHER_S = 0.01
-"""s the thread gathers work after it was woken: waking it for every piece would cost the giver more than the piece."""
+"""s that the thread collects work after it was woken. Waking it for every piece would cost the caller more than the
+piece."""
 
 Work = tuple[Callable[..., object], tuple[object, ...]]
 
@@ -20,7 +21,7 @@ class Backlog:
     """Does work in a thread of its own.
 
     :param name: of the thread
-    :param most: bytes that may wait, or be under way
+    :param most: bytes that may wait or be in progress
     """
 
     def __init__(self, name: str, most: int) -> None:
@@ -35,14 +36,14 @@ class Backlog:
 
     @property
     def pending(self) -> int:
-        """Pieces of work taken and not done."""
+        """Pieces of work accepted and not done yet."""
         return self._taken - self._done
 
     def offer(self, size: int, work: Callable[..., object], *arguments: object) -> bool:
         """Hand over work, which must not raise.
 
-        :param size: bytes it holds; with 0 it always fits
-        :return: whether it was taken: there was room, and this is not closed
+        :param size: bytes that the work holds; work of 0 bytes always fits
+        :return: whether the work was accepted: there was room, and the backlog is not closed
         """
         with self._changed:
             if self._closed or (size and self._held and self._held + size > self._most):
@@ -51,9 +52,9 @@ class Backlog:
         return True
 
     def put(self, size: int, work: Callable[..., object], *arguments: object) -> bool:
-        """The same, but wait for room.
+        """Hand over work like :meth:`offer`, but wait for room.
 
-        :return: whether it was taken: this is not closed
+        :return: whether the work was accepted: the backlog is not closed
         """
         with self._changed:
             while self._held and self._held + size > self._most and not self._closed:
@@ -64,7 +65,7 @@ class Backlog:
         return True
 
     def settle(self, timeout_s: float) -> bool:
-        """Wait until all that was taken is done.
+        """Wait until all accepted work is done.
 
         :return: whether it is, by then
         """
@@ -72,9 +73,9 @@ class Backlog:
             return self._changed.wait_for(lambda: not self.pending, timeout_s)
 
     def close(self, timeout_s: float | None = None) -> bool:
-        """Take no more, and wait until all that was taken is done. Idempotent.
+        """Accept no more work, and wait until all accepted work is done. Idempotent.
 
-        :param timeout_s: None waits for ever
+        :param timeout_s: None waits without limit
         :return: whether it is, by then
         """
         with self._changed:

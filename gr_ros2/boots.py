@@ -1,10 +1,10 @@
-"""What a robot must not forget from one start to the next: its boot number, and how far it has heard others.
+"""What a robot keeps from one start to the next: its boot number, and the newest packet heard of each other robot.
 
 A boot number is greater than all before it, and at least the wall clock's seconds: so it grows when the file is lost,
 and when the clock is set back.
 
-Laws: the file is replaced as a whole and is on the disk before a call returns, so that a power cut leaves the old or
-the new one; a boot number is given out only after it has been written.
+Invariants: the file is replaced as a whole and is on the disk before a call returns, so that a power cut leaves the old
+or the new one; a boot number is given out only after it has been written.
 """
 
 from __future__ import annotations

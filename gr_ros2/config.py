@@ -1,6 +1,6 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Law: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
+Invariant: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
 names the key, the value and what is allowed.
 """
 
@@ -43,7 +43,7 @@ _KINDS = {
     "string": "a text",
     "tuple": "a list",
 }
-"""What a value is asked to be, by what pydantic calls it."""
+"""What a value must be, in words, by pydantic's name of the error."""
 
 PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
 RobotId = Annotated[int, Field(ge=-1, lt=BROADCAST)]
@@ -75,9 +75,9 @@ class TopicOptions:
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); None follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
-    :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, or without
-        ``queue`` the publishers' lifespan
-    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
+    :param deadline_s: s from submission to delivery at the other end; a later message is dropped. 0 = no deadline, or
+        without ``queue`` the publishers' lifespan
+    :param weight: weight of this topic's age relative to other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
@@ -118,21 +118,25 @@ class SourceConfig:
     :param dst_id: destination id, 255 broadcast
     :param packet_len: bytes on the wire, 14..4095; 40 or more with version 1
     :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same on both ends
+    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
+        forge
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts (version 1); '' takes one of its own in the user's state folder
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
-    :param flush_timeout_s: s a partly filled packet waits for company; 0 = goes at once
+    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
     :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
     :param hop: initial hop count (TTL) 0..15
     :param packet_rate: packets/s offered to the flowgraph, 0 unpaced
     :param queue_depth: messages waiting per topic, oldest dropped and counted; 0 unbounded
-    :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
+    :param backpressure: make the middleware wait instead of dropping when a queue is full (bags)
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
     :param repeat_s: s between repeats of a transient-local topic, 0 off; with version 1 only while no robot reports
     :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
         much as losses are known or expected, off; None takes thrifty where receivers report, idle where none does
     :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
-    :param compression: code every message, C = 1; the sink must have it too
+    :param compression: code every message, C = 1; the sink must have the same setting
     :param dictionaries: files of dictionaries of your own, the same at both ends
     :param topic_options: per topic name, over the registry's columns
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
@@ -147,6 +151,9 @@ class SourceConfig:
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
     packet_len: PacketLen = 220
     version: WireVersion = 0
+    key: str = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: str = ""
     min_fragment: Annotated[int, Field(ge=1)] = 16
     greedy: bool = False
     flush_timeout_s: Seconds = 0.0
@@ -209,6 +216,9 @@ class SinkConfig:
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
     :param packet_len: bytes on the wire, 14..4095, the same on both ends
     :param version: of the wire format, the same on both ends
+    :param key: file of the fleet's keys, with version 1; sealed packets alone are taken then
+    :param seal: how packets of this robot are sealed
+    :param state: file of what was heard before a restart (version 1), see :class:`SourceConfig`
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
@@ -232,6 +242,9 @@ class SinkConfig:
     registry: str = ""
     packet_len: PacketLen = 220
     version: WireVersion = 0
+    key: str = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: str = ""
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Count = 10
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0

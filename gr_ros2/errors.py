@@ -19,7 +19,7 @@
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
     └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
 
-Law: messages name the thing, its value and the remedy, in one line.
+Invariant: messages name the thing, its value and the remedy, in one line.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class IndexRangeError(WireError):
 
 
 class EntryKindError(WireError):
-    """An entry of a kind that there is not, or whose fields contradict its kind."""
+    """An entry of an unknown kind, or whose fields contradict its kind."""
 
     kind = "entry_kind"
 
@@ -130,7 +130,7 @@ class SealError(WireError):
 
 
 class NoHelloError(SealError):
-    """A packet of a robot, or of a start of it, of which no hello has been heard yet."""
+    """A packet of a robot whose hello has not been received since that robot's last start."""
 
     kind = "no_hello"
 
@@ -148,7 +148,7 @@ class NotSealedError(SealError):
 
 
 class WrongKeyError(SealError):
-    """A hello sealed with none of the keys that are accepted, or damaged."""
+    """A hello that none of the accepted keys opens, or that is damaged."""
 
     kind = "wrong_key"
 
@@ -160,13 +160,13 @@ class TagError(SealError):
 
 
 class ReplayedError(SealError):
-    """A packet that was here before, or is older than anything that may still be accepted."""
+    """A packet that was received before, or that is too old to be accepted."""
 
     kind = "replayed"
 
 
 class SourcesError(WireError):
-    """A packet of one robot more than ``max_sources`` allows."""
+    """A packet of a further robot, when ``max_sources`` robots are known already."""
 
     kind = "max_sources"
 
@@ -184,13 +184,13 @@ class CodecError(GrRos2Error, ValueError):
 
 
 class UnknownDictionaryError(CodecError):
-    """A message coded with a dictionary that is not held here, or with another one of that name."""
+    """A message coded with a dictionary that is not available here, or with a different one of the same name."""
 
     row = "unknown_dictionary"
 
 
 class DamagedError(CodecError):
-    """Bytes that are no coded message, or one larger than is taken."""
+    """Bytes that are not a coded message, or a message larger than the limit."""
 
     row = "damaged"
 

@@ -1,6 +1,6 @@
 """Where GRC finds our block descriptions, and how to make it look there.
 
-Law: GRC has no discovery of its own for Python packages and does not look into a virtual environment; it reads
+Invariant: GRC has no discovery of its own for Python packages and does not look into a virtual environment; it reads
 `local_blocks_path` from section `[grc]` of the user's preferences. ``install`` adds our folder there, keeps every
 other line as it is, and does nothing the second time.
 

@@ -1,7 +1,7 @@
 """Makes gr-ros2 importable in the Python that GNU Radio Companion and its flowgraphs run in.
 
-Laws: written are two files in the user's site-packages of that Python, which ``withdraw`` removes; pip and its database
-are not touched (PEP 668); nothing of that Python's packages is shadowed before a flowgraph imports gr-ros2.
+Invariants: written are two files in the user's site-packages of that Python, which ``withdraw`` removes; pip and its
+database are not touched (PEP 668); nothing of that Python's packages is shadowed before a flowgraph imports gr-ros2.
 """
 
 from __future__ import annotations

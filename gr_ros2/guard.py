@@ -1,7 +1,7 @@
-"""What may fail and must not matter: an observer of a link, or one part of it.
+"""Calls something that may fail without harm to its caller: an observer of a link, or one part of a program.
 
-Laws: it is called until its first exception; that ends it, one line that names it is logged, and every call from then
-on is counted as missed; nobody who calls it ever sees it raise. Any thread may call.
+Invariants: the guarded object is called until its first exception; then it is ended, one log line names it, and every
+further call is counted as missed; the caller never sees an exception. Any thread may call.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _log = logging.getLogger(__name__)
 class Guard:
     """Calls one observer, or one function of it, until it raises.
 
-    :param name: what the one line about it begins with
-    :param needed: its failure is for :meth:`check` to raise, and not logged
+    :param name: first words of the log line about it
+    :param needed: :meth:`check` raises its failure, and nothing is logged
     """
 
     def __init__(self, name: str, *, needed: bool = False) -> None:
         self.name = name
         self.error: Exception | None = None
-        """What ended it."""
+        """The exception that ended it."""
         self.missed = 0
-        """Events it did not hear, or not to their end."""
+        """Events that it did not receive, or whose processing failed."""
         self._needed = needed
         self._lock = Lock()
 
@@ -42,14 +42,14 @@ class Guard:
         self.miss()
 
     def last(self, call: Callable[..., object], *arguments: object) -> None:
-        """Call it even if it has ended: to let go of what it holds."""
+        """Call it even if it has ended, so that it can release its resources."""
         try:
             call(*arguments)
         except Exception as error:  # noqa: BLE001 - as above
             self.end(error)
 
     def end(self, error: Exception) -> None:
-        """It has failed; only the first time counts."""
+        """Note that it has failed; only the first error is kept."""
         with self._lock:
             if self.error is not None:
                 return
@@ -59,7 +59,7 @@ class Guard:
             _log.debug("%s", self.name, exc_info=error)
 
     def miss(self, count: int = 1) -> None:
-        """So many events did not reach it."""
+        """Count events that did not reach it."""
         with self._lock:
             behind = self.error is None and not self.missed
             self.missed += count
@@ -74,7 +74,7 @@ class Guard:
             raise RunError(f"{self.name}: failed ({one_line(self.error)})") from self.error
 
     def told(self) -> list[str]:
-        """What it missed and why, as one line; none where it heard everything."""
+        """What it missed and why, as one line; an empty list where it received everything."""
         if self.error is None and not self.missed:
             return []
         why = "slower than the link" if self.error is None else f"ended ({one_line(self.error)})"
@@ -82,7 +82,7 @@ class Guard:
 
 
 def one_line(error: Exception) -> str:
-    """An error in one line, by its class where its text alone would not say what went wrong."""
+    """An error in one line, with its class name where the text alone would not say what went wrong."""
     text = " ".join(str(error).split())
     if isinstance(error, OSError) and error.strerror:
         return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"

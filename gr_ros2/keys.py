@@ -1,6 +1,6 @@
 """The file of a fleet's keys: one key per line, 64 hex digits; the first seals, all are accepted.
 
-Laws: a key file that others than its owner may read or write is refused; a file that exists is never written over.
+Invariants: a key file that other users may read or write is refused; an existing file is never overwritten.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def new_key_file(path: str | Path) -> None:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
-        raise ConfigError(f"{path}: exists; a key is never written over, so choose another name") from None
+        raise ConfigError(f"{path}: exists; a key is never overwritten, so choose another name") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror})") from error
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
@@ -37,7 +37,7 @@ def new_key_file(path: str | Path) -> None:
 def read_key_file(path: str | Path) -> tuple[bytes, ...]:
     """The keys of a file, at least one.
 
-    :raises ConfigError: cannot be read, is readable by others, or holds something else than keys
+    :raises ConfigError: the file cannot be read, other users may read it, or it holds something other than keys
     """
     try:
         with open(path, encoding="ascii") as file:
@@ -48,7 +48,7 @@ def read_key_file(path: str | Path) -> tuple[bytes, ...]:
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: no key file; make one with gr-ros2 key new FILE") from None
     if others:
-        raise ConfigError(f"{path}: others than its owner may read or write it; run chmod 600 {path}")
+        raise ConfigError(f"{path}: other users may read or write it; run chmod 600 {path}")
     keys: list[bytes] = []
     for number, line in enumerate(lines, 1):
         if line:

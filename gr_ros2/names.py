@@ -1,6 +1,6 @@
 """Names by ROS's rules: topics, namespaces, nodes, frames; and forms of them that hold the sender's id.
 
-Laws: a name that passes here passes in every ROS 2, since the rules are those its ``rmw`` package enforces
+Invariants: a name that passes here passes in every ROS 2, since the rules are those its ``rmw`` package enforces
 (``rmw_validate_full_topic_name``, ``rmw_validate_namespace``, ``rmw_validate_node_name``). They come from the ROS 2
 design article "Topic and Service name mapping to DDS"; two underscores in a row, which only the article forbids, pass.
 A form has one field, ``{src_id}``, and nothing else in braces.
@@ -28,7 +28,7 @@ _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
 
 
 def topic_fault(name: str, longest: int = MAX_TOPIC_LEN) -> str:
-    """What ROS has against an absolute topic name, in words; '' where nothing."""
+    """Why ROS refuses an absolute topic name, in words; '' for a valid name."""
     if not name.startswith("/"):
         return "must begin with /"
     if foreign := _FOREIGN.search(name):
@@ -45,7 +45,7 @@ def topic_fault(name: str, longest: int = MAX_TOPIC_LEN) -> str:
 def check_topic(topic: str) -> str:
     """An absolute ROS topic name, unchanged.
 
-    :raises ConfigError: when it is none
+    :raises ConfigError: for an invalid name
     """
     if fault := topic_fault(topic):
         raise ConfigError(f"topic {topic!r}: not an absolute topic name of ROS, as /robot_1/odom is: {fault}")
@@ -72,7 +72,7 @@ def filled(form: str, src_id: int) -> str:
     return form.replace(_FIELD, str(src_id))
 
 
-# What settings are checked with: the value as it is, or a ValueError that says what is wrong with it.
+# Validators of settings: each returns the value unchanged, or raises a ValueError that says what is wrong.
 
 
 def checked_namespace(namespace: str) -> str:
@@ -88,7 +88,7 @@ def checked_namespace_form(form: str) -> str:
 
 
 def checked_topic_form(form: str) -> str:
-    """A topic name in which ``{src_id}`` may stand, with or without leading slash; '' is none."""
+    """A topic name in which ``{src_id}`` may stand, with or without leading slash; '' means no topic."""
     name = filled(form, _LONGEST_ID)
     fault = topic_fault(name if name.startswith("/") else f"/{name}")
     _refuse(form and (_form_fault(form) or _of_form(form, fault)))
@@ -96,7 +96,7 @@ def checked_topic_form(form: str) -> str:
 
 
 def checked_merged_topic(topic: str) -> str:
-    """An absolute topic name beside which there is room for one that ends in ``_static``; '' is none."""
+    """An absolute topic name, short enough to append ``_static``; '' means no topic."""
     _refuse(topic and topic_fault(topic, MAX_TOPIC_LEN - len("_static")))
     return topic
 
@@ -120,7 +120,7 @@ def _form_fault(form: str) -> str:
 
 
 def _of_form(form: str, fault: str) -> str:
-    """A fault of a form that was filled; where it is one of numbers, with which."""
+    """A fault of a form, with the sender's number that was filled in where the fault depends on it."""
     return f"{fault} (for sender {_LONGEST_ID})" if re.search(r"[0-9]", fault) and _FIELD in form else fault
 
 

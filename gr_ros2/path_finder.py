@@ -1,9 +1,9 @@
 """Lets another Python import gr-ros2, and what it needs, from an environment that is not its own.
 
 `gr-ros2 grc-path --install` copies this file into the user's site-packages of GNU Radio's Python, where a path file
-calls ``offer`` at every start. Laws: it finds ``gr_ros2`` alone, and only when nobody else has, until that is imported;
-from then on it also finds the packages of gr-ros2 that the other Python lacks or has too old, and nothing else; what
-the process has imported before stays as it is.
+calls ``offer`` at every start. Invariants: it finds ``gr_ros2`` alone, and only when nobody else has, until that is
+imported; from then on it also finds the packages of gr-ros2 that the other Python lacks or has too old, and nothing
+else; what the process has imported before stays as it is.
 """
 
 from __future__ import annotations

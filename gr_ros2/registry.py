@@ -1,6 +1,6 @@
-"""The registry: which topics cross the link and which number stands for each (the paper, section 4.3).
+"""The registry: which topics cross the link, and the number of each (the paper, section 4.3).
 
-Law: row order is topic id order; the same file stands on both ends, and ``digest`` says in one word whether it does.
+Invariant: row order is topic id order; both ends use the same file, and equal ``digest`` values confirm that.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import overload
 from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
-from gr_ros2.wire import FORMATS
+from gr_ros2.wire import FORMATS, TableRow
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
@@ -70,7 +70,7 @@ class Topic:
 
     @property
     def latched(self) -> bool:
-        """Whether late joiners are to get the last message: registered so, or so by ROS convention."""
+        """Whether late joiners get the last message: because the registry says so, or by ROS convention."""
         if self.options.durability is not None:
             return self.options.durability == "transient_local"
         return self.name.rsplit("/", 1)[-1] in _LATCHED
@@ -94,6 +94,13 @@ class Registry(Sequence[Topic]):
                 raise RegistryError(f"duplicate topic {topic.name!r}", path)
         self._topics = tuple(topics)
         self._by_name = names
+
+    @classmethod
+    def empty(cls) -> Registry:
+        """No topics: of a robot that sends nothing, and takes what others announce."""
+        made = cls.__new__(cls)
+        made._topics, made._by_name = (), {}
+        return made
 
     @classmethod
     def from_rows(cls, rows: Mapping[str, str] | Sequence[tuple[str, str]]) -> Registry:
@@ -154,8 +161,10 @@ class Registry(Sequence[Topic]):
         """The same rows with configured options over the registry's own; only settings that differ from the
         default override.
 
-        :raises ConfigError: for a topic that is not registered
+        :raises ConfigError: for a topic that is not registered, unless none is
         """
+        if not self:
+            return self
         topics = list(self._topics)
         for name, override in options.items():
             topic = self.named(name)
@@ -170,6 +179,24 @@ class Registry(Sequence[Topic]):
         """16 hex digits over what both ends must agree on: ids, names and types."""
         text = "\n".join(f"{topic.topic_id},{topic.name.lstrip('/')},{topic.type_name}" for topic in self)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
+    """What a sender has announced of one of its topics.
+
+    :param options: configured ones by topic name, which go over it
+    :raises ConfigError: for a name or a type that ROS does not allow
+    """
+    if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
+        raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
+    known = {name.lstrip("/"): value for name, value in options.items()}.get(row.name.lstrip("/"), DEFAULT_OPTIONS)
+    said = {
+        "durability": "transient_local" if row.latched else "volatile",
+        "depth": row.depth or None,
+    }
+    chosen = {name: value for name, value in said.items() if getattr(known, name) is None}
+    merged = build(TopicOptions, {**asdict(known), **chosen})
+    return Topic(row.topic_id, row.name, normalize_type(row.type_name), merged)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:

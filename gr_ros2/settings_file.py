@@ -1,7 +1,8 @@
 """YAML files of settings: one file, registries found, and single settings replaced on the command line.
 
-Laws: a relative registry in a file is looked for beside the file, one on the command line in the current directory;
-overrides apply in their order; nothing is checked here but the form, since the settings know their own ranges.
+Invariants: a relative registry path in a file is relative to that file, one on the command line to the current
+directory; overrides apply in their order; only the form is checked here, since the settings classes check their own
+ranges.
 """
 
 from __future__ import annotations
@@ -16,10 +17,13 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.yaml_text import parse_yaml
 
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
-"""Where the built-in scenarios and registries lie."""
+"""Folder of the built-in scenarios and registries."""
 
-SHARED_KEYS = ("registry", "packet_len", "version")
+SHARED_KEYS = ("registry", "packet_len", "version", "key", "seal", "state")
 """Settings both ends of a link must agree on."""
+
+_FILES = ("key", "state")
+"""Those that are files, which need not be there yet."""
 
 ENDS = ("ros_source", "ros_sink")
 """The blocks at the ends of a link."""
@@ -47,6 +51,9 @@ def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str]
     values = dict(values)
     if isinstance(values.get("registry"), str):
         values["registry"] = find_registry(values["registry"], directory)
+    for name in _FILES:
+        if isinstance(values.get(name), str) and values[name]:
+            values[name] = str(directory / Path(values[name]).expanduser())
     for override in overrides:
         keys, value = parse_override(override)
         if keys == ("registry",):
@@ -106,7 +113,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     if _NUMBER.fullmatch(value):  # YAML 1.1 takes 2e5 for a string
         return keys, float(value)
     parsed = parse_yaml(value, f"--set {text}", "the value is ") if value else ""
-    # Without braces a mapping was not meant: the colon belongs to a text such as bag:PATH.
+    # Without braces the user did not mean a mapping: the colon belongs to a text such as bag:PATH.
     return keys, value if isinstance(parsed, dict) and not value.startswith("{") else parsed
 
 

@@ -1,6 +1,6 @@
-"""What a YAML text may cost, checked before any of it is made: its length, its depth, and what its aliases expand to.
+"""Limits of a YAML text, checked before it is loaded: its length, its depth, and the size with its aliases expanded.
 
-Law: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
+Invariant: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
 settings file needs, every text of that length passes.
 """
 
@@ -15,21 +15,21 @@ from gr_ros2.errors import ConfigError
 
 MOST_CHARACTERS = 1 << 18
 MOST_LEVELS = 50
-"""One within the other; a scenario's settings go five deep."""
+"""Nesting depth; a scenario's settings use five levels."""
 MOST_VALUES = 20_000
 """With every alias written out."""
 
 
 @dataclass
-class _Open:
-    """A list or mapping whose end has not come. ``values`` counts what is in it, itself included."""
+class _OpenCollection:
+    """A list or mapping whose end was not read yet. ``values`` counts the values in it, itself included."""
 
     anchor: str | None
     values: int = 1
 
 
 def read_bounded(path: Path) -> str:
-    """The text of a file, of which no more is read than may be.
+    """The text of a file. At most the allowed number of characters is read.
 
     :raises ConfigError: when it is longer
     :raises OSError: when it cannot be read
@@ -43,7 +43,7 @@ def read_bounded(path: Path) -> str:
 
 
 def check_bounds(text: str) -> None:
-    """Refuse a text that would take too long to load, or too much memory.
+    """Refuse a text that would take too much time or memory to load.
 
     :raises ConfigError: for a text that is too long, goes too deep, or whose aliases expand to too much
     :raises yaml.YAMLError: when it is no YAML
@@ -51,11 +51,11 @@ def check_bounds(text: str) -> None:
     if len(text) > MOST_CHARACTERS:
         raise ConfigError(f"longer than {MOST_CHARACTERS:,} characters; settings are not")
     sizes: dict[str, int] = {}
-    levels = [_Open(None)]
+    levels = [_OpenCollection(None)]
     for event in yaml.parse(text):  # events come one by one and build nothing
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.CollectionStartEvent):
-            levels.append(_Open(event.anchor))
+            levels.append(_OpenCollection(event.anchor))
             if len(levels) > MOST_LEVELS:
                 raise ConfigError(f"line {line}: more than {MOST_LEVELS} levels one within the other")
             continue

@@ -1,7 +1,7 @@
 """YAML as this program reads and writes it: plain values, and every key once.
 
-Law: whatever YAML comes in, from a file or the command line, is read here. A key that stands twice in one mapping is an
-error: YAML 1.2 (section 3.2.1.3) forbids it, and PyYAML would take the last without a word.
+Invariant: all YAML, from a file or the command line, is read here. A duplicate key in one mapping is an error: YAML 1.2
+(section 3.2.1.3) forbids it, and PyYAML would silently use the last one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gr_ros2.yaml_bounds import check_bounds
 
 
 class _Loader(yaml.SafeLoader):
-    """Sees keys as they are written: what ``<<`` merges in, and the mapping overrides, is no duplicate."""
+    """Checks keys as they are written: a key that ``<<`` merges in and the mapping overrides is not a duplicate."""
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
@@ -34,7 +34,7 @@ def parse_yaml(text: str, where: str, what: str = "") -> Any:
     """The value of a YAML text.
 
     :param where: what errors begin with, for instance the file name
-    :param what: of which errors speak, where that is not the whole of ``where``
+    :param what: the part of ``where`` that errors name, '' for all of it
     :raises ConfigError: when it is no YAML, is past what :mod:`gr_ros2.yaml_bounds` allows,
         or has a key twice; names the key and its lines
     """

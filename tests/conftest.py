@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 from collections.abc import Iterator
 
 import pytest
@@ -34,6 +35,10 @@ for name in (
     "ZENOH_SESSION_CONFIG_URI",
 ):
     os.environ.pop(name, None)
+
+# Robots of tests count their starts where nobody else's do.
+_STATE = tempfile.TemporaryDirectory(prefix="gr_ros2-state-")
+os.environ["XDG_STATE_HOME"] = _STATE.name
 
 # A shell script's background jobs ignore Ctrl-C, and so would every program that a test starts and interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -1,7 +1,8 @@
 """DDS domains that only one test process of a machine uses, also when several suites run at once.
 
-Laws: a process reserves a domain before it uses one, with an abstract Unix socket named after it. The kernel lets go of
-that socket when the process ends, however it ends. Network namespaces share neither these sockets nor the ports of DDS.
+Invariants: a process reserves a domain before it uses one, with an abstract Unix socket named after it. The kernel lets
+go of that socket when the process ends, however it ends. Network namespaces share neither these sockets nor the ports
+of DDS.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def test_every_row_has_a_summary_of_one_line(table: BackendTable[Backend]) -> No
 NAMES = {*MIDDLEWARE.own, *PHY.own, *FRONT_ENDS.own}
 MEANT = {
     "doctor/ros.py": {"rclpy", "zenoh"},  # the Python module, and a part of the name of an RMW
-    "race/ends.py": {"dds", "zenoh"},  # these very stacks are what races
+    "race/endpoints.py": {"dds", "zenoh"},  # these very stacks are what races
     "race/settings.py": {"zenoh", "sim"},
     "run/scenario.py": {"sim"},  # the simulated robots, not the front end
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fuzz.compression
-import fuzz.doorbell
+import fuzz.control_socket
 import fuzz.endpoint
 import fuzz.receiver
 import fuzz.wire
@@ -29,7 +29,7 @@ HARNESSES = {
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
-    "doorbell": (fuzz.doorbell.doorbell, fuzz.doorbell.corpus),
+    "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
 }
 COUNTS = {
@@ -38,7 +38,7 @@ COUNTS = {
     "endpoint": 400,
     "receiver": 1_500,
     "compression": 2_000,
-    "doorbell": 1_000,
+    "control_socket": 1_000,
     "dashboard": 300,
     "kernels": 400,
 }

@@ -20,7 +20,7 @@ def test_a_new_key_is_its_owners_and_no_other(tmp_path: Path, capsys: pytest.Cap
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o600
     capsys.readouterr()
     assert run(["key", "new", str(tmp_path / "a")]) == 2
-    assert "never written over" in capsys.readouterr().err
+    assert "never overwritten" in capsys.readouterr().err
     assert read_key_file(tmp_path / "a") == keys[0]
 
 

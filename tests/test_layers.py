@@ -43,8 +43,8 @@ PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
 CONFINED = {
-    "gnuradio": ("gr/", "phy/", "radio/", "race/air.py"),
-    "pmt": ("gr/", "phy/", "radio/", "race/air.py"),
+    "gnuradio": ("gr/", "phy/", "radio/", "race/links.py"),
+    "pmt": ("gr/", "phy/", "radio/", "race/links.py"),
     "rclpy": ("middleware/rclpy.py", "ros/"),
     "rcl_interfaces": ("ros/",),
     "distributed": ("study/sweep/cluster.py",),

@@ -1,7 +1,7 @@
 """The program: what `gr-ros2` and `python -m gr_ros2.cli` start.
 
-Law: from the first line of `main` on, Ctrl-C and SIGTERM end the program with one line and one status, whatever is
-being loaded; nothing heavy is imported before that.
+Invariant: from the first line of `main` on, Ctrl-C and SIGTERM end the program with one line and one status, whatever
+is being loaded; nothing heavy is imported before that.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Packets out of what people have: hex text, files of back-to-back packets, pcap and pcapng captures.
 
-Law: nothing is dropped in silence; what is no packet is handed on for the decoder to refuse, and what cannot be read
-as a capture at all is a ConfigError.
+Invariant: nothing is dropped in silence; what is no packet is handed on for the decoder to refuse, and what cannot be
+read as a capture at all is a ConfigError.
 """
 
 from __future__ import annotations

@@ -14,12 +14,12 @@ import click
 from rich.console import Console
 
 from gr_ros2.backends import uninterrupted
-from gr_ros2.cli.doorbell import Doorbell, neighbours, receive, ring
+from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
 from gr_ros2.errors import BackendMissingError, ConfigError, RunError
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard
-    from gr_ros2.run.watch import Audience
+    from gr_ros2.run.observers import LateObservers
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
@@ -36,19 +36,19 @@ dashboard_option = click.option(
 
 
 @contextmanager
-def audience(where: str | None, console: Console, name: str, *, instruments: bool = True) -> Iterator[Audience]:
+def audience(where: str | None, console: Console, name: str, *, instruments: bool = True) -> Iterator[LateObservers]:
     """Whoever looks on at a run or a link: a dashboard from the start where one is wanted, and those asked for by
     `gr-ros2 dashboard` in the meantime.
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for those who look for it
-    :param instruments: see :class:`gr_ros2.run.watch.Watcher`
+    :param instruments: see :class:`gr_ros2.run.observers.RunObserver`
     :raises ConfigError: for a place where nothing can be served
     :raises BackendMissingError: when the package that draws it is not installed
     """
-    from gr_ros2.run.watch import Audience
+    from gr_ros2.run.observers import LateObservers
 
-    seen = Audience(instruments or where is not None)
+    seen = LateObservers(instruments or where is not None)
     urls: list[str] = []
     with ExitStack() as dashboards:
 
@@ -62,10 +62,10 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
         # Closed before the dashboards are, so that nobody can ask for one more by then.
-        with ExitStack() as doorbell:
+        with ExitStack() as control_socket:
             try:
-                doorbell.enter_context(
-                    Doorbell(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))})
+                control_socket.enter_context(
+                    ControlSocket(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))})
                 )
             except (OSError, RunError) as error:
                 _log.warning("`gr-ros2 dashboard` cannot find this program (%s)", error)
@@ -112,14 +112,14 @@ def _find(address: str, port: int, pid: int | None) -> str | None:
     """Where a page is served, by who serves one already or by who is asked to; None where nothing runs."""
     if pid is None and _answers(address, port):
         return f"http://{address}:{port}/"
-    running = neighbours()
+    running = running_programs()
     if pid is None and not running:
         return None
     if pid is None and len(running) > 1:
         several = ", ".join(f"{pid} ({name})" for pid, name in running.items())
         raise ConfigError(f"several run: {several}; say which with --pid")
     chosen = next(iter(running)) if pid is None else pid
-    return str(ring(chosen, {"address": address, "port": port})["url"])
+    return str(request(chosen, {"address": address, "port": port})["url"])
 
 
 def parse_place(text: str) -> tuple[str, int]:

@@ -1,6 +1,6 @@
 """`gr-ros2 dict`: dictionaries for message compression: train one on a recording, show what there is.
 
-Law: what `train` promises it has measured, on messages it did not train on.
+Invariant: what `train` promises it has measured, on messages it did not train on.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def list_dictionaries(*, files: Sequence[Path]) -> None:
     for dictionary in [load(path) for path in files] or map(shipped, SHIPPED):
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("type", overflow="fold")
-        for heading in ("fields", "ballasts", "zstd, B"):
+        for heading in ("fields", "templates", "zstd, B"):
             table.add_column(heading, justify="right")
         for name, entry in dictionary.types.items():
             row = (len(entry.classes), len(entry.templates), len(entry.zstd))

@@ -31,7 +31,7 @@ from gr_ros2.yaml_text import yaml_text
 
 if TYPE_CHECKING:
     from gr_ros2.radio.link import RobotLink
-    from gr_ros2.run.watch import LiveRun
+    from gr_ros2.run.observers import LiveRun
 
 _SHOW_S = 0.5
 
@@ -93,17 +93,17 @@ def link(
     # These need GNU Radio, which a wrong setting must not wait for.
     with uninterrupted():
         from gr_ros2.radio.link import RobotLink
-        from gr_ros2.run.watch import Onlookers
+        from gr_ros2.run.observers import RunObservers
 
     console = make_console()
-    with audience(dashboard, console, settings.name) as visitors, capture(pcap) as captures, ExitStack() as stack:
-        onlookers = Onlookers([visitors, *captures], apart=True)
-        stack.callback(onlookers.run_ended, None)
-        running = RobotLink(settings, observer=onlookers, instrumented=True)
+    with audience(dashboard, console, settings.name) as clients, capture(pcap) as captures, ExitStack() as stack:
+        run_observers = RunObservers([clients, *captures], threaded=True)
+        stack.callback(run_observers.run_ended, None)
+        running = RobotLink(settings, observer=run_observers, instrumented=True)
         stack.callback(running.stop)
         try:
             running.start()
-            onlookers.run_started(_live(running))
+            run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
             pass  # how a link ends
@@ -131,8 +131,8 @@ def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path
 
 
 def _live(running: RobotLink) -> LiveRun:
-    """What onlookers see: this end alone, so no ledger."""
-    from gr_ros2.run.watch import LiveRun
+    """What observers see: this end alone, so no ledger."""
+    from gr_ros2.run.observers import LiveRun
 
     source = running.source
     return LiveRun(

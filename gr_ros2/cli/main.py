@@ -1,6 +1,6 @@
 """The command `gr-ros2`: finds a sub-command, runs it, and turns errors into one line and an exit status.
 
-Laws: nothing but this package prints, exits or reads argv; a sub-command's module is imported only when it is
+Invariants: nothing but this package prints, exits or reads argv; a sub-command's module is imported only when it is
 chosen, so `--help` is quick and works without GNU Radio, DDS and ROS; exit status 2 means bad input, 1 a failed run,
 130 Ctrl-C or SIGTERM.
 """

@@ -1,9 +1,9 @@
 """`--pcap FILE`: every packet that leaves or arrives, as a capture that Wireshark reads.
 
 A pcapng file of link type USER0 with two interfaces, `sent` (packets composed by a source of ours) and `received`
-(packets the PHY handed to the sink). Laws: a packet is in the file as soon as its call returns; the file ends after a
-whole record whatever happens to the process or the disk; times are wall time, also of runs in simulated time, which
-start now.
+(packets the PHY handed to the sink). Invariants: a packet is in the file as soon as its call returns; the file ends
+after a whole record whatever happens to the process or the disk; times are wall time, also of runs in simulated time,
+which start now.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, 
 
 if TYPE_CHECKING:
     from gr_ros2.record.result import Result
-    from gr_ros2.run.watch import LiveRun
+    from gr_ros2.run.observers import LiveRun
 
 LINK_TYPE = 147
 """DLT_USER0: ours to give a meaning; the dissector does."""
@@ -39,7 +39,7 @@ _CLOSE_S = 1.0
 
 
 class PacketCapture:
-    """A capture under way: a :class:`gr_ros2.run.watch.Watcher`, and for a link without runs its ears.
+    """A capture under way: a :class:`gr_ros2.run.observers.RunObserver`, and for a link without runs its observer.
 
     :param path: file to write, replaced if it is there
     :param clock: s, the clock of the events, until a run brings its own

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.config import build
 from gr_ros2.errors import ConfigError
-from gr_ros2.race.report import notes, race_grid, write_race
+from gr_ros2.race.results import notes, race_grid, write_race
 from gr_ros2.race.runner import run_race
 from gr_ros2.race.settings import RaceSettings
 from gr_ros2.report.table import as_table

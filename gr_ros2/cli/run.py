@@ -27,9 +27,9 @@ from gr_ros2.report.page import Run, read_runs, write_report
 from gr_ros2.report.repetitions import repetition_grid
 from gr_ros2.report.table import as_table, ledger_table, notes, paper_grid, summary_table
 from gr_ros2.run import runner
+from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.watch import Watcher
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
@@ -79,8 +79,8 @@ def _run(
     console = make_console()
     # With pace `flow` the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
     looked_at = audience(dashboard, console, scenario.name, instruments=scenario.pace == "airtime")
-    with looked_at as onlookers, capture(pcap) as captures, _bar(console) as bar:
-        seen: list[Watcher] = [onlookers, *captures]
+    with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
+        seen: list[RunObserver] = [run_observers, *captures]
         if scenario.repetitions == 1:
             outcome = runner.run_scenario(scenario, out, _advance(bar, scenario, scenario.name), seen)
         else:

@@ -55,8 +55,8 @@ def sweep(
     except ModuleNotFoundError as error:
         package = (error.name or "distributed").split(".")[0]
         raise BackendMissingError(f"sweep needs {package}: pip install 'gr-ros2[sweep]'") from error
-    from gr_ros2.study.sweep.page import summary_grid
-    from gr_ros2.study.sweep.table import rows_of, summaries
+    from gr_ros2.study.sweep.summaries import rows_of, summaries
+    from gr_ros2.study.sweep.sweep_page import summary_grid
 
     console = make_console()
     out = out or Path("results") / f"sweep-{plan.name}"

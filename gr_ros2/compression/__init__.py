@@ -1,12 +1,13 @@
-"""Message compression inside version 0: fewer bytes per message, each message by itself (the C bit of the header).
+"""Message compression inside version 0: fewer bytes per message, each message coded independently (the C bit of the
+header).
 
-``LinkCodec(registry)`` is what a sender and a receiver take as their message codec;
+``LinkCodec(registry)`` is the message codec of a sender and a receiver;
 ``docs/explanation/compression.md`` has the format.
 """
 
 from __future__ import annotations
 
-from gr_ros2.compression.codec import CODECS, MAX_MESSAGE, LinkCodec
 from gr_ros2.compression.dictionary import Dictionary, load, shipped
+from gr_ros2.compression.link_codec import CODECS, MAX_MESSAGE, LinkCodec
 
 __all__ = ["CODECS", "MAX_MESSAGE", "Dictionary", "LinkCodec", "load", "shipped"]

@@ -1,11 +1,11 @@
-"""Long arrays made easy for zstd: bytes of like significance side by side, differences, decimals.
+"""Transforms of long arrays that help zstd: bytes of equal significance side by side, differences, decimals.
 
-Each array says how it was turned: PLAIN, PLANES (byte 0 of all elements, then byte 1, ...), DELTAS (differences of
-neighbouring elements, modulo their width, folded and as planes), DECIMALS (float32 that are n / 10**k: 5 + the folded
-differences of the n, as planes; 0..4 stand for infinities and the like).
+Each array names its transform: PLAIN, PLANES (byte 0 of all elements, then byte 1, ...), DELTAS (differences of
+neighbouring elements, modulo their width, zigzag-coded and as planes), DECIMALS (float32 of the form n / 10**k: 5 + the
+zigzag-coded differences of the n, as planes; 0..4 stand for infinities and other special values).
 
-Laws: little endian in and out; exact for all bytes; a turn back never yields more bytes than the size it is given, and
-only ValueError comes out of it.
+Invariants: little endian in and out; exact for all bytes; the inverse never yields more bytes than the given size, and
+raises only ValueError.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _SPECIAL = np.array([0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00000, 0x80000000]
 _MAX_N = 1 << 24
 
 
-def turn(data: bytes, size: int, real: bool, compressed: Callable[[bytes], int]) -> tuple[int, int, bytes]:
-    """(way, parameter, turned bytes) of the way that compresses best.
+def transform(data: bytes, size: int, real: bool, compressed: Callable[[bytes], int]) -> tuple[int, int, bytes]:
+    """(transform, parameter, transformed bytes) of the transform that compresses best.
 
     :param size: bytes of an element
     :param real: elements are floating point
@@ -50,10 +50,10 @@ def _candidates(data: bytes, size: int, real: bool) -> Iterator[tuple[int, int, 
         yield DELTAS, size, _to_planes(_differences(np.frombuffer(data, _UNSIGNED[size])).tobytes(), size)
 
 
-def turn_back(way: int, parameter: int, data: bytes, size: int) -> bytes:
-    """The array.
+def inverse_transform(way: int, parameter: int, data: bytes, size: int) -> bytes:
+    """The original array.
 
-    :raises ValueError: no such way, or not of whole elements
+    :raises ValueError: unknown transform, or an incomplete element
     """
     if way == PLAIN:
         return data
@@ -83,7 +83,7 @@ def _from_planes(data: bytes, size: int) -> bytes:
 
 
 def _differences(values: _Whole) -> _Whole:
-    """Of neighbours, folded so that small ones of either sign are small numbers."""
+    """Differences of neighbours, zigzag-coded so that small differences of either sign are small numbers."""
     out = values.copy()
     out[1:] -= values[:-1]
     signed = out.view(out.dtype.str.replace("u", "i"))
@@ -98,7 +98,7 @@ def _unfolded(values: _Whole) -> _Whole:
 
 
 def _decimals(data: bytes) -> tuple[int, int, bytes] | None:
-    """As differences of n with the fewest decimals k <= 4, None where some element is no such number."""
+    """Differences of n with the fewest decimals k <= 4, None where some element is not such a number."""
     bits = np.frombuffer(data, "<u4")
     special = np.isin(bits, _SPECIAL)
     with np.errstate(all="ignore"):

@@ -1,12 +1,13 @@
-"""Dictionaries: what both ends know beforehand about the messages of some types.
+"""Dictionaries: knowledge about the messages of some types that both ends have in advance.
 
 A dictionary is one JSON file: words (frame names and the like), constants (numbers that covariances are made of), and
-for each type the float class of its fields, whole ballasts that are frequent, a zstd dictionary, and the definition
+for each type the float class of its fields, frequent sets of static values, a zstd dictionary, and the definition
 where ROS 2 Humble has none or another one.
 
-Laws: a dictionary never changes; another content is another dictionary with another id. The sets shipped with gr-ros2
-are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A user's own are named by
-the first two bytes of their SHA-256. A file that is no dictionary is a ConfigError that names it.
+Invariants: a dictionary never changes; different content is a different dictionary with a different id. The sets
+shipped with gr-ros2 are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A
+user's own dictionaries are named by the first two bytes of their SHA-256. A file that is not a dictionary is a
+ConfigError that names the file.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.compression.ballast import Words
-from gr_ros2.compression.floats import CLASSES, Constants
+from gr_ros2.compression.floats import CLASSES, KnownNumbers
 from gr_ros2.compression.prepared import Model
+from gr_ros2.compression.static_values import Words
 from gr_ros2.errors import ConfigError
 
 FORMAT = 1
@@ -33,7 +34,7 @@ since, up to Lyrical. A sender uses the last one with a definition that fits the
 GENERAL = 1
 """The set whose words and constants serve the types that no set has."""
 OWN = 15
-"""Stands in the first byte for a user's own dictionary; its id follows."""
+"""Number in the first byte for a user's own dictionary; its id follows."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class TypeEntry:
     """What is known about one type.
 
     :param classes: float class letter by path of the field
-    :param templates: (sequence lengths, coded ballast), most frequent first, at most 15
+    :param templates: (sequence lengths, coded static values), most frequent first, at most 15
     :param zstd: a zstd dictionary over its payloads, b'' = none
     :param definition: ``.msg`` text, '' for types as ROS 2 Humble has them
     """
@@ -54,7 +55,7 @@ class TypeEntry:
 
 @dataclass(frozen=True)
 class Dictionary:
-    """A set of what is known.
+    """The content of one dictionary.
 
     :param name: for people
     :param number: 1..14 for a shipped set, OWN for a user's
@@ -70,23 +71,23 @@ class Dictionary:
 
     @property
     def digest(self) -> str:
-        """64 hex digits over all that coding depends on; the name is not part of it."""
+        """64 hex digits over everything that coding depends on; the name is not part of it."""
         content = {key: value for key, value in self._as_json().items() if key != "name"}
         return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
     @property
     def prefix(self) -> bytes:
-        """What follows the first byte of a message: the id of a user's own dictionary."""
+        """The bytes after the first byte of a message: the id of a user's own dictionary, otherwise empty."""
         return bytes.fromhex(self.digest[:4]) if self.number == OWN else b""
 
     def model(self, type_name: str) -> Model:
-        """For the codec ``fields``; the words and constants serve types without an entry too."""
+        """The model for the codec ``fields``; words and constants also apply to types without an entry."""
         entry = self.types.get(type_name, TypeEntry())
         return Model(*self._lists, entry.classes, entry.templates)
 
     @cached_property
-    def _lists(self) -> tuple[Words, Constants]:
-        return Words([word.encode() + b"\0" for word in self.words]), Constants(self.constants)
+    def _lists(self) -> tuple[Words, KnownNumbers]:
+        return Words([word.encode() + b"\0" for word in self.words]), KnownNumbers(self.constants)
 
     def save(self, path: str | Path) -> None:
         """Write the file.
@@ -120,7 +121,7 @@ class Dictionary:
 def load(path: str | Path, number: int = OWN) -> Dictionary:
     """Read a dictionary from its file.
 
-    :raises ConfigError: when it is none; names the file
+    :raises ConfigError: when the file is not a dictionary; names the file
     """
     try:
         return _parse(json.loads(Path(path).read_text(encoding="utf-8")), number)

@@ -1,11 +1,11 @@
-"""The codec ``fields``: a message taken apart by its type, each value coded for what it is.
+"""The codec ``fields``: a message is split by its type, and each value is coded according to its kind.
 
-A message becomes one number (see ``number``). Popped off it come, in order: byte order, options and tail; sequence
-lengths; live values (stamps, numbers); and what is left of the number is the ballast (strings, matrices, flags), which
-therefore can be remembered under the number itself. Long arrays and strings follow as a second part.
+A message becomes one number (see ``ans``). Popping it yields, in order: byte order, options and tail; sequence lengths;
+live values (stamps, numbers). The rest of the number is the static values (strings, matrices, flags), so they can be
+cached with that number as the key. Long arrays and strings follow as a second part.
 
-Laws: exact but for alignment gaps, which become zero; no message needs another; what is remembered only saves time;
-memory is bounded; decoding arbitrary bytes ends in a message or in a DamagedError.
+Invariants: exact except for alignment gaps, which become zero; no message needs another; caches only save time; memory
+is bounded; decoding arbitrary bytes gives a message or a DamagedError.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
 from gr_ros2.compression import bounds, bulk
-from gr_ros2.compression.ballast import Value, pop_ballast, push_ballast
+from gr_ros2.compression.ans import Table, from_bytes, pop_natural, push_natural, to_bytes
 from gr_ros2.compression.floats import (
     pop_double,
     pop_quaternion,
@@ -25,9 +25,7 @@ from gr_ros2.compression.floats import (
     push_quaternion,
     push_single,
 )
-from gr_ros2.compression.frames import Zstd, read_varint, varint
-from gr_ros2.compression.number import Table, from_bytes, pop_natural, push_natural, to_bytes
-from gr_ros2.compression.plan import (
+from gr_ros2.compression.layout import (
     DOUBLE,
     INTEGER,
     MATRIX,
@@ -43,12 +41,14 @@ from gr_ros2.compression.plan import (
 from gr_ros2.compression.prepared import PARTS, TEMPLATES, Model, Prepared
 from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, Repeat, Shape, is_open, shape_of
 from gr_ros2.compression.stamps import pop_stamp, push_stamp
+from gr_ros2.compression.static_values import Value, pop_static, push_static
+from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
 from gr_ros2.errors import DamagedError
 
 MAX_NUMBER = 8192
-"""Bytes of the number part: what MAX_SLOTS values can need; more is damage."""
+"""Bytes of the number part: the most that MAX_SLOTS values can need; a longer number is damage."""
 _REMEMBERED = 128
-"""Things of a kind that are remembered."""
+"""Entries of each cache."""
 _LAYOUTS_TRIED = 4
 
 _HEADERS = [bytes((0, order, 0, options)) for order in (1, 0) for options in range(4)]
@@ -62,7 +62,7 @@ _V = TypeVar("_V")
 
 
 class _Array(NamedTuple):
-    """A piece of the second part: item, bytes, bytes of an element, and how it was turned."""
+    """A piece of the second part: item, bytes, bytes of an element, and its transform."""
 
     item: int
     length: int
@@ -90,7 +90,7 @@ class FieldsCodec:
         self._values: dict[tuple[tuple[int, ...], int], tuple[Value, ...]] = {}
 
     def layout(self, payload: bytes) -> tuple[Layout, tuple[Any, ...]] | None:
-        """The layout of a payload and its values; None where it is no message of the type, or one of too many parts."""
+        """The layout of a payload and its values; None where it is not a message of the type, or has too many parts."""
         recent = self._recent.get(len(payload))
         if recent is not None:
             for layout in recent:
@@ -110,7 +110,7 @@ class FieldsCodec:
         return found, found.unpack(payload)
 
     def encode(self, payload: bytes) -> tuple[bytes, bool] | None:
-        """The coded message, and whether it has a second part; None where the payload cannot be taken apart."""
+        """The coded message, and whether it has a second part; None where the payload cannot be split."""
         found = self.layout(payload)
         if found is None:
             return None
@@ -123,7 +123,7 @@ class FieldsCodec:
         packed = _RAW
         if prepared.bulk or layout.long_texts:
             blob, ways, packed = self._blob(layout, prepared, values)
-        x = self._push_ballast(prepared, layout, values)
+        x = self._push_static(prepared, layout, values)
         x = self._push_live(x, prepared, values, layout.unpack_reals(payload), ways)
         if self._open:
             for count in reversed(layout.shape.counts):
@@ -141,8 +141,8 @@ class FieldsCodec:
     def decode(self, coded: bytes, with_blob: bool, max_size: int) -> bytes:
         """The message.
 
-        :param max_size: bytes; more are not made
-        :raises DamagedError: no such message, or a larger one than is taken
+        :param max_size: most bytes of the message
+        :raises DamagedError: not a coded message, or a message larger than ``max_size``
         """
         try:
             return self._decode(coded, with_blob, max_size)
@@ -151,17 +151,17 @@ class FieldsCodec:
                 raise
             raise DamagedError(f"damaged message: {' '.join(str(error).split())}") from error
 
-    def ballast(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
-        """What a template of this message would be (``Model.templates``); None where it has no use for one."""
+    def static_values(self, payload: bytes) -> tuple[tuple[int, ...], int] | None:
+        """The template of this message (``Model.templates``); None where it cannot use one."""
         found = self.layout(payload)
         if found is None or found[0].long_texts or (prepared := self._prepare(found[0].shape.counts)) is None:
             return None
-        values = self._ballast_values(prepared, *found)
-        return found[0].shape.counts, push_ballast(
-            0, values, prepared.plan.ballast, self._model.words, self._model.constants
+        values = self._static_values(prepared, *found)
+        return found[0].shape.counts, push_static(
+            0, values, prepared.plan.static_values, self._model.words, self._model.constants
         )
 
-    # Preparation, remembered
+    # Preparation, cached
 
     def _prepare(self, counts: tuple[int, ...], max_items: int = 4 * MAX_PARTS) -> Prepared | None:
         made = self._prepared.get(counts)
@@ -186,27 +186,27 @@ class FieldsCodec:
 
     # Encoding
 
-    def _ballast_values(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> tuple[Value, ...]:
-        picked = [values[index] for index in prepared.ballast_indexes]
+    def _static_values(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> tuple[Value, ...]:
+        picked = [values[index] for index in prepared.static_indexes]
         if layout.shape.order == BIG:
-            for n, slot in enumerate(prepared.plan.ballast):
+            for n, slot in enumerate(prepared.plan.static_values):
                 if slot.kind == MATRIX:
                     picked[n] = bulk.swapped(picked[n], 8)
         if layout.long_texts:
-            for n, index in enumerate(prepared.ballast_indexes):
+            for n, index in enumerate(prepared.static_indexes):
                 if index in layout.long_texts:
                     picked[n] = layout.long_texts[index]
         return tuple(picked)
 
-    def _push_ballast(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> int:
-        key = self._ballast_values(prepared, layout, values)
+    def _push_static(self, prepared: Prepared, layout: Layout, values: Sequence[Any]) -> int:
+        key = self._static_values(prepared, layout, values)
         known = (prepared.counts, key)
         x = self._coded.get(known)
         if x is None:
             number = prepared.templates.get(key, PARTS)
             x = 0
             if number == PARTS:
-                x = push_ballast(0, key, prepared.plan.ballast, self._model.words, self._model.constants)
+                x = push_static(0, key, prepared.plan.static_values, self._model.words, self._model.constants)
             if self._model.templates:
                 x = TEMPLATES.push(x, number)
             _remember(self._coded, known, x)
@@ -244,13 +244,13 @@ class FieldsCodec:
     def _blob(
         self, layout: Layout, prepared: Prepared, values: Sequence[Any]
     ) -> tuple[bytes, list[tuple[int, int]], int]:
-        """(second part, way of each array, whether it is compressed)"""
+        """(second part, transform of each array, whether it is compressed)"""
         ways, parts = [], []
         for slot in prepared.bulk:
             data = values[slot.index]
             if layout.shape.order == BIG:
                 data = bulk.swapped(data, slot.size)
-            way, parameter, turned = bulk.turn(data, slot.size, slot.real >= 0, self._measure)
+            way, parameter, turned = bulk.transform(data, slot.size, slot.real >= 0, self._measure)
             ways.append((way, parameter))
             parts.append(turned)
         parts += [values[index] for index in layout.long_texts]
@@ -291,14 +291,14 @@ class FieldsCodec:
         values = prepared.blank.copy()
         values[0], values[-1] = header, bytes(tail)
         x, ways = self._pop_live(x, prepared, values)
-        ballast = self._pop_ballast(x, prepared)
+        static_values = self._pop_static(x, prepared)
         big = header[1] == 0
         texts: list[int] = []
         arrays = [
             _Array(slot.index, prepared.plan.items[slot.index][2], slot.size, way, parameter)
             for slot, (way, parameter) in zip(prepared.bulk, ways, strict=True)
         ]
-        for slot, value in zip(prepared.plan.ballast, ballast, strict=True):
+        for slot, value in zip(prepared.plan.static_values, static_values, strict=True):
             index = slot.index
             if slot.kind == STRING:
                 length = value if isinstance(value, int) else len(value)
@@ -358,7 +358,7 @@ class FieldsCodec:
                 ways.append((way, parameter))
         return x, ways
 
-    def _pop_ballast(self, x: int, prepared: Prepared) -> Sequence[Value]:
+    def _pop_static(self, x: int, prepared: Prepared) -> Sequence[Value]:
         known = (prepared.counts, x)
         values = self._values.get(known)
         if values is not None:
@@ -369,13 +369,13 @@ class FieldsCodec:
                 raise DamagedError("damaged message: a template of another shape")
             found = prepared.template_values[number]
         else:
-            rest, found = pop_ballast(rest, prepared.plan.ballast, self._model.words, self._model.constants)
+            rest, found = pop_static(rest, prepared.plan.static_values, self._model.words, self._model.constants)
         if rest:
-            raise DamagedError("damaged message: more than was wanted")
+            raise DamagedError("damaged message: more values than its type has")
         return _remember(self._values, known, tuple(found))
 
     def _take_blob(self, blob: bytes, packed: int, arrays: Sequence[_Array], values: list[Any], max_size: int) -> None:
-        """Put the arrays and long strings of the second part into their places."""
+        """Store the arrays and long strings of the second part in their items."""
         size = sum(array.length for array in arrays)
         if size > max_size:
             raise DamagedError(f"damaged message: larger than {max_size} bytes")
@@ -385,13 +385,13 @@ class FieldsCodec:
         big = values[0][1] == 0
         at = 0
         for array in arrays:
-            data = bulk.turn_back(array.way, array.parameter, raw[at : at + array.length], array.size)
+            data = bulk.inverse_transform(array.way, array.parameter, raw[at : at + array.length], array.size)
             values[array.item] = bulk.swapped(data, array.size) if big else data
             at += array.length
 
 
 def _remember(memory: dict[_K, _V], key: _K, value: _V) -> _V:
-    """Keep something that can always be made again, and forget what has been kept for longest."""
+    """Cache a value that can always be computed again; drop the oldest entry when the cache is full."""
     if len(memory) >= _REMEMBERED:
         del memory[next(iter(memory))]
     memory[key] = value

@@ -1,11 +1,12 @@
-"""Floating point numbers, bit for bit: most of a double is noise, so everything that is not must cost next to nothing.
+"""Lossless coding of floating point numbers: most bits of a double are noise, so all others must cost almost nothing.
 
 A number is one of: zero; one of the dictionary's constants; a double that carries a float32; a short decimal fraction
-(n / 10**k, k <= 9); the square of one, as variances often are (in matrices); a sign and exponent from the field's
-static model and the fraction as it is; or, failing all these (NaN, infinities, denormals, far-off exponents), its bits.
+(n / 10**k, k <= 9); the square of a short decimal fraction, as variances often are (in matrices); a sign and exponent
+from the field's static model and the fraction bits; or, where none of these applies (NaN, infinities, denormals,
+extreme exponents), all its bits.
 
-Laws: exact for all bit patterns, including NaN payloads and -0.0; each number stands for itself, so that one field
-never needs another (quaternions excepted, see there).
+Invariants: exact for all bit patterns, including NaN payloads and -0.0; each number is coded independently, except for
+the four of a quaternion.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from struct import Struct
 
-from gr_ros2.compression.number import MASK, SCALE_BITS, Table, pop_natural, pop_rank, push_natural, push_rank
+from gr_ros2.compression.ans import MASK, SCALE_BITS, Table, pop_natural, pop_rank, push_natural, push_rank
 
 ZERO, CONSTANT, SINGLE, SHORT, SQUARE, VERBATIM, EXPONENTS = range(7)
 """Symbols of a field's model; from EXPONENTS on, sign and exponent: EXPONENTS + 2 * (exponent + 40) + sign."""
 LOWEST, HIGHEST = -40, 23
-"""Exponents the models know: 1e-12 .. 1.6e7."""
+"""Range of exponents in the models: 1e-12 .. 1.6e7."""
 MAX_DECIMALS = 9
 
 _POWERS = [10**k for k in range(MAX_DECIMALS + 1)]
@@ -81,12 +82,12 @@ CLASSES: Mapping[str, FloatClass] = {
     "f": FloatClass(40, 20, 850, 30, -2, 6, 4),
     "c": FloatClass(200, 500, 20, 100, 0, 6, 4, 2, 100),
 }
-"""Letter -> class, part of the format: a dictionary names one letter per field. "a" is for fields nobody knows."""
+"""Letter -> class, part of the format: a dictionary names one letter per field. "a" is for unknown fields."""
 DEFAULT_CLASS = "a"
 
 
 _CLASS_TABLES = {letter: made.table() for letter, made in CLASSES.items()}
-"""Made at once, so that no message has to wait for one."""
+"""Computed in advance, so that no message has to wait for a table."""
 
 
 def class_table(letter: str) -> Table:
@@ -94,7 +95,7 @@ def class_table(letter: str) -> Table:
     return _CLASS_TABLES[letter]
 
 
-class Constants:
+class KnownNumbers:
     """Values of doubles in order of frequency, by their bits."""
 
     def __init__(self, values: Sequence[int]) -> None:
@@ -134,7 +135,7 @@ def _root(value: float) -> tuple[int, int] | None:
     return short if short is not None and short[0].bit_length() <= 24 else None
 
 
-def push_double(x: int, bits: int, value: float, table: Table, constants: Constants) -> int:
+def push_double(x: int, bits: int, value: float, table: Table, constants: KnownNumbers) -> int:
     """Push a double given by its bits and its value."""
     if bits == 0:
         symbol = ZERO
@@ -166,10 +167,10 @@ def push_double(x: int, bits: int, value: float, table: Table, constants: Consta
     return (quotient << SCALE_BITS) + rest + start
 
 
-def pop_double(x: int, table: Table, constants: Constants) -> tuple[int, int]:
+def pop_double(x: int, table: Table, constants: KnownNumbers) -> tuple[int, int]:
     """(x, bits)
 
-    :raises IndexError: a constant the dictionary has not
+    :raises IndexError: a constant that is not in the dictionary
     """
     slot = x & MASK
     symbol, start, share = table.slots[slot]
@@ -257,11 +258,11 @@ _LARGEST_MISS = 24
 IDENTITY = (0, 0, 0, bits_of(1.0))
 
 
-def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table: Table, constants: Constants) -> int:
-    """Push a unit quaternion: its largest component follows from the others but for a few last bits."""
+def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table: Table, constants: KnownNumbers) -> int:
+    """Push a unit quaternion: its largest component is predicted from the others, except for a few last bits."""
     if tuple(bits) == IDENTITY:
         return _QUATERNIONS.push(x, _IDENTITY)
-    largest = max(range(4), key=lambda i: abs(values[i]))  # with NaN it may be any; the miss tells then
+    largest = max(range(4), key=lambda i: abs(values[i]))  # NaN: any index; the coded difference corrects it
     truth = bits[largest]
     if truth & _SINGLE_TAIL and truth not in constants.ranks:
         miss = (truth & ~(1 << 63)) - bits_of(_predicted(values, largest))
@@ -282,7 +283,7 @@ def push_quaternion(x: int, bits: Sequence[int], values: Sequence[float], table:
     return _QUATERNIONS.push(x, _FREE)
 
 
-def pop_quaternion(x: int, table: Table, constants: Constants) -> tuple[int, list[int]]:
+def pop_quaternion(x: int, table: Table, constants: KnownNumbers) -> tuple[int, list[int]]:
     """(x, the bits of x, y, z, w)"""
     x, symbol = _QUATERNIONS.pop(x)
     if symbol == _IDENTITY:

@@ -1,6 +1,6 @@
-"""An outline together with what a dictionary knows about it, ready for use.
+"""An outline together with the models of a dictionary, ready for use.
 
-Law: follows from type, sequence lengths and dictionary alone, so both ends prepare the same.
+Invariant: it depends only on type, sequence lengths and dictionary, so both ends prepare the same.
 """
 
 from __future__ import annotations
@@ -9,32 +9,32 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gr_ros2.compression.ballast import Value, Words, pop_ballast
-from gr_ros2.compression.floats import DEFAULT_CLASS, Constants, class_table
-from gr_ros2.compression.number import Table
-from gr_ros2.compression.plan import MATRIX, Outline
+from gr_ros2.compression.ans import Table
+from gr_ros2.compression.floats import DEFAULT_CLASS, KnownNumbers, class_table
+from gr_ros2.compression.layout import MATRIX, Outline
+from gr_ros2.compression.static_values import Value, Words, pop_static
 
 PARTS = 15
-"""Symbol for ballast that is none of the type's templates 0..14."""
+"""Symbol for static values that are none of the type's templates 0..14."""
 TEMPLATES = Table([1200, 500, 300, 200, *[60] * 11, 1100])
 
 
 @dataclass(frozen=True)
 class Model:
-    """What a dictionary knows about one type.
+    """The knowledge of a dictionary about one type.
 
     :param classes: letter of each field's float class, by path
-    :param templates: whole ballasts for given sequence lengths, as coded without templates
+    :param templates: sets of static values for given sequence lengths, as coded without templates
     """
 
     words: Words
-    constants: Constants
+    constants: KnownNumbers
     classes: Mapping[str, str]
     templates: Sequence[tuple[tuple[int, ...], int]] = ()
 
 
 class Prepared:
-    """An outline with its models and with what was remembered about its messages."""
+    """An outline with its models and with cached results for its messages."""
 
     def __init__(self, plan: Outline, model: Model, counts: tuple[int, ...]) -> None:
         self.plan = plan
@@ -44,8 +44,8 @@ class Prepared:
         self.backward = list(zip(plan.live, self.tables, strict=True))[::-1]
         self.forward = self.backward[::-1]
         self.bulk = plan.bulk
-        self.ballast_indexes = [slot.index for slot in plan.ballast]
-        self.matrices = [slot.index for slot in plan.ballast if slot.kind == MATRIX]
+        self.static_indexes = [slot.index for slot in plan.static_values]
+        self.matrices = [slot.index for slot in plan.static_values if slot.kind == MATRIX]
         self.templates: dict[tuple[Value, ...], int] = {}
         self.template_values: dict[int, list[Value]] = {}
         self.blank: list[Any] = [0] * (len(plan.items) + 1)
@@ -53,7 +53,7 @@ class Prepared:
             self.blank[index] = count
         for number, (of_counts, coded) in enumerate(model.templates[:PARTS]):
             if of_counts == counts:
-                rest, values = pop_ballast(coded, plan.ballast, model.words, model.constants)
+                rest, values = pop_static(coded, plan.static_values, model.words, model.constants)
                 if rest == 0:
                     self.templates.setdefault(tuple(values), number)
                     self.template_values[number] = values

@@ -1,8 +1,9 @@
-"""Bounded loss, where a user asks for it: numbers rounded to so many decimals before they are coded.
+"""Bounded loss, where the user configures it: numbers are rounded to a number of decimals before they are coded.
 
-Law: a finite x of magnitude below 2**33 steps becomes the double (or float32) nearest to a multiple of the step, so it
-is off by at most step * (1/2 + 2**-20), plus half a unit in the last place of a float32; every other value (NaN,
-infinities, larger ones) and every field not named stays as it is, bit for bit. The decoder knows nothing of all this.
+Invariant: a finite x of magnitude below 2**33 steps becomes the double (or float32) nearest to a multiple of the step,
+so it is off by at most step * (1/2 + 2**-20), plus half a unit in the last place of a float32; every other value (NaN,
+infinities, larger ones) and every field not named stays as it is, bit for bit. The decoder does not need to know about
+quantisation.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from gr_ros2.compression.plan import BULK, DOUBLE, MATRIX, QUATERNION, SINGLE, Layout, Slot
+from gr_ros2.compression.layout import BULK, DOUBLE, MATRIX, QUATERNION, SINGLE, Layout, Slot
 from gr_ros2.compression.schema import BIG, Composite, Node, Repeat, Scalar
 from gr_ros2.errors import ConfigError
 
 LARGEST = float(1 << 33)
-"""Steps; beyond, values stay as they are."""
+"""Largest magnitude in steps; larger values stay unchanged."""
 _MAX_DECIMALS = 6
 
 
 def parse_steps(text: str) -> dict[str, int]:
-    """``pose.pose.position=0.001 ranges=0.01`` as decimals by path; parted by blanks, commas or semicolons.
+    """``pose.pose.position=0.001 ranges=0.01`` as decimals by path; separated by blanks, commas or semicolons.
 
     :raises ConfigError: no path=step, or a step that is not 1, 0.1, ... 0.000001
     """
@@ -48,7 +49,7 @@ def _is(text: str, value: float) -> bool:
 class Quantizer:
     """Rounds the chosen fields of one type.
 
-    :param steps: decimals by path; a path stands for all below it
+    :param steps: decimals by path; a path includes all fields below it
     :raises ConfigError: for a path under which there is no floating-point field
     """
 
@@ -66,7 +67,7 @@ class Quantizer:
         """The payload with its chosen fields rounded."""
         out = list(values)
         order = layout.shape.order
-        for slot in [*layout.outline.live, *layout.outline.ballast]:
+        for slot in [*layout.outline.live, *layout.outline.static_values]:
             if slot.kind in (DOUBLE, QUATERNION):
                 for place in range(4 if slot.kind == QUATERNION else 1):
                     decimals = self._decimals(slot, "xyzw"[place] if slot.kind == QUATERNION else "")

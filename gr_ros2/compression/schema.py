@@ -1,8 +1,8 @@
-"""Message types as trees, and the shape of one serialized message: what the type leaves open, read off its bytes.
+"""Message types as trees, and the shape of one serialized message: the lengths that its type does not fix.
 
-Laws: XCDR1 as ROS 2 writes it (alignment counts from behind the 4-byte encapsulation header; an empty sequence has no
-padding before its elements); a payload that is not exactly such a message, up to 3 bytes behind it, has no shape, which
-is no error; nothing here trusts a length before checking it against the bytes at hand.
+Invariants: XCDR1 as ROS 2 writes it (alignment counts from after the 4-byte encapsulation header; an empty sequence has
+no padding before its elements); a payload that is not exactly such a message (plus up to 3 bytes) has no shape, which
+is not an error; every length is checked against the available bytes before it is used.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ HEADER = 4
 """Bytes of the encapsulation header."""
 LITTLE, BIG = "<", ">"
 MAX_PARTS = 4096
-"""Strings and sequences in one message; one with more has no shape, which bounds the time a walk takes."""
+"""Most strings and sequences in one message; a message with more has no shape, which bounds the time of a walk."""
 
 _CODES = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "B",
     "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q",
     "float32": "f", "float64": "d",
 }  # fmt: skip
-"""struct codes; bool and int8 as plain bytes, since any byte may stand there and has to come back."""
+"""struct codes; bool and int8 are plain bytes, since any byte value may occur and has to be preserved."""
 SIZES = {code: Struct("<" + code).size for code in "BHhIiQqfd"}
 
 
@@ -67,7 +67,7 @@ Node = Scalar | Text | Composite | Repeat
 
 
 def is_open(node: Node) -> bool:
-    """Whether the type leaves a sequence length to the message."""
+    """Whether the type contains a sequence, whose length is in the message."""
     return isinstance(node, Composite | Repeat) and node.open
 
 
@@ -106,7 +106,7 @@ class Types:
 
 def _composite(types: Typesdict, type_name: str, above: tuple[str, ...]) -> Composite:
     if type_name in above:
-        raise KeyError(type_name)  # a type within itself has no tree
+        raise KeyError(type_name)  # a type that contains itself has no tree
     _, members = types[type_name]
     if not members:
         raise KeyError(type_name)
@@ -123,7 +123,7 @@ def _node(types: Typesdict, kind: Any, above: tuple[str, ...]) -> Node:
         return _composite(types, detail, above)
     element, length = detail
     if node_type is Nodetype.ARRAY and not length:
-        raise KeyError("an array of no elements")  # any number of them would fit into no bytes
+        raise KeyError("an array of no elements")  # any number of them would take 0 bytes
     node, count = _node(types, element, above), length if node_type is Nodetype.ARRAY else None
     return Repeat(node, count, count is None or is_open(node))
 
@@ -135,12 +135,12 @@ def _humble() -> Typestore:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What one message adds to its type.
+    """The lengths that one message adds to its type.
 
     :param order: ``<`` or ``>``
     :param counts: lengths of its sequences, in order of appearance
     :param texts: stored lengths of its strings, terminator included
-    :param tail: bytes behind the message, 0..3
+    :param tail: bytes after the message, 0..3
     """
 
     order: str
@@ -150,7 +150,7 @@ class Shape:
 
 
 def shape_of(payload: bytes, tree: Composite) -> Shape | None:
-    """Read off the shape of a payload; None where it is no message of that type."""
+    """The shape of a payload; None where it is not a message of that type."""
     if len(payload) < HEADER or payload[0] or payload[1] > 1:
         return None
     reader = _Reader(payload, LITTLE if payload[1] else BIG)
@@ -163,7 +163,7 @@ def shape_of(payload: bytes, tree: Composite) -> Shape | None:
 
 
 class _Reader:
-    """Walks along a message; ``at`` counts from behind the encapsulation header."""
+    """Walks through a message; ``at`` counts from after the encapsulation header."""
 
     def __init__(self, payload: bytes, order: str) -> None:
         self.order = order
@@ -175,7 +175,7 @@ class _Reader:
         self._length = Struct(order + "I")
 
     def walk(self, node: Node) -> bool:
-        """Step over one value; whether the message is long enough for it."""
+        """Skip one value; returns whether the message is long enough for it."""
         if isinstance(node, Scalar):
             self._skip(SIZES[node.code], 1)
         elif isinstance(node, Text):
@@ -197,7 +197,7 @@ class _Reader:
         if isinstance(node.element, Scalar):
             self._skip(SIZES[node.element.code], count)
             return self.at <= self._end
-        # Every element takes at least a byte, so the walk ends with the payload, whatever the count says.
+        # Every element takes at least a byte, so the walk ends with the payload, whatever the count is.
         return (
             self.at <= self._end
             and len(self.counts) <= MAX_PARTS

@@ -1,11 +1,11 @@
 """Stamps and durations: seconds and nanoseconds in as few bits as their range needs.
 
-Law: exact for all pairs of 32-bit numbers, sensible or not.
+Invariant: exact for all pairs of 32-bit numbers, valid or not.
 """
 
 from __future__ import annotations
 
-from gr_ros2.compression.number import Table
+from gr_ros2.compression.ans import Table
 
 _FULL_STAMP, _ZERO_STAMP, _MS_STAMP, _YOUNG, _YOUNG_MS, _ANY_STAMP = range(6)
 _STAMPS = Table([3000, 200, 200, 350, 250, 90])

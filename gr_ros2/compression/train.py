@@ -1,6 +1,6 @@
 """Dictionaries learned from messages.
 
-Law: deterministic: the same messages in the same order give the same dictionary, byte for byte.
+Invariant: deterministic: the same messages in the same order give the same dictionary, byte for byte.
 """
 
 from __future__ import annotations
@@ -9,31 +9,31 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from gr_ros2.compression.ballast import Words, numbered
+from gr_ros2.compression.ans import Table
 from gr_ros2.compression.dictionary import OWN, Dictionary, TypeEntry
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.floats import (
     CLASSES,
     DEFAULT_CLASS,
-    Constants,
+    KnownNumbers,
     class_table,
     push_double,
     push_quaternion,
     push_single,
 )
-from gr_ros2.compression.frames import Zstd, train
-from gr_ros2.compression.number import Table
-from gr_ros2.compression.plan import DOUBLE, LONG_TEXT, MATRIX, QUATERNION, SINGLE, STRING, Layout
+from gr_ros2.compression.layout import DOUBLE, LONG_TEXT, MATRIX, QUATERNION, SINGLE, STRING, Layout
 from gr_ros2.compression.prepared import Model
 from gr_ros2.compression.schema import BIG, Composite, Types
+from gr_ros2.compression.static_values import Words, numbered
+from gr_ros2.compression.zstd_frames import Zstd, train
 
 _T = TypeVar("_T")
 
 MAX_SAMPLES = 1000
-"""Messages of a type that are looked at, evenly spread."""
+"""Most messages of a type that are analysed, evenly spread."""
 MAX_WORDS, MAX_CONSTANTS, MAX_TEMPLATES = 1000, 250, 15
 _COMMON = 0.02
-"""A constant or ballast is worth a place from this share of a type's messages on."""
+"""A constant or a set of static values enters the dictionary if at least this share of a type's messages has it."""
 _VALUES_PER_CLASS = 150
 
 
@@ -49,7 +49,7 @@ def learn(
     """A dictionary from sample messages.
 
     :param messages: (type name, payload)
-    :param base: its words and constants follow after those that were learned
+    :param base: its words and constants follow after the learned ones
     :param definitions: ``.msg`` texts of types; kept in the dictionary where ROS 2 Humble has none or another one
     :param zstd_size: bytes of each type's zstd dictionary at most; 0 = none
     """
@@ -63,7 +63,7 @@ def learn(
     seen = {type_name: _Seen(types.tree(type_name), payloads) for type_name, payloads in sorted(by_type.items())}
     words = _ranked([item.words for item in seen.values()], base.words if base else (), MAX_WORDS)
     constants = _ranked([item.constants for item in seen.values()], base.constants if base else (), MAX_CONSTANTS)
-    model = Model(Words([word.encode() + b"\0" for word in words]), Constants(constants), {})
+    model = Model(Words([word.encode() + b"\0" for word in words]), KnownNumbers(constants), {})
     entries = {
         type_name: TypeEntry(
             item.classes(model.constants),
@@ -77,7 +77,7 @@ def learn(
 
 
 class _Seen:
-    """What the samples of one type hold."""
+    """Statistics of the samples of one type."""
 
     def __init__(self, tree: Composite | None, payloads: Sequence[bytes]) -> None:
         self._tree = tree
@@ -86,7 +86,7 @@ class _Seen:
         self.constants: Counter[int] = Counter()
         self.normalised = list(payloads)
         self._samples: dict[str, tuple[int, list[Any]]] = {}
-        codec = _codec(tree, Model(Words(()), Constants(()), {}))
+        codec = _codec(tree, Model(Words(()), KnownNumbers(()), {}))
         for n, payload in enumerate(payloads):
             found = codec.layout(payload) if codec is not None else None
             if found is not None:
@@ -102,11 +102,11 @@ class _Seen:
         values, reals = layout.unpack(payload), layout.unpack_reals(payload)
         little = layout.shape.order != BIG
         constants: set[int] = set()
-        for slot in layout.outline.ballast:
+        for slot in layout.outline.static_values:
             value = values[slot.index]
             if slot.kind == STRING and 0 < len(value) <= LONG_TEXT and value[-1] == 0:
                 if numbered(value):
-                    continue  # the codec composes the names of numbered robots
+                    continue  # the codec composes names of numbered robots itself itself itself itself itself
                 try:
                     self.words[value[:-1].decode()] += 1
                 except UnicodeDecodeError:
@@ -126,8 +126,8 @@ class _Seen:
         for bits in constants - {0}:
             self.constants[bits] += 1
 
-    def classes(self, constants: Constants) -> dict[str, str]:
-        """The letter of each field for which the default is not the best."""
+    def classes(self, constants: KnownNumbers) -> dict[str, str]:
+        """The letter of each field for which the default class is not the best."""
         found: dict[str, str] = {}
         for path, (kind, samples) in self._samples.items():
             costs = {letter: _bits(kind, samples, class_table(letter), constants) for letter in CLASSES}
@@ -135,11 +135,11 @@ class _Seen:
         return {path: letter for path, letter in sorted(found.items()) if letter != DEFAULT_CLASS}
 
     def templates(self, model: Model) -> tuple[tuple[tuple[int, ...], int], ...]:
-        """The most frequent ballasts."""
+        """The most frequent sets of static values."""
         codec = _codec(self._tree, model)
         if codec is None:
             return ()
-        counts = Counter(found for payload in self._payloads if (found := codec.ballast(payload)) is not None)
+        counts = Counter(found for payload in self._payloads if (found := codec.static_values(payload)) is not None)
         common = [item for item, count in counts.most_common(MAX_TEMPLATES) if count > _COMMON * len(self._payloads)]
         return tuple(common)
 
@@ -148,8 +148,8 @@ def _codec(tree: Composite | None, model: Model) -> FieldsCodec | None:
     return None if tree is None else FieldsCodec(tree, model, Zstd())
 
 
-def _bits(kind: int, samples: Sequence[Any], table: Table, constants: Constants) -> int:
-    """What the numbers of a field cost with a class, bits."""
+def _bits(kind: int, samples: Sequence[Any], table: Table, constants: KnownNumbers) -> int:
+    """Cost of the numbers of a field with a class, bits."""
     x = 1
     for bits, reals in samples[:: max(1, len(samples) // _VALUES_PER_CLASS)]:
         if kind == QUATERNION:
@@ -162,7 +162,7 @@ def _bits(kind: int, samples: Sequence[Any], table: Table, constants: Constants)
 
 
 def _ranked(counted: Sequence[Counter[_T]], base: Sequence[_T], limit: int) -> list[_T]:
-    """What most types have most of, then the rest of ``base``."""
+    """Values in order of frequency over the types, then the rest of ``base``."""
     total: Counter[_T] = Counter()
     for counter in counted:
         total.update(counter)
@@ -172,7 +172,7 @@ def _ranked(counted: Sequence[Counter[_T]], base: Sequence[_T], limit: int) -> l
 
 
 def _zstd_dictionary(samples: list[bytes], size: int) -> bytes:
-    """A trained dictionary; where samples are too few or too small for that, the samples themselves."""
+    """A trained dictionary; where the samples are too few or too small for training, the samples themselves."""
     if not size:
         return b""
     try:

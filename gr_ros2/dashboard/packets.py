@@ -1,6 +1,6 @@
 """Received packets, field by field, for people.
 
-Law: whatever the bytes, there is a view of them; what is no packet says why.
+Invariant: whatever the bytes, there is a view of them; what is no packet says why.
 """
 
 from __future__ import annotations

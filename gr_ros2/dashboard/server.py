@@ -1,8 +1,8 @@
 """The dashboard's web server: one thread of its own beside a run, any number of viewers.
 
-Laws: without a viewer it does little more than count, and with as many as are let in (``door``) it leaves the link most
-of a core; on a loopback address unless told otherwise, and only pages it
-served itself may talk to it; closing it shows every viewer the last picture first and leaves no thread.
+Invariants: without a viewer it does little more than count, and with as many as are let in (``admission``) it leaves
+the link most of a core; on a loopback address unless told otherwise, and only pages it served itself may talk to it;
+closing it shows every viewer the last picture first and leaves no thread.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from bokeh.server.util import bind_sockets
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import RequestHandler
 
-from gr_ros2.dashboard.desk import TICK_S, Desk
-from gr_ros2.dashboard.door import SETTINGS, Front, Room, keep
-from gr_ros2.dashboard.page import Page
+from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
+from gr_ros2.dashboard.live_page import LivePage
+from gr_ros2.dashboard.monitor import TICK_S, RunMonitor
 from gr_ros2.errors import ConfigError
 from gr_ros2.record.result import Result
 
@@ -41,8 +41,8 @@ _UNUSED_MS = 5000
 _ANY = ("0.0.0.0", "::")
 
 
-class Dashboard(Desk):
-    """A desk with a web page.
+class Dashboard(RunMonitor):
+    """A monitor with a web page.
 
     :param address: to serve on; 0.0.0.0 for every interface
     :param port: 1..65535, 0 = any free one
@@ -53,8 +53,8 @@ class Dashboard(Desk):
         self.address = address
         self.port = port
         self._instance = uuid.uuid4().hex
-        self._pages: set[Page] = set()
-        self._room = Room()
+        self._pages: set[LivePage] = set()
+        self._admission = Admission()
         self._loop: IOLoop | None = None
         self._thread: threading.Thread | None = None
 
@@ -137,8 +137,8 @@ class Dashboard(Desk):
             secret_key=secrets.token_bytes(32),
             **SETTINGS,
         )
-        keep(pages, self._room)
-        http = Front(pages)
+        keep(pages, self._admission)
+        http = BoundedServer(pages)
         http.add_sockets(sockets)
         return BaseServer(loop, pages, http)
 
@@ -154,9 +154,9 @@ class Dashboard(Desk):
 
     def _open(self, document: Document) -> None:
         """A viewer comes."""
-        if not self._room.enter(document):
+        if not self._admission.enter(document):
             return  # a WebSocket came without asking for its page, and there is no room
-        page = Page(document, self, self._instance)
+        page = LivePage(document, self, self._instance)
         self._pages.add(page)
         document.on_session_destroyed(lambda _context: self._pages.discard(page))
 

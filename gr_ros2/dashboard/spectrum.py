@@ -1,6 +1,6 @@
 """The received signal as a spectrum, steady enough to be looked at.
 
-Law: powers are relative to the strongest bin seen lately, in dB; nothing is kept but one average.
+Invariant: powers are relative to the strongest bin seen lately, in dB; nothing is kept but one average.
 """
 
 from __future__ import annotations

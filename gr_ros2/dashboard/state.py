@@ -1,7 +1,7 @@
 """What a dashboard knows of one link: fed by the events of both ends, asked for a snapshot now and then. Sans-IO.
 
-Laws: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock of
-the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
+Invariants: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock
+of the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
 Counts are exact while it runs; once the result is in, every number is the result's.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
-from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate
+from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
@@ -29,7 +29,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row, arrived
+from gr_ros2.link.ledger_rows import LedgerRow, arrived
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -66,18 +66,18 @@ class _Topic:
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.age = AgeMeter()
         self.read_position = read_position
-        self.belief = Belief(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
+        self.belief = PathComparison(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
 
     def rows(self) -> dict[str, int]:
         """What the events alone say: who sees both ends asks the ledger instead."""
-        whole = {Row.DELIVERED.value: self.delivered - self.repaired, Row.REPAIRED.value: self.repaired}
+        whole = {LedgerRow.DELIVERED.value: self.delivered - self.repaired, LedgerRow.REPAIRED.value: self.repaired}
         rows = {row: count for row, count in {**whole, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
-        return {**rows, Row.IN_FLIGHT.value: rest} if rest > 0 else rows
+        return {**rows, LedgerRow.IN_FLIGHT.value: rest} if rest > 0 else rows
 
 
-class _Source:
+class _SourceWindow:
     """One sender."""
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class DashboardState:
         self._ledger = ledger
         self._history = int(HISTORY_S / tick_s)
         self._start: float | None = None
-        self._sources: dict[int, _Source] = {}
+        self._sources: dict[int, _SourceWindow] = {}
         self._topics: dict[Key, _Topic] = {}
         self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
@@ -133,7 +133,7 @@ class DashboardState:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """What the sender with this source id reports."""
         with self._lock:
-            source = self._sources.setdefault(src_id, _Source())
+            source = self._sources.setdefault(src_id, _SourceWindow())
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
                 self._packets_sent.add(event.now)
@@ -144,7 +144,7 @@ class DashboardState:
             elif isinstance(event, Missed):
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
-                topic.ended[Row.LOST_ON_GRAPH.value] += event.count
+                topic.ended[LedgerRow.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
 
@@ -314,7 +314,7 @@ class DashboardState:
             topic = self._topics[key] = _Topic(read, self._history)
         return topic
 
-    def _accepted(self, source: _Source, src_id: int, event: Accepted) -> None:
+    def _accepted(self, source: _SourceWindow, src_id: int, event: Accepted) -> None:
         self._begin(event.now)
         topic = self._topic((src_id, event.topic_id))
         topic.sent += 1
@@ -326,7 +326,7 @@ class DashboardState:
             if point is not None:
                 topic.belief.moved(event.now, point)
 
-    def _refused(self, source: _Source, src_id: int, event: Refused) -> None:
+    def _refused(self, source: _SourceWindow, src_id: int, event: Refused) -> None:
         topic = self._topic((src_id, event.topic_id))
         topic.ended[str(event.reason)] += 1
         message = source.messages.get(event.serial)

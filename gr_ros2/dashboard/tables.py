@@ -1,7 +1,7 @@
 """Numbers and packets as HTML.
 
-Laws: every text that comes from outside is escaped; a number that does not apply is a dash; the exact value stands
-beside the rounded one in ``data-value``.
+Invariants: every text that comes from outside is escaped; a number that does not apply is a dash; the exact value
+stands beside the rounded one in ``data-value``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the page draws: values only.
 
-Law: a number that does not apply is None, as in ``result.json``; nothing here grows with the length of a run.
+Invariant: a number that does not apply is None, as in ``result.json``; nothing here grows with the length of a run.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Bounded memories of what goes on: rates, ages, paths.
 
-Laws: each holds a fixed number of items however long it is fed; times are seconds on one clock, given by the caller,
-and never run backwards within one object.
+Invariants: each holds a fixed number of items however long it is fed; times are seconds on one clock, given by the
+caller, and never run backwards within one object.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class AgeMeter:
         return self._area + (low + high) / 2 * (high - low), max(self._peak, high)
 
 
-class Trail:
+class PathWindow:
     """The last stretch of a path, thinned in time, and where it ends exactly.
 
     :param points: most points kept
@@ -98,7 +98,7 @@ class Trail:
         return points[:, 0], points[:, 1]
 
 
-class Belief:
+class PathComparison:
     """One robot's true path beside the path another one knows of, and how far apart they are at each moment.
 
     The error at an instant is the distance from where the robot last said it was to where the other believes it is.
@@ -108,8 +108,8 @@ class Belief:
     """
 
     def __init__(self, points: int, apart_s: float) -> None:
-        self.sent = Trail(points, apart_s)
-        self.received = Trail(points, apart_s)
+        self.sent = PathWindow(points, apart_s)
+        self.received = PathWindow(points, apart_s)
         self._errors: deque[tuple[float, float]] = deque(maxlen=points)
         self._apart_s = apart_s
 

@@ -1,6 +1,6 @@
 """The computer: its clock, and the limits that a link in real time meets.
 
-Law: read only; every limit is named with the value found and the value that is enough.
+Invariant: read only; every limit is named with the value found and the value that is enough.
 """
 
 from __future__ import annotations

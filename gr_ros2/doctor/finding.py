@@ -1,6 +1,6 @@
 """What a check says: how it stands, in a line, and the command that mends it.
 
-Law: a check that cannot be made is a finding too, and never ends the others.
+Invariant: a check that cannot be made is a finding too, and never ends the others.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What is installed: the parts every link needs, and those that only some do.
 
-Law: GNU Radio is asked in a process of its own, since one that was built for another numpy may end it.
+Invariant: GNU Radio is asked in a process of its own, since one that was built for another numpy may end it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Programs that a check asks: found on PATH, with a limit on their time.
 
-Law: nothing here waits for longer than the limit, and a program that hangs is ended.
+Invariant: nothing here waits for longer than the limit, and a program that hangs is ended.
 """
 
 from __future__ import annotations

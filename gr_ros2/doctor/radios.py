@@ -1,6 +1,6 @@
 """Which radios are plugged in or answer.
 
-Law: nothing is opened or set up: buses are listed, and the vendors' own programs asked.
+Invariant: nothing is opened or set up: buses are listed, and the vendors' own programs asked.
 """
 
 from __future__ import annotations

@@ -1,23 +1,28 @@
 """What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
 
-Law: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever; every
-block of this process is checked against every other when it is made.
+Invariant: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever;
+every block of this process is checked against every other when it is made.
 """
 
 from __future__ import annotations
 
+import os
 import random
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, TypeVar
 
+from gr_ros2.boots import BootFile
 from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.codec import MessageCodec
+from gr_ros2.keys import read_key_file
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
 from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.sealing import Keys
@@ -50,13 +55,16 @@ def own_settings(config: SourceConfig | SinkConfig) -> dict[str, Any]:
     return {name: getattr(config, name) for name in names}
 
 
-def read_registry(registry: str | Registry) -> Registry:
+def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
     """The registry itself, or the one in a CSV file.
 
+    :param needed: whether there has to be one; where topics are announced a receiver can do without
     :raises ConfigError: when there is none, or the file is wrong
     """
     if isinstance(registry, Registry):
         return registry
+    if not registry and not needed:
+        return Registry.empty()
     if not registry:
         raise ConfigError("registry is missing; give the path of a CSV with rows of the form name,type")
     return Registry.from_csv(registry)
@@ -123,7 +131,7 @@ def make_endpoint(
     start = start or Start()
     dictionaries = () if sink is None else sink.dictionaries
     return EndpointV1(
-        None if source is None else registry.with_options(source.topic_options),
+        None if source is None or not registry else registry.with_options(source.topic_options),
         settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
@@ -140,6 +148,53 @@ def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> Me
     from gr_ros2.compression import LinkCodec
 
     return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
+
+
+def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, half_duplex: bool = False) -> Start:
+    """This start of a robot, counted in its state file; its keys.
+
+    :param src_id: of the robot, -1 for one that says nothing
+    :raises ConfigError: a key file or a state file that cannot be read or understood
+    """
+    keys = Keys(read_key_file(config.key), config.seal) if config.key else None
+    if not config.version:
+        return Start()
+    if not config.state and not config.key and src_id < 0:
+        return Start(int(time.time()), reports=reports, half_duplex=half_duplex)
+    path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
+    file = BootFile(path, time.time())
+    # Nobody can tell a replay from the original where packets are not sealed, so there is nothing to be remembered.
+    heard, save = (file.heard, file.save) if config.key else ({}, None)
+    return Start(file.boot, keys, heard, save, reports, half_duplex)
+
+
+def state_folder() -> Path:
+    """Where what a robot must not forget is kept: the folder of XDG for state."""
+    base = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(base).expanduser() / "gr_ros2"
+
+
+class LiveEnd:
+    """An end that blocks of one flowgraph share, and the one lock that guards it.
+
+    :param make: makes the endpoint, given its observer
+    :ivar work: notified when a packet may leave
+    :ivar observer: hears what the sending half does, with the lock held
+    """
+
+    def __init__(self, make: Callable[[Callable[[SenderEvent], None]], Endpoint]) -> None:
+        self.lock = threading.Lock()
+        self.work = threading.Condition(self.lock)
+        self.observer: Callable[[SenderEvent], None] | None = None
+        self.endpoint = make(self._tell)
+
+    def _tell(self, event: SenderEvent) -> None:
+        if self.observer is not None:
+            self.observer(event)
 
 
 class Graph:
@@ -215,6 +270,19 @@ class LoopGuard:
                 if graph.same_as(other):
                     check_loop(names, config, registry)
             self._sinks[block] = (graph, config, registry)
+
+    def check_output(self, graph: Graph, name: str) -> None:
+        """Refuse a topic that a sink is about to publish, where a source of the same graph subscribes it.
+
+        :raises ConfigError: for a loop
+        """
+        with self._lock:
+            for other, names in self._sources.values():
+                if name in names and graph.same_as(other):
+                    raise ConfigError(
+                        f"loop: the sink would publish {name}, which a source on the same graph subscribes; change "
+                        "namespace_format, publish_as or domain_id"
+                    )
 
     def remove(self, block: Any) -> None:
         """A block has left its graph."""

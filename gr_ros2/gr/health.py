@@ -1,8 +1,8 @@
 """How a live link is doing: its counters over the last seconds, judged against limits.
 
-Laws: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left out,
-never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are those
-of diagnostic_msgs/DiagnosticStatus.
+Invariants: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left
+out, never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are
+those of diagnostic_msgs/DiagnosticStatus.
 """
 
 from __future__ import annotations
@@ -14,12 +14,20 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from gr_ros2.config import DiagnosticsConfig
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 
 Stats = Mapping[str, Any]
 
 _NO_LOSS = {"bursts_in", "bursts_out", "blanked"}
 """Of what a front end counts: what passed, and what half duplex costs by design."""
+_LOCKED = {
+    "no_key": "sealed, and no key is configured here",
+    "not_sealed": "not sealed, where a key is configured",
+    "wrong_key": "sealed with a key that is not accepted here",
+    "replayed": "replays of what was heard before",
+    "tag": "damaged, or forged",
+}
+"""Why packets are refused that may be somebody's attack, or somebody's wrong configuration."""
 
 
 class Level(IntEnum):
@@ -75,6 +83,7 @@ class _Look(NamedTuple):
     unpublished: int
     topics: dict[str, tuple[int, int]]
     front_end: dict[str, int]
+    locked: dict[str, int]
 
 
 class LinkHealth:
@@ -106,6 +115,8 @@ class LinkHealth:
         topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
         receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
         first = before is look
+        for kind, count in look.locked.items():
+            receiver.warn(f"packets refused: {_LOCKED[kind]}", count, 0 if first else before.locked.get(kind, 0))
         receiver.warn("messages not published", look.unpublished, 0 if first else before.unpublished)
         transmitter.warn("messages lost on the ROS graph", look.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *topics]
@@ -181,7 +192,7 @@ def _look(stats: Stats, now: float) -> _Look:
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
     front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
-    lost_on_graph = sum(topic[Row.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    lost_on_graph = sum(topic[LedgerRow.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
         sent=stats["packets"]["out"],
@@ -189,9 +200,10 @@ def _look(stats: Stats, now: float) -> _Look:
         missing=sink["packet_loss_est"],
         rejected=rejected,
         lost_on_graph=lost_on_graph,
-        unpublished=sink[Row.PUBLISH_FAILED],
+        unpublished=sink[LedgerRow.PUBLISH_FAILED],
         topics=topics,
         front_end=front_end,
+        locked={kind: count for kind, count in sink["rejected"].items() if kind in _LOCKED},
     )
 
 

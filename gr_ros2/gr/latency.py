@@ -1,7 +1,7 @@
 """The sink's live latency: from a message's own stamp to its publication.
 
-Laws: only types whose first field is a std_msgs/Header have one; a stamp of zero is unset, as ROS has it; negative
-values (clocks that disagree) are kept and counted; memory is bounded by a window of the newest values.
+Invariants: only types whose first field is a std_msgs/Header have one; a stamp of zero is unset, as ROS has it;
+negative values (clocks that disagree) are kept and counted; memory is bounded by a window of the newest values.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def leading_time(payload: bytes) -> float | None:
     return None if seconds == nanoseconds == 0 else seconds + nanoseconds * 1e-9
 
 
-class Latency(NamedTuple):
+class LatencySummary(NamedTuple):
     """Over the window, s; None where nothing was measured. ``measured`` and ``negative`` are since the start."""
 
     p50: float | None
@@ -76,10 +76,10 @@ class LatencyWindow:
         """The latency measured last, s."""
         return self._values[-1] if self._values else None
 
-    def summary(self, newest: int = WINDOW) -> Latency:
+    def summary(self, newest: int = WINDOW) -> LatencySummary:
         """Percentiles by nearest rank, over that many of the newest values."""
         values = sorted(islice(reversed(self._values), newest))
         if not values:
-            return Latency(None, None, None, None, 0, 0)
+            return LatencySummary(None, None, None, None, 0, 0)
         p50, p95, p99 = (values[-(-len(values) * percent // 100) - 1] for percent in (50, 95, 99))
-        return Latency(p50, p95, p99, values[-1], self._count, self._negative)
+        return LatencySummary(p50, p95, p99, values[-1], self._count, self._negative)

@@ -1,6 +1,6 @@
 """Packets to PDUs and back, the fast way.
 
-Laws: a PDU is a PMT pair of a dictionary and a u8vector; what comes back from ``packet_of`` is bytes or a named
+Invariants: a PDU is a PMT pair of a dictionary and a u8vector; what comes back from ``packet_of`` is bytes or a named
 reason why it is none, whatever object came in; metadata is for people and other blocks, never trusted here.
 """
 

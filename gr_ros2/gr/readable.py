@@ -1,6 +1,6 @@
 """What `debug` writes: one line per packet, for people.
 
-Law: only where a user asked for `debug` and no logging is set up does a handler appear, on standard output as the
+Invariant: only where a user asked for `debug` and no logging is set up does a handler appear, on standard output as the
 paper has it (section 4.3); otherwise logging is the application's.
 """
 

@@ -1,8 +1,8 @@
 """ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
 
-Laws: a thin shell, all behaviour is in ``link.Receiver``, which one lock guards; only the bytes of a PDU are trusted;
-neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph seems
-alive; messages are published in completion order; what counts as delivered was published, and everything else is
+Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; only the bytes of a PDU are
+trusted; neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph
+seems alive; messages are published in completion order; what counts as delivered was published, and everything else is
 counted by name.
 """
 
@@ -18,26 +18,28 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
-from gr_ros2.gr.frames import TF_TYPE, FramePrefix, MergedTransforms
+from gr_ros2.errors import ConfigError, GrRos2Error, SealError
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
-from gr_ros2.link import Delivered, Received, Receiver, ReceiverEvent, Rejected
+from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
+from gr_ros2.link.events import Announced
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
-from gr_ros2.registry import Registry, check_outputs
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
+from gr_ros2.registry import Registry, Topic, announced, check_outputs
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
-    *("not_a_pair", "not_u8", Row.PUBLISH_FAILED.value, "handler_failed"),
+    *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -49,11 +51,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     sender and topic. ``close`` leaves the graph; the end of the process does it too. A middleware handed over open is
     closed by who opened it.
 
-    :param registry: CSV path or Registry, the same as at the source
+    :param registry: CSV path or Registry, the same as at the source; '' with version 1, where senders announce theirs
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
     :param observer: hears every ReceiverEvent, in order, and Delivered after it was published; when it raises, it is
         told nothing more
     :param clock: s, monotonic
+    :param end: of both directions, where a source shares it; None makes one that says nothing
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
     :raises ConfigError: naming key, value and what is allowed
     """
@@ -65,24 +68,32 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         middleware: str | Middleware | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
+        end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
         super().__init__("ros2_sink", None, None)
         self.config = settings(SinkConfig, values, registry, middleware)
-        rows = read_registry(registry)
-        check_outputs(rows, self.config)
-        self._receiver = Receiver(rows, self.config, codec=message_codec(self.config, rows))
-        self.registry = self._receiver.registry
+        rows = read_registry(registry, needed=not self.config.version)
+        self.registry = rows
+        if rows:
+            check_outputs(rows, self.config)
+            self.registry = rows.with_options(self.config.topic_options)
+        if end is None:
+            start = start_of(self.config, self.config.robot_id, reports=False)
+            end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
+        self._end, self._work = end.endpoint, end.work
+        self._announced: dict[tuple[int, int], Topic] = {}
+        """What topic ids mean that senders have announced themselves, by source and topic id."""
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
-        self._lock = threading.Lock()
+        self._lock = end.lock
         self._timer_due = threading.Condition(self._lock)
         self._timer_idle = False
         self._running = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self._counters: Counter[str] = Counter()
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
@@ -92,7 +103,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._published: Counter[tuple[int, int]] = Counter()
         self._delivered_at: dict[tuple[int, int], float] = {}
-        self._stamped = [has_header(topic.type_name) for topic in self.registry]
+        self._stamped: dict[str, bool] = {}
+        """Whether messages of a type begin with a header."""
+        self._said: set[str] = set()
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
         self.handled = 0
@@ -127,8 +140,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._advertise((src_id, topic_id))
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         with self._lock:
             self._running = True
         self._thread = threading.Thread(target=self._watch_timeouts, name="gr-ros2-sink", daemon=True)
@@ -142,7 +155,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def close(self) -> None:
@@ -160,7 +173,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def stats(self) -> dict[str, Any]:
         """A snapshot. ``packet_loss_est`` and ``message_loss_est`` are estimates from gaps in numbers."""
         with self._lock:
-            stats = self._receiver.stats
+            stats = self._end.received
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
             topics = {key: self._topic_stats(key) for key in keys}
             windows = {key: self._latency[key].copy() for key in keys if key in self._latency}
@@ -172,10 +185,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
                 "repeats": stats.repeats,
+                "repaired": stats.repaired.total(),
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
                 "message_loss_est": stats.message_loss_est,
-                "held_bytes": self._receiver.held_bytes,
+                "held_bytes": self._end.held_bytes,
                 "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
             }
@@ -188,7 +202,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def set_reassembly_timeout_s(self, reassembly_timeout_s: float) -> None:
         """s an incomplete message is kept (raises ConfigError out of range)."""
         with self._lock:
-            self.config = self._receiver.config = replaced(self.config, reassembly_timeout_s=reassembly_timeout_s)
+            self.config = replaced(self.config, reassembly_timeout_s=reassembly_timeout_s)
+            self._end.keep_incomplete(reassembly_timeout_s)
             self._timer_due.notify_all()
 
     def set_debug(self, debug: bool) -> None:
@@ -198,10 +213,41 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._log = debug_logger(self._log.name, self.config.debug)
 
     def _name(self, key: tuple[int, int]) -> str:
-        return self.registry[key[1]].republished(self.config.namespace_format, key[0])
+        return self._topic(key).republished(self.config.namespace_format, key[0])
+
+    def _topic(self, key: tuple[int, int]) -> Topic:
+        """What a sender's topic id means: as it has announced, or as the registry has it.
+
+        :raises ConfigError: neither says so
+        """
+        topic = self._announced.get(key)
+        if topic is not None:
+            return topic
+        if key[1] < len(self.registry):
+            return self.registry[key[1]]
+        raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
+
+    def _learn(self, event: Announced) -> None:
+        """Take over what a sender says of its topics; a publisher of what has another name or type now is closed."""
+        for row in event.rows:
+            key = (event.src_id, row.topic_id)
+            try:
+                topic = announced(row, self.config.topic_options)
+                name = topic.republished(self.config.namespace_format, event.src_id)
+                LOOP_GUARD.check_output(self._graph, name)
+                if fault := topic_fault(name):
+                    raise ConfigError(f"topic {name!r}: {fault}")
+            except ConfigError as error:
+                self._tell_first("bad_announcement", f"a topic of robot {event.src_id} cannot be published", error)
+                continue
+            before = self._announced.get(key)
+            self._announced[key] = topic
+            same = before is None or (before.name, before.type_name) == (topic.name, topic.type_name)
+            if key in self._publishers and not same:
+                self._publishers.pop(key).close()
 
     def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
-        stats = self._receiver.stats
+        stats = self._end.received
         window = self._latency.get(key)
         delivered_at = self._delivered_at.get(key)
         latency = 0.0 if window is None else window.newest or 0.0
@@ -240,9 +286,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
             return
         with self._lock:
-            events = self._receiver.receive(data, self._clock())
-            if self._timer_idle and self._receiver.next_timeout() is not None:
+            events = self._end.receive(data, self._clock())
+            if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
+            if self._end.answers and not self._end.out_of_credit:
+                self._work.notify()
         self._settle(events)
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:
@@ -251,6 +299,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             try:
                 if self.config.debug and isinstance(event, Received | Rejected):
                     self._log.debug("rx %s", describe(event, self.registry))
+                if isinstance(event, Announced):
+                    self._learn(event)
+                elif isinstance(event, Rejected):
+                    self._warn(event)
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
                     self._guard(self._observer.receiver_event, result, self._clock())
@@ -259,23 +311,33 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
-        topic = self.registry[event.topic_id]
         try:
+            topic = self._topic(key)
             payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
             publisher = self._publishers.get(key) or self._advertise(key)
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
-            self._tell_first(Row.PUBLISH_FAILED.value, f"a message of {self._name(key)} was not published", error)
+            named = f"topic id {key[1]} of robot {key[0]}"
+            self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
-                return self._receiver.unpublished(event)
+                return self._end.unpublished(event)
         with self._lock:
             self._published[key] += 1
             self._delivered_at[key] = self._clock()
-        if self._stamped[event.topic_id]:
+        stamped = self._stamped.get(topic.type_name)
+        if stamped is None:
+            stamped = self._stamped[topic.type_name] = has_header(topic.type_name)
+        if stamped:
             self._measure(key, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
         return event
+
+    def _warn(self, event: Rejected) -> None:
+        """Say once of each reason that concerns keys why nothing is heard."""
+        if isinstance(event.error, SealError) and event.error.kind not in self._said:
+            self._said.add(event.error.kind)
+            self._log.warning("ros2_sink: a packet was refused (%s): %s", event.error.kind, event.error)
 
     def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
         try:
@@ -293,7 +355,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._log.warning("ros2_sink: %s: %s", what, error, exc_info=trace)
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
-        topic = self.registry[key[1]]
+        topic = self._topic(key)
         depth = self.config.publisher_depth if topic.options.depth is None else topic.options.depth
         qos = Qos(topic.options.reliability, "transient_local" if topic.latched else "volatile", depth)
         publisher = self._publishers[key] = self.middleware.advertise(self._name(key), topic.type_name, qos)
@@ -311,7 +373,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _forget_the_gone(self) -> None:
         """Free the latencies, 0.3 MB a topic, of senders whose place the receiver has given to others."""
-        known = self._receiver.knows
+        known = self._end.knows
         self._latency = {key: window for key, window in self._latency.items() if known(key[0])}
 
     def _set_sim_time(self, payload: bytes) -> None:
@@ -322,9 +384,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             with self._lock:
                 if not self._running:
                     return
-                events = self._receiver.handle_timeout(self._clock())
+                events = self._end.handle_timeout(self._clock())
                 if not events:
-                    at = self._receiver.next_timeout()
+                    at = self._end.next_timeout()
                     self._timer_idle = at is None
                     self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
                     self._timer_idle = False

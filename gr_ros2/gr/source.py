@@ -1,7 +1,8 @@
 """ROS Source: ROS topics in, packets out on message port `pdus` (the paper, section 4.1 and 4.3).
 
-Laws: a thin shell, all behaviour is in ``link.Sender``, which one lock guards; packets are composed just before they
-go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped unnamed.
+Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; packets are composed just before
+they go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped
+unnamed.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from gnuradio import gr
 
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, message_codec, read_registry, settings
-from gr_ros2.gr.frames import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
-from gr_ros2.link import Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Refused, SenderEvent, SentPacket
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.outcome import Row
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
@@ -57,6 +58,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         raises, it is told nothing more
     :param clock: s, monotonic
     :param seed: of sequence number and entry ids; None is random
+    :param end: of both directions, where a sink shares it; None makes one that hears nothing
     :param settings: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: naming key, value and what is allowed
     """
@@ -69,27 +71,35 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
+        end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
         super().__init__("ros2_source", None, None)
         self.config = settings(SourceConfig, values, registry, middleware)
-        rows = read_registry(registry)
-        codec = message_codec(self.config, rows)
-        self._sender = Sender(rows, self.config, codec=codec, rng=random.Random(seed), observer=self._observe)
-        self.registry = self._sender.registry
+        rows = read_registry(registry, needed=not self.config.version)
+        self.src_id = self.config.src_id()
+        """The source id on the wire."""
+        self.registry = rows.with_options(self.config.topic_options)
+        if end is None:
+            start = start_of(self.config, self.src_id, reports=False)
+            rng = random.Random(seed)
+            end = LiveEnd(
+                lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
+            )
+        end.observer = self._observe
+        self._end = end.endpoint
         self._observer = observer
-        self._guard = Guard(f"observer of ros2_source {self._sender.src_id}")
+        self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self._clock = clock
         self._pdus = PduMaker()
         self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
-        self._lock = threading.Lock()
-        self._work = threading.Condition(self._lock)
+        self._lock, self._work = end.lock, end.work
         self._room = threading.Condition(self._lock)
         self._running = False
         self._closed = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.emitted = 0
@@ -105,7 +115,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
         self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen}
         """Topic of the registry by its absolute name on the ROS graph."""
-        node_name = f"gr_ros2_source_{self._sender.src_id}"
+        node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
@@ -116,11 +126,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             raise
 
     @property
-    def src_id(self) -> int:
-        """The source id on the wire."""
-        return self._sender.src_id
-
-    @property
     def middleware(self) -> Middleware:
         """Our participant on the ROS graph."""
         return self._graph.middleware
@@ -129,7 +134,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def idle(self) -> bool:
         """Whether no message is waiting or under way."""
         with self._lock:
-            return self._sender.idle
+            return self._end.idle
 
     @property
     def matched(self) -> bool:
@@ -146,11 +151,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
         with self._lock:
-            self._sender.use_credit()
+            self._end.use_credit()
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         self._unread = pmt.is_null(self.message_subscribers(PDUS))
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
@@ -168,7 +173,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def close(self) -> None:
@@ -188,17 +193,17 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """A snapshot: packets and messages, per topic and in all."""
         with self._lock:
             self._take_losses()
-            stats = self._sender.stats
-            queued = self._sender.queued()
+            stats = self._end.sent
+            queued = self._end.queued()
             topics = {
                 name: {
                     "topic_id": topic.topic_id,
                     "submitted": stats.submitted[topic.topic_id],
-                    Row.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
+                    LedgerRow.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
                     "sent": stats.sent[topic.topic_id],
                     "queued": queued[topic.topic_id],
-                    "queue": self._sender.queue(topic.topic_id)[0],
-                    "queue_depth": self._sender.depth(topic.topic_id),
+                    "queue": self._end.queue(topic.topic_id)[0],
+                    "queue_depth": self._end.depth(topic.topic_id),
                     "refused": {
                         reason: count for (number, reason), count in stats.refused.items() if number == topic.topic_id
                     },
@@ -211,6 +216,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "entries": stats.entries,
                 "payload_bytes": stats.payload_bytes,
                 "repeats": stats.repeats,
+                "air": dict(stats.air),
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
                 "unmatched": self.unmatched,
@@ -254,7 +260,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def _reconfigure(self, **changes: Any) -> None:
         with self._lock:
-            self._sender.reconfigure(**changes)
+            self._end.reconfigure(**changes)
             self.config = replaced(self.config, **changes)
             self._work.notify_all()
             self._room.notify_all()
@@ -277,10 +283,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """What the publishers of a topic offer: its queue follows, where it is not configured."""
         qos = agreed(offers)
         with self._lock:
-            changed = self._sender.follow(
-                topic.topic_id, depth=qos.depth, lifespan_s=qos.lifespan_s, period_s=qos.deadline_s
+            changed = self._end.follow(
+                topic.topic_id,
+                reliable=qos.reliability != "best_effort",
+                depth=qos.depth,
+                lifespan_s=qos.lifespan_s,
+                period_s=qos.deadline_s,
             )
-            policy, deadline_s = self._sender.queue(topic.topic_id)
+            policy, deadline_s = self._end.queue(topic.topic_id)
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
@@ -288,29 +298,29 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _take(self, topic_id: int, payload: bytes) -> None:
         """A message of the ROS graph, in a thread of the middleware."""
         with self._lock:
-            while self.config.backpressure and not self._closed and not self._sender.room(topic_id):
+            while self.config.backpressure and not self._closed and not self._end.room(topic_id):
                 self._room.wait()
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
             if topic_id in self._subscriptions:
-                self._sender.missed(topic_id, self._subscriptions[topic_id].lost)
+                self._end.missed(topic_id, self._subscriptions[topic_id].lost)
             # A robot that comes late gets the newest message of a topic, which then has to hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._sender.submit(topic_id, whole or payload, self._clock())
-            if not self._sender.out_of_credit:  # waking the pump for nothing would cost as much as a packet
+            self._end.submit(topic_id, whole or payload, self._clock())
+            if not self._end.out_of_credit:  # waking the pump for nothing would cost as much as a packet
                 self._work.notify()
 
     def _take_losses(self) -> None:
         """What the ROS graph has lost before it reached us is part of what was sent. Called with the lock held."""
         for topic_id, subscription in self._subscriptions.items():
-            self._sender.missed(topic_id, subscription.lost)
+            self._end.missed(topic_id, subscription.lost)
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
-            self._sender.credit(max(0, packets))
+            self._end.credit(max(0, packets))
             self._work.notify()
 
     def _pump(self) -> None:
@@ -329,12 +339,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                if self._sender.next_packet(self._clock()) is None:
+                if self._end.next_packet(self._clock()) is None:
                     break
             if packets:
                 self._room.notify_all()
             elif self._running:
-                at = self._sender.next_timeout()
+                at = self._end.next_departure()
                 self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
         return packets
 
@@ -355,7 +365,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            level = logging.INFO if event.reason == Row.SUPERSEDED else logging.WARNING  # what `latest` is for
+            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # what `latest` is for
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

@@ -1,6 +1,6 @@
-"""When packets have the air: one after the other, each for its airtime, and when the next may be asked for.
+"""When each packet occupies the channel: one after the other, each for its airtime; and when to ask for the next.
 
-Laws: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
+Invariants: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
 airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air
 is free of all that is here or promised (credits not yet used, each for a longest packet), and while fewer than
 ``OUTSTANDING`` packets are. No IO, no clock: ``now`` is seconds, monotonic.
@@ -18,7 +18,7 @@ T = TypeVar("T")
 LEAD_S = 0.005
 """s before the air is free that a source needs to compose and hand over the next packet."""
 OUTSTANDING = 2
-"""Packets here or promised at most: one on the air and one behind it; what waits further back is not yet composed."""
+"""Most packets queued or granted: one on the air and one behind it. Later packets are not composed yet."""
 
 
 class AirtimeClock(Generic[T]):
@@ -75,6 +75,11 @@ class AirtimeClock(Generic[T]):
         if self._free > now and self._outstanding < OUTSTANDING:
             times.append(max(now, self._promised_until(now) - self._lead))
         return min(times) if times else None
+
+    @property
+    def first_due(self) -> float | None:
+        """When the first packet here may leave, None where there is none."""
+        return self._queue[0][0] if self._queue else None
 
     @property
     def backlog(self) -> int:

@@ -1,8 +1,8 @@
 """One robot's end of a link: messages and packets in, packets and events out.
 
-An end sends and receives, so that what it hears may change what it sends. Laws: as everywhere in ``link``, time is an
-argument and never goes back; nothing happens but in a call; what the sending half does is told to its observer while
-it happens, what the receiving half does is returned, for the caller to act on before others hear of it.
+An end sends and receives, so that received packets can change what it sends. Invariants: as everywhere in ``link``,
+time is an argument and never goes back; nothing happens outside a call; the sending half reports to its observer
+immediately; the receiving half returns its events, so that the caller can act on them before any observer.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig
+from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
@@ -22,11 +22,11 @@ from gr_ros2.registry import Registry
 
 
 class Endpoint(Protocol):
-    """What the shells need of an end, whatever its version of the wire format."""
+    """The interface of an end, the same for every version of the wire format."""
 
     @property
     def answers(self) -> bool:
-        """Whether what it receives can change what it sends."""
+        """Whether received packets can change what this end sends."""
 
     @property
     def sent(self) -> SenderStats:
@@ -96,6 +96,9 @@ class Endpoint(Protocol):
         :raises ConfigError: for a value out of range or a setting that cannot change
         """
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """How long an incomplete message waits for its next fragment, s; version 1 waits while it may be repaired."""
+
     def unpublished(self, event: Delivered) -> Lost:
         """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
 
@@ -106,7 +109,7 @@ class Endpoint(Protocol):
         """From now on a packet leaves only for a credit."""
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take so many further packets."""
+        """The PHY can take this many further packets."""
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
@@ -115,18 +118,21 @@ class Endpoint(Protocol):
         """Take the bytes of one packet; the events it causes, in order."""
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Do what is due by ``now``; the events it causes, in order. Whether a packet may go is asked apart."""
+        """Do what is due by ``now``; the events it causes, in order. ``next_packet`` is a separate question."""
+
+    def next_departure(self) -> float | None:
+        """Earliest time at which ``next_packet`` may have something without a further call; None where only a call can
+        change that."""
 
     def next_timeout(self) -> float | None:
-        """Earliest time at which ``next_packet`` or ``handle_timeout`` may have something without a further call; None
-        where only a call can change that."""
+        """The same of ``handle_timeout``."""
 
 
 class EndpointV0:
-    """An end that speaks version 0, whose receiving half tells its sending half nothing.
+    """An end of version 0. Its receiving half passes nothing on to its sending half.
 
-    :param source: settings of what it sends; None: it sends nothing
-    :param sink: settings of what it receives; None: it receives nothing
+    :param source: settings of its sending half; None: it sends nothing
+    :param sink: settings of its receiving half; None: it receives nothing
     :param codecs: of messages sent and received, where the link compresses
     :param rng: see :class:`Sender`
     :param observer: called with every SenderEvent, in order
@@ -210,6 +216,11 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         self._half().reconfigure(**changes)
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """See :class:`Endpoint`."""
+        if self._receiver is not None:
+            self._receiver.config = replaced(self._receiver.config, reassembly_timeout_s=timeout_s)
+
     def unpublished(self, event: Delivered) -> Lost:
         """See :class:`Endpoint`."""
         assert self._receiver is not None
@@ -250,8 +261,10 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         return [] if self._receiver is None else self._receiver.handle_timeout(now)
 
+    def next_departure(self) -> float | None:
+        """See :class:`Endpoint`."""
+        return None if self._sender is None else self._sender.next_timeout()
+
     def next_timeout(self) -> float | None:
         """See :class:`Endpoint`."""
-        halves = (self._sender, self._receiver)
-        times = [at for half in halves if half is not None and (at := half.next_timeout()) is not None]
-        return min(times, default=None)
+        return None if self._receiver is None else self._receiver.next_timeout()

@@ -1,7 +1,7 @@
-"""What the engines tell their shells: values only, no behaviour.
+"""The events that the engines report: values only, no behaviour.
 
 A message is named by its source, its topic and a ``key``: a hashable value that the engine makes and only compares. A
-key may come round, but never while the message that had it before can still arrive.
+key may be used again, but never while the earlier message with this key can still arrive.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gr_ros2.wire import Packet, TableRow
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A packet came in: its bytes and what they say. What it completes or ends is told behind it."""
+    """A packet arrived: its bytes and their meaning. Events that it causes follow it."""
 
     data: bytes
     packet: Packet
@@ -47,11 +47,11 @@ class Delivered:
 class Lost:
     """A message of which at least something came will not be delivered.
 
-    ``reason`` is a :class:`gr_ros2.link.outcome.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
+    ``reason`` is a :class:`gr_ros2.link.ledger_rows.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
     outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
     ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (nothing
-    says what its topic is), ``sender_restarted``; or it is complete and its codec says ``unknown_dictionary`` or
-    ``damaged``.
+    says what its topic is), ``sender_restarted``; or the message is complete and its codec reports
+    ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int
@@ -95,8 +95,8 @@ ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
 class Accepted:
     """A message was submitted. ``serial`` counts the submitted messages of this sender from 0.
 
-    ``expected`` is what is to come out at the far end, where the link's codec changes the message on purpose (alignment
-    gaps, quantised fields); None: the payload itself.
+    ``expected`` is the payload that the other end should publish, where the link's codec changes the message on purpose
+    (alignment gaps, quantised fields); None: the payload itself.
     """
 
     serial: int
@@ -108,7 +108,7 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A submitted message will not be sent, or not to its end.
+    """A submitted message will not be sent, or not completely.
 
     ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
     a message whose first fragments have left, ``abandoned``.
@@ -122,7 +122,8 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Missed:
-    """Messages of a topic that the source's ROS graph lost before they were submitted, as far as it tells.
+    """Messages of a topic that the source's ROS graph lost before they were submitted, as far as the graph reports
+    them.
 
     They end in the ledger row ``lost_on_graph``. Nothing but their number is known: they have no serial and no time.
     """
@@ -135,8 +136,8 @@ class Missed:
 class SentEntry:
     """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
-    ``total`` fragments are all of it; 0 while a message is cut as it goes. ``repeat`` says that the message has been
-    sent before, and is sent again for robots that come late.
+    ``total`` is the number of fragments of the message; 0 where the number is not fixed in advance. ``repeat`` says
+    that the message was sent before, and is sent again for robots that join late.
     """
 
     serial: int

@@ -1,9 +1,10 @@
-"""How a message is cut into fragments (the paper, section 5.2), at fixed lengths or to fit what room there is.
+"""How a message is cut into fragments (the paper, section 5.2): at fixed lengths, or to fit the free space of a packet.
 
-Laws: the number of fragments of a message is fixed when its first one is sent, since every entry carries ``total``;
-fragments are taken in order and together are the message. Version 0 gives each entry its own length, so only the
-paper's policy makes them equal (all but the last); a flexible cut may make each as long as the room found, as long as
-what remains can still go in the entries that remain, at most ``cut`` bytes each and at least one.
+Invariants: the number of fragments of a message is fixed when its first one is sent, since every entry carries
+``total``; fragments are taken in order and together are the message. Version 0 gives each entry its own length, so only
+the paper's policy makes them equal (all but the last); a flexible cut may fill the free space with each fragment,
+provided that the remaining bytes still fit the remaining entries, with at most ``cut`` bytes and at least one byte
+each.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: 
 
 @dataclass(slots=True, eq=False)
 class Outgoing:
-    """A message on its way out.
+    """A message being sent.
 
     :param serial: number of the submitted message
     :param payload: what goes on the air: the message, coded where the link compresses
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
-    :param weight: what its age counts beside that of other topics
-    :param expires: time after which it is of no use, s
-    :param repeat: it was sent before, and goes again for robots that come late (transient-local topics)
-    :param entry_id: its name on the air, -1 until its first fragment leaves
-    :param cut: most bytes that any fragment still to come needs to take, 0 until it is cut
+    :param weight: weight of its age relative to other topics
+    :param expires: time after which the message is useless, s
+    :param repeat: the message was sent before, and is sent again for robots that join late (transient-local topics)
+    :param entry_id: its number on the wire, -1 until its first fragment leaves
+    :param cut: most bytes that any remaining fragment needs to carry, 0 until the message is cut
     :param index: next fragment to send
     :param offset: bytes sent
     """

@@ -1,21 +1,21 @@
-"""Which fragments go into the next packet so that what is known at the far end is young.
+"""A scheduler that keeps the age of information at the other end low: it chooses the fragments of the next packet.
 
-*Value.* Sending a message of ``c`` bytes of air makes its topic younger by ``g``, the time between its submission and
-that of the newest one sent whole before. Topics that all want more than the air has are best off, in weighted mean
-age, when each comes every T with T^2 proportional to c / weight; sending the greatest ``weight * g^2 / c`` first does
-that.
+*Value.* Sending a message of ``c`` bytes reduces the age of its topic by ``g``, the time between its submission and
+that of the newest message sent completely before. When the topics together need more than the channel's capacity, the
+weighted mean age is lowest if each topic is sent with a period T, where T^2 is proportional to c / weight. Sending the
+message with the greatest ``weight * g^2 / c`` first achieves that.
 
 *Classes.* Messages of class latency go first, then default, then bulk in what is left.
 
-*Turns.* Every ``TURN``-th packet belongs to the topic whose last turn is longest ago, whatever its class: it gets the
-room it needs there, of which ``reserve`` bytes stay free for a message of class latency.
+*Turns.* Every ``TURN``-th packet belongs to the topic whose last turn is longest ago, whatever its class. That topic
+gets the space that it needs, but ``reserve`` bytes stay free for a message of class latency.
 
-*Cuts.* A fragment takes the room there is. ``total`` is fixed at the first one, so it leaves slack: what remains of a
-message never needs fragments of more than ``cut`` bytes, with ``cut`` below a packet's room by that reserve.
+*Cuts.* A fragment fills the free space. ``total`` is fixed at the first fragment, so it includes slack: the rest of a
+message never needs fragments of more than ``cut`` bytes, and ``cut`` is smaller than a packet's space by that reserve.
 
-Laws: a message of class latency that waits alone in its class has an entry in the next packet; a topic that always
-has something waiting gets a turn within TURN times the number of topics, and a message needs no more turns than it
-has fragments, at most 1 + ceil(size / cut): nothing starves.
+Invariants: a message of class latency that waits alone in its class has an entry in the next packet; a topic that
+always has something waiting gets a turn within TURN times the number of topics, and a message needs no more turns than
+it has fragments, at most 1 + ceil(size / cut): nothing starves.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from gr_ros2.registry import Registry
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Format
 
 TURN = 4
-"""Every so manieth packet belongs to the topic that has waited longest for one."""
+"""One packet in this many belongs to the topic whose last turn is longest ago."""
 FIRST_AGE_S = 1.0
-"""s that a topic counts as old when its first message comes."""
+"""Age in s that a topic is assumed to have when its first message comes."""
 LARGE = 4
-"""Packets from which on a message is cut with slack, to fill what others leave in packets."""
+"""A message of this many packets or more is cut with slack, so that it can fill the space that others leave."""
 
 RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
 """The order of the classes."""
@@ -75,7 +75,7 @@ class Turns:
 
 
 class _Packing:
-    """A packet being filled. ``keep``: payload bytes of one more entry that what is added must leave room for."""
+    """A packet being filled. ``keep``: payload bytes that must stay free for one more entry."""
 
     def __init__(self, wire_format: Format, packet_len: int) -> None:
         self._room = wire_format.room
@@ -86,7 +86,7 @@ class _Packing:
         self.keep = 0
 
     def room(self) -> int:
-        """Payload bytes a further entry may have; not above 0 where none fits."""
+        """Payload bytes a further entry may have; 0 or negative where no entry fits."""
         return self._room(self._packet_len, len(self.picks) + (self.keep > 0), self._payload + self.keep)
 
     def add(self, message: Outgoing, length: int) -> None:
@@ -110,12 +110,12 @@ class FreshnessScheduler:
         self._alone = len(registry) == 1
         self._latency = {topic.topic_id for topic in registry if topic.options.qos == "latency"}
         self._urgent = min(config.min_fragment, self._half)
-        """Bytes of the largest message of class latency so far, as far as half a packet goes."""
+        """Bytes of the largest message of class latency so far, at most half a packet."""
         self._newest: dict[int, float] = {}
-        """Per topic, submission time of the newest message sent whole."""
+        """Per topic, submission time of the newest message sent completely."""
         self._turns = Turns()
         self._holder = -1
-        """Topic whose turn the planned packet is."""
+        """The topic to which the turn of the planned packet belongs."""
 
     def plan(self, queues: Queues) -> Plan | None:
         pending = [topic_id for topic_id, queue in queues.items() if queue]
@@ -161,7 +161,7 @@ class FreshnessScheduler:
                 heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
 
     def _add(self, packing: _Packing, message: Outgoing) -> bool:
-        """Add what fits of a message; whether that was all of it."""
+        """Add as much of a message as fits; returns whether that was all of it."""
         if not message.started and not self._cut(packing, message):
             return False
         remaining = message.remaining
@@ -179,7 +179,7 @@ class FreshnessScheduler:
         return True
 
     def _cut(self, packing: _Packing, message: Outgoing) -> bool:
-        """Fix ``total`` and ``cut`` of a message that would start in this packet; False where it had better not."""
+        """Fix ``total`` and ``cut`` of a message that would start in this packet; False where it is better to wait."""
         size, room = len(message.payload), packing.room()
         if size <= room:
             message.total, message.cut = 1, size

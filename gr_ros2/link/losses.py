@@ -1,7 +1,7 @@
-"""Packets the channel loses whole: at random, in bursts, and while the link is unplugged.
+"""Loss of whole packets in the channel: at random, in bursts, and during outages.
 
-Laws: equal seeds give equal losses for the same order of packets; every packet draws the same number of random
-values, so that a change of one setting does not shift what the seed does later; each loss is counted under the name
+Invariants: equal seeds give equal losses for the same order of packets; every packet draws the same number of random
+values, so that a change of one setting does not change the later random values; each loss is counted under the name
 of the setting that caused it.
 """
 
@@ -14,7 +14,7 @@ from gr_ros2.config import BurstLoss, ChannelConfig
 
 
 class PduLosses:
-    """Decides packet by packet what comes through, wherever the packets come from.
+    """Decides for each packet whether it passes.
 
     :param config: ``packet_loss``, ``burst_loss``, ``outages`` and ``seed`` of it
     """
@@ -49,7 +49,7 @@ class GilbertElliott:
 
     def __init__(self, config: BurstLoss, seed: int = 0) -> None:
         self._config = config
-        self._random = random.Random(f"burst_loss {seed}")  # not the sequence of packet_loss
+        self._random = random.Random(f"burst_loss {seed}")  # a sequence different from that of packet_loss
         self.bad = self._random.random() < config.share_bad
 
     def loses(self) -> bool:

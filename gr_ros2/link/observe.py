@@ -1,9 +1,8 @@
-"""Who observes a link, and cannot harm it.
+"""Observers of a link. An observer cannot harm the link.
 
-Laws: an observer hears every event in order until its first exception, which ends it alone
-(:class:`gr_ros2.guard.Guard`): the link and the other observers go on. It is called in the thread of the event: one
-that may be slow gets its events through a bounded queue from who attaches it
-(``gr_ros2.run.watch.Onlookers``).
+Invariants: an observer receives every event in order until its first exception; that ends only this observer
+(:class:`gr_ros2.guard.Guard`), and the link and the other observers go on. An observer is called in the thread of the
+event. A slow observer has to be attached through a bounded queue (``gr_ros2.run.observers.RunObservers``).
 """
 
 from __future__ import annotations
@@ -16,13 +15,14 @@ from gr_ros2.link.events import ReceiverEvent, SenderEvent
 
 
 class LinkObserver(Protocol):
-    """What hears both ends of a link. It is called from the link's threads, in causal order, and must be quick."""
+    """Receives the events of both ends of a link. It is called from the link's threads, in causal order, and must be
+    fast."""
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender with this source id reports."""
+        """An event of the sender with this source id."""
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports, packets included; of a delivery once it is republished."""
+        """An event of the receiver, packets included. A delivery is reported after it was published."""
 
 
 _Observer = TypeVar("_Observer", bound=LinkObserver)
@@ -37,7 +37,7 @@ class Observers(Generic[_Observer]):
             self.add(observer)
 
     def add(self, observer: _Observer, *, needed: bool = False) -> Guard:
-        """Let one more observe, from now.
+        """Attach one more observer, from now on.
 
         :param needed: see :class:`Guard`
         """
@@ -54,11 +54,11 @@ class Observers(Generic[_Observer]):
             guard(observer.receiver_event, event, now)
 
     def told(self) -> list[str]:
-        """What observers missed and why, one line each; often none."""
+        """What observers missed and why, one line each; empty if they missed nothing."""
         lines = [line for _, guard in self._guarded for line in guard.told()]
         return lines + [line for one, _ in self._guarded if isinstance(one, Observers) for line in one.told()]
 
 
 def name_of(observer: object) -> str:
-    """What an observer is called: its ``name``, or its class."""
+    """Name of an observer in messages: its ``name``, or its class."""
     return str(getattr(observer, "name", type(observer).__name__))

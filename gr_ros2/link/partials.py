@@ -1,7 +1,7 @@
-"""The incomplete messages of all sources: the one place that holds them, knows their order and counts their bytes.
+"""The incomplete messages of all sources. Only this module holds them, knows their order and counts their bytes.
 
-Laws: a message is here from its first fragment until it is completed or taken off, and then nowhere; ``size`` is the
-sum over all that are here; the order is that of their last new fragment, the longest ago first.
+Invariants: a message is held from its first fragment until it is complete or removed; ``size`` is the sum over all held
+messages; they are ordered by the time of their last new fragment, the oldest first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Partial:
     :ivar number: its entry id unwrapped
     :ivar last: s, when its last fragment came
     :ivar size: bytes that it takes
-    :ivar following: the index that an orderly sender sends next
+    :ivar following: the index that a sender which keeps the order sends next
     :ivar doubtful: the sender used its id for another message at the same time
     """
 
@@ -40,12 +40,12 @@ class Partial:
     following: int = 0
 
     def contradicts(self, entry: Entry, flags: int) -> bool:
-        """Whether an entry of the same id cannot be of this message."""
+        """Whether an entry with the same id cannot belong to this message."""
         held = self.fragments.get(entry.index)
         return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
 
     def goes_on_with(self, entry: Entry) -> bool:
-        """Whether an entry is the next of this message, or one that it has already."""
+        """Whether an entry is the next fragment of this message, or one that was received before."""
         return not self.doubtful and (entry.index == self.following or entry.index in self.fragments)
 
 
@@ -60,25 +60,25 @@ class Partials:
         self._of: dict[tuple[int, int], dict[int, Partial]] = {}
 
     def of(self, src_id: int, topic_id: int) -> dict[int, Partial]:
-        """Those of a source and topic by entry id: always the same dictionary, to be read only."""
+        """The messages of a source and topic by entry id: always the same dictionary; do not modify it."""
         return self._of.setdefault((src_id, topic_id), {})
 
     def size_of(self, src_id: int) -> int:
-        """Bytes of those of a source."""
+        """Bytes of the messages of a source."""
         return self._sizes[src_id]
 
     def oldest(self, src_id: int | None = None) -> Partial:
-        """The one without a new fragment for longest, of a source or of all; there is one."""
+        """The message whose last new fragment is oldest, of one source or of all; there must be one."""
         return next(partial for partial in self._in_order if src_id is None or partial.src_id == src_id)
 
     def __iter__(self) -> Iterator[Partial]:
-        """In their order."""
+        """All messages in their order."""
         return iter(self._in_order)
 
     def add(self, partial: Partial, entry: Entry, now: float) -> bytes | None:
         """Hold a fragment of a message, which may be its first.
 
-        :return: the whole message where that completes it, which is then here no more
+        :return: the complete message, which is then no longer held; None while fragments are missing
         """
         partial.last = now
         if partial not in self._in_order:
@@ -109,7 +109,7 @@ class Partials:
         return partial
 
     def forget(self, src_id: int) -> None:
-        """A source without incomplete messages is gone."""
+        """Forget a source that has no incomplete messages."""
         for key in [key for key in self._of if key[0] == src_id]:
             del self._of[key]
         del self._sizes[src_id]

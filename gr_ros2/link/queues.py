@@ -1,9 +1,9 @@
-"""What waits at the source, topic by topic, and which of it is dropped: whole messages, never fragments.
+"""The queues of the source, one per topic, and which messages they drop: whole messages, never fragments.
 
-Laws: a message under way stands first and no newer one pushes it out; every message dropped is handed back with the
-ledger row it ends in. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest, when full),
-``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
-``abandoned`` (under way, and the same).
+Invariants: a message that is being sent is first in its queue, and no newer message replaces it; every dropped message
+is returned with its ledger row. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest,
+when full), ``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
+``abandoned`` (started, and it would be late).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from math import inf
 
 from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +23,12 @@ class Dropped:
     """A message that will not be sent: its ledger row, and why in words."""
 
     message: Outgoing
-    row: Row
+    row: LedgerRow
     detail: str
 
 
 class TopicQueue(deque[Outgoing]):
-    """The messages of one topic, in the order in which they go.
+    """The messages of one topic, in the order in which they are sent.
 
     :param policy: see ``TopicOptions.queue``
     :param deadline_s: s a message may take from submission to the far end, 0 no limit
@@ -42,40 +42,40 @@ class TopicQueue(deque[Outgoing]):
         self._interval = 1 / max_rate if max_rate else 0.0
         self._opens = float("-inf")
         self.since = inf
-        """When the wait for company began: with the first message, or when one started; not anew when one is dropped,
-        or a topic faster than the wait would never leave."""
+        """When ``flush_timeout_s`` began to run: with the first message, or when a message started. A drop does not
+        restart it; otherwise a topic faster than the timeout would never be sent."""
 
     def change(self, policy: QueuePolicy, deadline_s: float) -> None:
-        """Another policy or deadline, from now on; the deadline for what waits too."""
+        """Set another policy or deadline, from now on; the deadline applies to waiting messages too."""
         self.policy = policy
         self.deadline_s = deadline_s
         for message in self:
             message.expires = self._expiry(message)
 
     def room(self, depth: int) -> bool:
-        """Whether one more would push none out. ``depth``: messages that may wait, 0 unbounded."""
+        """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 unbounded."""
         if self.policy == "latest":
             return not self or (len(self) == 1 and self[0].started)
         return not depth or len(self) < depth
 
     def admit(self, message: Outgoing, depth: int) -> list[Dropped]:
-        """Put a message in; returns those that make room for it."""
+        """Add a message; returns the messages dropped to make room for it."""
         if not self:
             self.since = message.submitted
         dropped: list[Dropped] = []
         if self.policy == "latest":
             while self and not self[-1].started:
-                dropped.append(Dropped(self.pop(), Row.SUPERSEDED, "a newer message came before it could start"))
+                dropped.append(Dropped(self.pop(), LedgerRow.SUPERSEDED, "a newer message came before it could start"))
         elif depth and len(self) >= depth:
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
-                dropped.append(Dropped(victim, Row.QUEUE_BOUND, f"{depth} messages were waiting"))
+                dropped.append(Dropped(victim, LedgerRow.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
         self.append(message)
         return dropped
 
     def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
-        """Drop what cannot be across in time, even if it had the link to itself.
+        """Drop the messages that cannot be delivered in time, even if they had the link to themselves.
 
         :param interval: s from one packet to the next, 0 where not known
         :param lead: s between composing a packet and its first sample
@@ -87,50 +87,50 @@ class TopicQueue(deque[Outgoing]):
             packets = max(-(-message.remaining // payload), 1)
             late = now + packets * interval + lead * bool(interval) > message.expires
             if not late and now < message.expires:
-                return  # what follows is younger, and waits for this one
+                return  # the following messages are younger, and wait for this one
             self.remove(message)
             yield Dropped(message, *self._reason(message, now, packets * interval))
 
     def started(self, now: float) -> None:
-        """A message began: when may the next one?"""
+        """A message was started: compute when the next one may start."""
         self.since = now
         if self._interval:
-            # What a start was late by is not added to the next, unless it was late by a whole interval.
+            # The delay of one start is not added to the next, unless it was a whole interval.
             self._opens = (self._opens if now - self._opens < self._interval else now) + self._interval
 
     def open(self, now: float) -> Sequence[Outgoing]:
-        """The messages that may go on or start."""
+        """The messages that may continue or start."""
         if not self._interval:
             return self
         return [self[0]] if self and (self[0].started or now >= self._opens) else []
 
     def opens(self, now: float) -> float:
-        """When the next message may start, if one waits for that; otherwise infinite."""
+        """When the next message may start, if one waits for ``max_rate``; otherwise infinite."""
         return self._opens if self and now < self._opens and not self[0].started else inf
 
     def _expiry(self, message: Outgoing) -> float:
         return message.submitted + self.deadline_s if self.deadline_s else inf
 
-    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[Row, str]:
+    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[LedgerRow, str]:
         limit = f"{self.deadline_s * 1e3:g} ms"
         if message.started:
-            return Row.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
+            return LedgerRow.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:
-            return Row.STALE, f"it waited longer than {limit}"
-        return Row.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
+            return LedgerRow.STALE, f"it waited longer than {limit}"
+        return LedgerRow.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
 def queue_for(
     options: TopicOptions, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
 ) -> tuple[QueuePolicy, float]:
-    """The policy of a topic's queue and its deadline in s (0 none), as configured; where left open, as its publishers'
-    QoS has it.
+    """The policy of a topic's queue and its deadline in s (0 = none): the configured ones, otherwise from its
+    publishers' QoS.
 
     A configured ``queue`` stands as it is. A history of one message, which the registry may set too, or a promise of
-    one per period says that only the newest matters: ``latest``. A lifespan says when a message is of no more use.
+    one per period says that only the newest matters: ``latest``. A lifespan says when a message becomes useless.
 
     :param depth: of the publishers' history, 0 unbounded or not known
-    :param lifespan_s: s, 0 for ever
+    :param lifespan_s: s, 0 without limit
     :param period_s: their deadline: s within which they promise a message, 0 no promise
     """
     if options.queue is not None:

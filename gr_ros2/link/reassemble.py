@@ -1,21 +1,21 @@
-"""Fragments of one source and topic back to messages, and never to a message made of two.
+"""Reassembles the fragments of one source and topic into messages, and never mixes two messages.
 
-The 8-bit entry id comes round after 256 messages, a restarted sender starts anywhere, and a sender of random ids (the
-paper's) repeats itself soon. What protects a message, besides its id:
+The 8-bit entry id wraps around after 256 messages, a restarted sender starts at any id, and a sender of random ids (as
+in the paper) soon repeats an id. These rules protect a message, besides its id:
 
 - *Contradiction*: another ``total``, other flags, or the same index with other bytes begins a new message.
-- *Overtaking*: 64 newer ids seen, or 64 that would have passed unseen at the topic's recent rate, end a message.
-- *Order*: a sender sends a topic's messages one after the other, each in index order. Once packets have been missed,
-  an entry whose place among the topic's recent ones does not agree with its packet's sequence number is of another
-  time: held messages end and it begins a new one. While no packet has been missed this is not asked, so messages of
-  a topic may interleave on a clean link.
-- *Rules broken*: between two entries with no packet missed, an orderly sender goes on with a message or begins one at
-  index 0, and uses no id for two messages. Of a sender that does otherwise nothing is held across a missed packet, and
-  a message takes its next fragment only. So messages of a topic may still interleave on a clean link; fragments in
-  another order, and two messages under one id, are refused.
+- *Overtaking*: a message ends when 64 newer ids were seen, or would have passed unseen at the topic's recent rate.
+- *Order*: a sender sends a topic's messages one after the other, each in index order. After packets were missed, an
+  entry whose order among the topic's recent entries contradicts its packet's sequence number belongs to a different
+  period: held messages end, and the entry begins a new one. While no packet was missed this rule does not apply, so
+  messages of a topic may interleave on a link without loss.
+- *Rules broken*: between two entries with no packet missed, an orderly sender continues a message or begins one at
+  index 0, and never uses one id for two messages. From a sender that breaks these rules nothing is held across a missed
+  packet, and a message accepts only its next fragment. Messages of a topic may then still interleave on a link without
+  loss; fragments in another order, and two messages with one id, are refused.
 - *Reset* (see ``sequence``): a restart or outage seen in the packet numbers ends everything held of the source.
 
-Laws: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
+Invariants: each message that began ends exactly once, in a Delivered or a Lost; completed ids are not remembered.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gr_ros2.wire.v0 import V0, Entry
 
 OVERTAKEN = 64
 _PATIENT = 192
-"""Ids that must have passed unseen where the packet numbers show no loss: a sender that paused, most likely."""
+"""Ids that must have passed unseen where the packet numbers show no loss; most likely the sender paused."""
 _STALL_S = 0.5
 """s that a sender or receiver may hang between packets, however fast it is: at 30,000 packets/s 192 ids take 0.1 s."""
 _HISTORY = 128
@@ -41,7 +41,7 @@ _NOWHERE = (-1, -1)
 
 @dataclass(slots=True)
 class Context:
-    """What the packet of an entry says about it.
+    """What the packet of an entry says about the entry.
 
     :param position: unwrapped sequence number
     :param epoch: counts the breaks in the order of this source's packets: at a gap, before and after a late one, at a
@@ -72,12 +72,12 @@ class TopicReassembler:
         self._history: deque[tuple[int, int, int, int]] = deque(maxlen=_HISTORY)
         """(packet position, message number, index, epoch) of the last entries."""
         self._latest = self._settled = _NOWHERE
-        """The furthest (message number, index) seen at all, and before the last packet that was missed."""
+        """The highest (message number, index) seen at all, and before the last missed packet."""
         self._orderly = True
-        """Whether the sender has kept to the rules since the last reset."""
+        """Whether the sender has kept the rules since the last reset."""
         self._epoch = 0
         self._top = -1
-        """The furthest packet position that had an entry of this topic."""
+        """The highest packet position that had an entry of this topic."""
         self._pace = Pace(window=16, least=8)
 
     def accept(self, entry: Entry, context: Context) -> tuple[bytes | None, list[Partial]]:
@@ -126,7 +126,7 @@ class TopicReassembler:
         return [self._partials.take(partial) for partial in list(self._mine.values())]
 
     def reset(self) -> list[Partial]:
-        """End everything held and forget ids, order and pace: what follows is of another time."""
+        """End everything held and forget ids, order and rate: the following entries belong to a different period."""
         self._newest = None
         self._latest = self._settled = _NOWHERE
         self._history.clear()
@@ -135,13 +135,13 @@ class TopicReassembler:
         return self.clear()
 
     def _number(self, entry_id: int) -> int:
-        """An entry id unwrapped: less than 64 behind the newest it is an older message, otherwise a newer one."""
+        """The unwrapped entry id: less than 64 behind the newest id it is an older message, otherwise a newer one."""
         if self._newest is None:
             return entry_id
         return unwrap(entry_id, self._newest - OVERTAKEN + 1, V0.id_bits)  # further back a message is overtaken
 
     def _out_of_order(self, number: int, index: int, context: Context) -> bool:
-        """Whether an entry's place in its topic disagrees with its packet's, other than on a link without loss."""
+        """Whether the order of an entry in its topic contradicts its packet's order; never on a link without loss."""
         if context.epoch != self._epoch:
             self._epoch = context.epoch
             self._settled = max(self._settled, self._latest)
@@ -155,7 +155,7 @@ class TopicReassembler:
         return False
 
     def _advance(self, number: int, entry_id: int, index: int, now: float) -> None:
-        """Follow the newest message, and count those never seen."""
+        """Follow the newest message, and count the messages never seen."""
         if self._newest is None or number - self._newest >= _RESTART_JUMP // 2:
             self._newest = number
             self._pace.observe(now, 1)

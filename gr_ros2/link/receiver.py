@@ -1,7 +1,7 @@
 """The receiving engine: bytes from the PHY in, messages out.
 
-Laws: nothing but the bytes is trusted; ``receive`` never raises whatever the bytes; everything dropped is counted by
-name; memory is bounded per source and in all; time is an argument and never goes back.
+Invariants: ``receive`` trusts no byte and never raises, whatever the bytes; everything dropped is counted by name;
+memory is bounded per source and in total; time is an argument and never goes back.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.errors import CodecError, WireError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
@@ -23,7 +23,7 @@ from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.v0 import V0, Packet
 
 SOURCE_IDLE_S = 60.0
-"""A source silent for so long gives its place to a new one when ``max_sources`` are known."""
+"""A source that was silent for this many seconds is replaced by a new one when ``max_sources`` are known."""
 
 
 @dataclass(slots=True)
@@ -73,10 +73,10 @@ class Receiver:
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Give up what has waited ``reassembly_timeout_s`` for its next fragment."""
+        """Give up messages that have waited ``reassembly_timeout_s`` for their next fragment."""
         events: list[ReceiverEvent] = []
         while (at := self.next_timeout()) is not None and at <= now:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.EXPIRED))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.EXPIRED))
         return events
 
     def next_timeout(self) -> float | None:
@@ -86,12 +86,13 @@ class Receiver:
         return None
 
     def unpublished(self, event: Delivered) -> Lost:
-        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+        """Record a delivered message that could not be published on the ROS graph. A repeat of it is delivered
+        again."""
         source = self._sources.get(event.src_id)
         if source is not None and source.latched.get(event.topic_id) == event.payload:
             del source.latched[event.topic_id]
-        self.stats.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
+        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
         """Whether a sender has a place at present."""
@@ -103,7 +104,7 @@ class Receiver:
         return self._partials.size
 
     def _admit(self, packet: Packet, now: float) -> _Source | None:
-        """The source of a packet that concerns us."""
+        """The source of a packet, None if the packet is not for this receiver."""
         own = self.config.robot_id
         if own >= 0:
             if packet.src_id == own:
@@ -140,7 +141,7 @@ class Receiver:
                 self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 for topic in source.topics.values():
-                    events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in topic.reset()]
+                    events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in topic.reset()]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
@@ -155,20 +156,20 @@ class Receiver:
             message, ended = reassembler.accept(entry, context)
             self.stats.message_loss_est += reassembler.missed_ids - missed
             if ended:
-                events += [self._given_up(partial, Row.LOST_FRAGMENTS) for partial in ended]
+                events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in ended]
             if message is not None:
                 events += self._deliver(source, packet, entry.topic_id, entry.entry_id, message)
         source.epoch += placed.arrival is Arrival.LATE
         while self._partials.size_of(src_id) > self.config.max_source_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), Row.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), LedgerRow.MEMORY))
         while self._partials.size > self.config.max_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), Row.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.MEMORY))
 
     def _deliver(
         self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
-            return [self._undone(packet, topic_id, entry_id, Row.UNSUPPORTED)]
+            return [self._undone(packet, topic_id, entry_id, LedgerRow.UNSUPPORTED)]
         if packet.compressed and self._codec is not None:
             try:
                 payload = self._codec.decode(topic_id, payload)
@@ -182,13 +183,13 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: Row) -> Lost:
-        """Book a message that came whole, but cannot be read here."""
+    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
+        """Record a complete message that cannot be decoded here."""
         self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)
 
-    def _given_up(self, partial: Partial, row: Row) -> Lost:
-        """Book an incomplete message that is held no longer."""
+    def _given_up(self, partial: Partial, row: LedgerRow) -> Lost:
+        """Record an incomplete message that is no longer held."""
         self.stats.lost[partial.src_id, partial.topic_id, row.value] += 1
         self.stats.message_loss_est += 1
         return Lost(partial.src_id, partial.topic_id, row, partial.entry_id)

@@ -1,7 +1,8 @@
-"""Which fragments go into the next packet: what a policy is, and the paper's (section 5.2); ``freshness`` is the other.
+"""Schedulers choose the fragments of the next packet: their interface, and the paper's scheduler (section 5.2). The
+other one is ``freshness``.
 
-Law: a scheduler plans, and changes nothing but its own order of topics and the still open cut of waiting messages; the
-sender carries the last plan out or asks for another.
+Invariant: a scheduler only plans. It changes only its own order of topics and the cut of waiting messages that is not
+fixed yet. The sender executes the last plan or asks for another one.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from gr_ros2.wire import Format
 class Plan:
     """The next packet: from each message, in this order, one further fragment.
 
-    :param picks: messages to take one fragment of; a message may stand several times
+    :param picks: messages to take one fragment of; a message may occur several times
     :param lengths: bytes of each of these fragments
-    :param full: no further entry of ``min_fragment`` bytes would fit, so waiting for company is no use
+    :param full: no further entry of ``min_fragment`` bytes would fit, so that waiting for more is useless
     """
 
     picks: tuple[Outgoing, ...]
@@ -40,13 +41,13 @@ class Scheduler(Protocol):
         """The next packet's content from the messages waiting per topic id, or None where nothing is waiting."""
 
     def sent(self, plan: Plan) -> None:
-        """The last plan was carried out."""
+        """The last plan was executed."""
 
 
 class PaperScheduler:
     """Round robin over topics: one entry per topic and packet, or with ``greedy`` several back to back.
 
-    A topic that got an entry goes to the end of the line; one whose next fragment did not fit keeps its place.
+    A topic that got an entry goes to the end of the queue; a topic whose next fragment did not fit keeps its place.
     """
 
     def __init__(self, config: SourceConfig, registry: Registry, wire_format: Format) -> None:  # noqa: ARG002 - all topics are alike

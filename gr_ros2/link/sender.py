@@ -1,7 +1,7 @@
 """The sending engine: messages in, packets out.
 
-Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
-has them); a message whose first fragment has left is dropped only when its deadline cannot be met any more; packets
+Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
+has them); a message whose first fragment was sent is dropped only when its deadline cannot be met any more; packets
 come out only when the pace (rate or credit) allows; a packet is composed when it is asked for, never before; time is
 an argument and never goes back.
 """
@@ -17,22 +17,22 @@ from typing import Any
 from gr_ros2.config import QueuePolicy, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.registry import Registry, Topic
-from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
+from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that make sense to change while running."""
 
 _INTERVALS = 15
-"""Packet intervals from which the pace of credits is taken, as their median."""
+"""Number of packet intervals whose median estimates the interval of credits."""
 
 Observer = Callable[[SenderEvent], None]
 
@@ -57,7 +57,11 @@ class Sender:
     ) -> None:
         self.config = config
         if len(registry) > V0.max_topics:
-            raise ConfigError(f"{len(registry)} topics; version 0 carries {V0.max_topics}, version 1 up to 240")
+            beyond = registry[V0.max_topics]
+            raise ConfigError(
+                f"topic {V0.max_topics + 1}, {beyond.name!r}: version 0 carries {V0.max_topics} topics; leave some "
+                f"out, or set version: 1, which carries {FORMATS[1].max_topics}"
+            )
         self.registry = registry.with_options(config.topic_options)
         self.src_id = config.src_id()
         self.stats = SenderStats()
@@ -71,7 +75,7 @@ class Sender:
         self._capped = any(topic.options.max_rate for topic in self.registry)
         self._plan: Plan | None = None
         self._plan_until = -inf
-        """When the plan is out of date though nothing has happened; -inf: something has."""
+        """Time from which the plan is out of date without a further call; -inf: it is out of date already."""
         self._now = -inf
         self._ids, self._numbers = 1 << V0.id_bits, 1 << V0.number_bits
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
@@ -83,7 +87,7 @@ class Sender:
         """When the last packet left, if another was waiting for a credit then."""
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         self._latched: dict[int, tuple[int, bytes]] = {}
-        """Serial and coded bytes of the message that late robots are to get, per topic."""
+        """Per topic, serial and coded bytes of the message for robots that join late."""
         self._repeat_at: dict[int, float] = {}
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
@@ -105,7 +109,7 @@ class Sender:
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
-            self._refuse(serial, topic_id, Row.TOO_LARGE, self._too_large(len(payload)))
+            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
             return
         topic = self.registry[topic_id]
         options = topic.options
@@ -118,9 +122,9 @@ class Sender:
             self._repeat_at[topic_id] = now + self.config.repeat_s
 
     def missed(self, topic_id: int, total: int) -> None:
-        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted.
+        """Record how many messages of a topic the ROS graph has lost so far, before they could be submitted.
 
-        :param total: since the start; what is new of it is observed
+        :param total: since the start; the increase is reported to the observer
         """
         new = total - self.stats.missed[topic_id]
         if new > 0:
@@ -143,7 +147,7 @@ class Sender:
             self._spend_credit(now)
         if self.config.packet_rate > 0:
             interval = 1 / self.config.packet_rate
-            # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
+            # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.
             self._slot = max(self._slot, now - interval) + interval
         return data
 
@@ -163,9 +167,9 @@ class Sender:
         """Let a topic's queue follow the QoS of its publishers, as far as the configuration leaves it open.
 
         :param depth: of their history, 0 unbounded or not known
-        :param lifespan_s: s after which a message is of no use, 0 for ever
+        :param lifespan_s: s after which a message is useless, 0 without limit
         :param period_s: s within which they promise a message, 0 no promise
-        :return: whether that changed it; ``queue`` has what it is
+        :return: whether the policy or deadline changed; ``queue`` returns them
         """
         queue = self._queues[topic_id]
         wanted = queue_for(self.registry[topic_id].options, depth, lifespan_s, period_s)
@@ -191,21 +195,21 @@ class Sender:
             self._credits = 0
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take so many further packets; the first call does what ``use_credit`` does."""
+        """The PHY can take this many further packets; the first call implies ``use_credit``."""
         self._credits = (self._credits or 0) + packets
 
     @property
     def out_of_credit(self) -> bool:
-        """Whether nothing leaves before the next credit, whatever is submitted."""
+        """Whether no packet can leave before the next credit, whatever is submitted."""
         return self._credits == 0
 
     def room(self, topic_id: int) -> bool:
-        """Whether a message of that topic could be submitted without pushing another out."""
+        """Whether a message of that topic could be submitted without dropping another one."""
         return self._queues[topic_id].room(self.depth(topic_id))
 
     @property
     def interval(self) -> float:
-        """s from one packet to the next while the source is busy: set by ``packet_rate``, or as credits have come.
+        """s from one packet to the next while the source is busy: from ``packet_rate``, or measured from the credits.
 
         0 where neither is known.
         """
@@ -240,12 +244,12 @@ class Sender:
         return [queue for queue in self._queues.values() if queue.deadline_s]
 
     def _changed(self, now: float) -> None:
-        """What waits is not what was planned for."""
+        """The waiting messages have changed since the last plan."""
         self._now = now
         self._plan_until = -inf
 
     def _planned(self, now: float) -> Plan | None:
-        """The next packet's content; made anew only when something has changed."""
+        """The next packet's content; planned again only when something has changed."""
         if now >= self._plan_until:
             self._now = now
             queues: Mapping[int, Sequence[Outgoing]] = self._queues
@@ -257,7 +261,7 @@ class Sender:
         return self._plan
 
     def _expire(self, now: float) -> None:
-        """Drop what is too late, or would be."""
+        """Drop messages that are too late, or would be."""
         for queue in self._with_deadline:
             if queue:
                 payload = V0.single_entry_payload(self.config.packet_len)
@@ -273,11 +277,11 @@ class Sender:
                 continue
             self._refuse(message.serial, message.topic_id, item.row, item.detail)
             if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
-                # It is of no use any more, or there is a newer one: refused is refused, for late robots too.
+                # The message is useless now, or a newer one exists; so it is not kept for robots that join late either.
                 del self._latched[message.topic_id], self._repeat_at[message.topic_id]
 
     def _spend_credit(self, now: float) -> None:
-        """A packet left for a credit; where each had to wait for its own, learn how far apart they come."""
+        """A packet used a credit; while packets wait for their credits, measure the interval of the credits."""
         assert self._credits is not None
         if self._busy_since < inf:
             self._intervals.append(now - self._busy_since)
@@ -286,7 +290,7 @@ class Sender:
         self._busy_since = now if busy else inf
 
     def _departure(self, plan: Plan) -> float:
-        """When a planned packet may leave: at once if full, else after it has waited for company."""
+        """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout_s``."""
         if plan.full or self.config.flush_timeout_s == 0:
             return -inf
         waits = (min(message.submitted, self._queues[message.topic_id].since) for message in plan.picks)
@@ -337,7 +341,7 @@ class Sender:
         return entry_id
 
     def _repeat(self, now: float) -> None:
-        """Queue again what late robots need, once nothing newer of that topic is waiting."""
+        """Queue the message for robots that join late again, if nothing newer of that topic is waiting."""
         if self.config.repeat_s <= 0:
             return
         for topic_id, at in self._repeat_at.items():
@@ -357,7 +361,7 @@ class Sender:
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
         return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
 
-    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))
 

@@ -1,7 +1,7 @@
-"""Sequence numbers of one source: their order, their gaps, and the signs that a new sender counts from elsewhere.
+"""Sequence numbers of one source: their order, their gaps, and the signs that the sender was restarted.
 
-Laws: ``position`` is the sequence number unwrapped, so that it orders packets although the wire has only a few bits;
-after a reset positions start so far ahead that nothing earlier compares as near.
+Invariants: ``position`` is the unwrapped sequence number, so that it orders packets although the wire has only a few
+bits; after a reset positions start so far ahead that no earlier packet appears to be close.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from gr_ros2.wire.v0 import V0
 RECENT_PACKETS = 64
 """How far back a packet with the same number and bytes is a duplicate."""
 _REMEMBERED = 1 << V0.number_bits - 1
-"""How far back packets are remembered: half the numbers are read as steps back, further back nothing is met again."""
+"""How many packets are remembered: half the numbers are read as steps back, so an older packet cannot be recognised."""
 LATEST_S = 0.5
-"""How late, in seconds at the recent pace, a packet may come and still be one of this numbering."""
+"""How late, in seconds at the recent rate, a packet may come and still belong to this numbering."""
 EARLIEST_S = 2.0
-"""How early, in seconds at the recent pace, a packet may come and beyond doubt be one of this numbering."""
+"""How early, in seconds at the recent rate, a packet may come and certainly belong to this numbering."""
 NEAR = 16
-"""How far ahead a packet's number may be, in doubt, and still tell how many are missing: a sender that has restarted
-counts from anywhere, so seldom from so near."""
+"""How far ahead a packet's number may be to count the missing packets where a restart is possible: a restarted sender
+starts at any number, so rarely at one this close."""
 _RESET_JUMP = 4096
 
 
@@ -60,7 +60,7 @@ class Pace:
         self._seen.append((self._elapsed, self._count))
 
     def skip(self, now: float) -> None:
-        """The time since the last observation says nothing about the rate."""
+        """Exclude the time since the last observation from the rate."""
         self._now = now
 
     def duration(self, count: int) -> float:
@@ -75,7 +75,8 @@ class Pace:
 class Placed:
     """A packet's place: its arrival kind, its position, and how many packets are newly missing before it.
 
-    ``missing`` is None where that is not known: the sender may have restarted, or its numbers may have come round.
+    ``missing`` is None where the number is not known: the sender may have restarted, or its numbers may have wrapped
+    around.
     """
 
     arrival: Arrival
@@ -103,12 +104,12 @@ class SequenceTracker:
         if seen == data and newest - position < RECENT_PACKETS:
             return Placed(Arrival.DUPLICATE, position)
         elapsed = now - self._last_time
-        # Another packet under a number of the last few; a packet that would have been under way for longer than any
-        # link holds one back; or a silence in which the numbers may have come round.
+        # Another packet with a recent number; a packet that would have been delayed for longer than any link delays
+        # one; or a silence in which the numbers may have wrapped around.
         collision = seen is not None and seen != data and step != 0
         restart = collision or (step < 0 and LATEST_S < self._pace.duration(-step) < inf)
         silence = step != 1 and elapsed > self._pace.duration(RECENT_PACKETS)
-        early = self._pace.duration(step) - elapsed > EARLIEST_S  # so is all while the pace is not known
+        early = self._pace.duration(step) - elapsed > EARLIEST_S  # always true while the rate is not known
         known = not restart and (0 < step <= NEAR or not (silence or early))
         missing = step - 1 if known else None
         if restart or silence:

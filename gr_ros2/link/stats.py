@@ -1,6 +1,6 @@
 """What both halves of an end have counted since the start.
 
-Law: counters only grow, but for estimates of loss, which a packet that comes late takes back.
+Invariant: counters only grow, but for estimates of loss, which a packet that comes late takes back.
 """
 
 from __future__ import annotations

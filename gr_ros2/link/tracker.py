@@ -1,7 +1,8 @@
-"""Which delivery is of which message: what a sender reports joined with what comes out at the other end.
+"""Joins the events of a sender with the deliveries at the other end: which delivery belongs to which message.
 
-Laws: a message is found by its key where the engine's key still means it, otherwise by its bytes; a repeat is of the
-message that it repeats; what is closed is forgotten. Memory holds a digest of each open message, and no payload.
+Invariants: a message is found by its key while the engine's key still denotes it, otherwise by its bytes; a repeat
+counts for the message that it repeats; a closed message is forgotten. Memory holds a digest of each open message, and
+no payload.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ REPEATS = 4096
 
 
 def digest_of(payload: bytes) -> bytes:
-    """What stands for a message's bytes."""
+    """Digest of a message's bytes."""
     return blake2b(payload, digest_size=16).digest()
 
 
 @dataclass(slots=True, eq=False)
 class Tracked:
-    """A message whose fate is open.
+    """A message whose fate is not known yet.
 
-    :ivar digest: of what is to come out at the far end
+    :ivar digest: of the bytes that the other end should publish
     :ivar key: topic id and the engine's key, once its first fragment has left
     :ivar total: fragments, 0 while not known
     :ivar sent: fragments that have left
@@ -67,7 +68,7 @@ class Tracker(Generic[T]):
         self._most = most
         self._open: dict[int, T] = {}
         self._by_key: dict[tuple[int, Hashable], dict[int, T]] = {}
-        """A key may come round, so several may have had it; by serial, oldest first."""
+        """A key may be used again, so several messages may have had it; by serial, oldest first."""
         self._by_digest: dict[tuple[int, bytes], dict[int, T]] = {}
         self._repeats: OrderedDict[tuple[int, Hashable], int] = OrderedDict()
         """Topic id and key whose latest use was a repeat -> serial of the message repeated."""
@@ -92,7 +93,7 @@ class Tracker(Generic[T]):
             self.close(next(iter(self._open.values())))
 
     def left(self, entry: SentEntry) -> T | None:
-        """A fragment left the sender: of which open message, None where it is a repeat or of a message closed."""
+        """A fragment left the sender: returns its open message, None for a repeat or a closed message."""
         key = (entry.topic_id, entry.key)
         if entry.repeat:
             self._repeats[key] = entry.serial
@@ -116,11 +117,11 @@ class Tracker(Generic[T]):
         return list(self._by_key.get((topic_id, key), {}).values())
 
     def repeats(self, event: Delivered | Lost) -> bool:
-        """Whether an event is of a repeat."""
+        """Whether an event belongs to a repeat."""
         return (event.topic_id, event.key) in self._repeats
 
     def find(self, event: Delivered) -> T | None:
-        """The message that a delivery is of, None where it is of none that is open."""
+        """The open message of a delivery, None where there is none."""
         digest = digest_of(event.payload)
         for message in self._by_key.get((event.topic_id, event.key), {}).values():
             if message.digest == digest:
@@ -140,7 +141,7 @@ class Tracker(Generic[T]):
         return None if serial is None else self._open.get(serial)
 
     def close(self, message: T) -> None:
-        """What became of a message is known."""
+        """Close a message whose fate is known."""
         del self._open[message.serial]
         _take(self._by_digest, (message.topic_id, message.digest), message.serial)
         if message.key is not None:

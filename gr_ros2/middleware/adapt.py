@@ -1,6 +1,6 @@
-"""How a subscription adapts to the publishers found (DESIGN, QoS): what DDS matches, and when to join anew.
+"""How a subscription adapts to the publishers found (DESIGN, QoS): which QoS DDS matches, and when to join again.
 
-Law: pure bookkeeping over what discovery reports and what is received; nothing here knows a DDS, a thread or a clock.
+Invariant: this module only evaluates reports of discovery and received messages; it uses no DDS, thread or clock.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from dataclasses import replace
 from gr_ros2.middleware.base import Qos
 
 REPLAY_S = 2.0
-"""s after joining anew in which publishers may send once more what they keep for those who come late."""
+"""s after a subscription joined again in which publishers may repeat the messages that they keep for late joiners."""
 
 _REMEMBERED = 256
 
 
 def settle(asked: Qos, offered: Iterable[Qos]) -> Qos:
-    """The QoS of a subscription: as asked; where None, the strictest that every publisher offers."""
+    """The QoS of a subscription: as requested; where None, the strictest that every publisher offers."""
     offers = tuple(offered)
     reliable = all(offer.reliability == "reliable" for offer in offers)
     latched = all(offer.durability == "transient_local" for offer in offers)
@@ -30,12 +30,13 @@ def settle(asked: Qos, offered: Iterable[Qos]) -> Qos:
 
 
 def offered(qos: Qos) -> Qos:
-    """The QoS of a publisher: what is left open has its default."""
+    """The QoS of a publisher, with defaults where None."""
     return replace(qos, reliability=qos.reliability or "reliable", durability=qos.durability or "volatile")
 
 
 def refused_policies(offer: Qos, request: Qos) -> list[str]:
-    """Policies in which an offer falls short of a request; what a request leaves open adapts and never does."""
+    """Policies in which an offer does not satisfy a request; a policy that the request leaves open is always
+    satisfied."""
     refused = []
     if request.reliability == "reliable" and offer.reliability == "best_effort":
         refused.append("reliability")
@@ -52,12 +53,13 @@ def compatible(offer: Qos, request: Qos) -> bool:
 
 
 def agreed(offers: Sequence[Qos]) -> Qos:
-    """What the publishers of a topic say about its messages, all together.
+    """The combined QoS of all publishers of a topic.
 
-    History and deadline are of one publisher alone: its newest message replaces its own earlier ones, not those of
-    another. So with several the history is unbounded, there is no deadline, and the longest lifespan counts.
+    History and deadline apply to one publisher: its newest message replaces its own earlier ones, not those of another
+    publisher. So with several publishers the history is unbounded, there is no deadline, and the longest lifespan
+    counts.
 
-    :param offers: one at least
+    :param offers: at least one
     """
     if len(offers) == 1:
         return offers[0]
@@ -66,13 +68,13 @@ def agreed(offers: Sequence[Qos]) -> Qos:
 
 
 class Adaptation:
-    """Decides with which QoS a subscription is on the graph.
+    """Decides with which QoS a subscription joins the graph.
 
-    One that asks for everything is there from the start. One that adapts joins with the first publisher: before, there
-    is nothing to hear, and so it never meets a publisher with a QoS that this one does not offer. It joins anew only
-    when a publisher appears that calls for another QoS; departures alone are no reason to miss samples.
+    A subscription that requests every policy joins at once. A subscription that adapts joins when the first publisher
+    appears: before that there is nothing to receive, and so its QoS always fits that publisher. It joins again only
+    when a new publisher requires a different QoS; the departure of a publisher is no reason to risk a loss of samples.
 
-    :param asked: what the user wants, None = adapt
+    :param asked: the requested QoS, None = adapt
     """
 
     def __init__(self, asked: Qos) -> None:
@@ -86,13 +88,13 @@ class Adaptation:
         return self.asked.reliability is None or self.asked.durability is None
 
     def adapts(self, policy: str) -> bool:
-        """Whether this policy (``reliability``, ``durability``, …) is ours to adapt."""
+        """Whether this policy (``reliability``, ``durability``, …) adapts."""
         return getattr(self.asked, policy, policy) is None
 
     def consider(self, publishers: Mapping[bytes, Qos]) -> Qos | None:
-        """The QoS to join (anew) with, None to stay as it is.
+        """The QoS with which to join (again), None for no change.
 
-        :param publishers: what each publisher of the topic and type now on the graph offers, by its id
+        :param publishers: the offered QoS of each publisher of the topic and type that is on the graph now, by its id
         """
         appeared = publishers.keys() - self._seen
         self._seen = frozenset(publishers)
@@ -106,10 +108,10 @@ class Adaptation:
 
 
 class Replays:
-    """Tells messages that publishers send once more, since they keep them for those who come late and we joined anew.
+    """Recognises messages that publishers repeat for late joiners because the subscription joined again.
 
-    By content, for where nothing tells when a message was published, as in Humble's rclpy. Without this an old message
-    would come after newer ones.
+    It compares the content, for middlewares without a publication time, as in Humble's rclpy. Without this an old
+    message would be delivered after newer ones.
     """
 
     def __init__(self) -> None:
@@ -118,12 +120,12 @@ class Replays:
         self._until = 0.0
 
     def join(self, qos: Qos, now: float) -> None:
-        """What was received so far may come again, if we ask for the past."""
+        """Messages received so far may come again, if the subscription is transient-local."""
         self._expected = Counter(self._had if qos.durability == "transient_local" else ())
         self._until = now + REPLAY_S
 
     def has(self, payload: bytes, now: float) -> bool:
-        """Whether this is one; each message received is expected once more."""
+        """Whether this message is a repetition; each received message is expected once more."""
         key = hash(payload)
         if now < self._until and self._expected[key] > 0:
             self._expected[key] -= 1

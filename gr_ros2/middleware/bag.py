@@ -1,7 +1,7 @@
 """ROS 2 bags (MCAP and sqlite3) as a source and as a sink.
 
-Law: a bag being read is a finite graph of publishers: one thread plays the topics subscribed before ``start()`` in
-recorded order, held back by callbacks that block. A bag being written is a graph of one subscriber that takes all.
+Invariant: a bag being read is a finite graph of publishers: one thread plays the topics subscribed before ``start()``
+in recorded order, and a blocking callback delays it. A bag being written is a graph with one subscriber of all topics.
 """
 
 from __future__ import annotations
@@ -86,13 +86,13 @@ class BagMiddleware(Middleware):
     :param speed: times the recorded speed; 0 = as fast as the callbacks return
     :param mode: ``read`` or ``write``
     :param storage: of a bag being written: ``mcap`` or ``sqlite3``
-    :param definitions: ``.msg`` texts by type name, written into the bag; of other types ROS's
-    :param lossless: of a bag being written: publishing waits for a slow disk; else what it cannot take is counted as
-        ``not_recorded:/topic``
-    :param domain_id: a bag has no domain: taken, so that all back-ends can be asked alike, and not used; likewise
-        node_name and namespace
+    :param definitions: ``.msg`` texts by type name, written into the bag; other types have the definition of ROS
+    :param lossless: of a bag being written: publishing waits for a slow disk; otherwise messages that the disk cannot
+        take are dropped and counted as ``not_recorded:/topic``
+    :param domain_id: accepted but not used, because a bag has no domain, so that all back-ends have the same arguments;
+        likewise node_name and namespace
     :raises ConfigError: a setting is out of range
-    :raises BagError: missing, damaged, no bag; or exists already
+    :raises BagError: the file is missing, damaged or not a bag; or it exists already
     """
 
     name = "bag"
@@ -112,7 +112,7 @@ class BagMiddleware(Middleware):
     ) -> None:
         super().__init__()
         if not 0 <= speed < float("inf"):
-            raise ConfigError(f"speed = {speed!r}: a factor from 0 (as fast as it goes) up")
+            raise ConfigError(f"speed = {speed!r}: must be a factor of 0 (as fast as possible) or more")
         if mode not in ("read", "write"):
             raise ConfigError(f"mode = {mode!r}: read or write")
         self.path = Path(path)
@@ -143,7 +143,7 @@ class BagMiddleware(Middleware):
     ) -> BagSubscription:
         """See base; nothing can be subscribed after :meth:`start`.
 
-        :raises ConfigError: the bag has the topic with another type, or as one that cannot be carried
+        :raises ConfigError: the bag has the topic with another type, or the topic cannot be carried
         """
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
         self._reading(f"subscribe {topic}")
@@ -159,14 +159,14 @@ class BagMiddleware(Middleware):
         return subscription
 
     def discover(self) -> list[TopicInfo]:
-        """The topics of the bag that is read, with the QoS offered when it was recorded; none of one being written.
+        """The topics of the bag that is read, with the QoS offered when it was recorded; empty for a bag being written.
 
-        Those that cannot be carried are no part of it.
+        Topics that cannot be carried are left out.
         """
         return [topic.info for topic in self._contents.topics.values()]
 
     def start(self) -> None:
-        """Begin to play; the second call does nothing. A bag being written needs no start."""
+        """Start to play; the second call does nothing. A bag being written needs no start."""
         with self._starting:
             if self._recorder is None and self._thread is None and not self._stop.is_set():
                 self._thread = threading.Thread(target=self._run, name=f"bag-{self.path.name}", daemon=True)
@@ -179,7 +179,7 @@ class BagMiddleware(Middleware):
 
     @property
     def error(self) -> BagError | None:
-        """What ended playing or recording early, None while all is well."""
+        """The error that ended playing or recording early, None without one."""
         return self._error if self._recorder is None else self._recorder.error
 
     def _run(self) -> None:
@@ -208,7 +208,7 @@ class BagMiddleware(Middleware):
     # Writing
 
     def advertise(self, topic: str, type_name: str, qos: Qos) -> BagPublisher:
-        """See base. The definition of a type that ROS ships is written too; of others, what ``definitions`` has.
+        """See base. Also writes the definition of the type: from ``definitions``, or that of ROS.
 
         :raises ConfigError: the topic is being written with another type
         """

@@ -1,9 +1,9 @@
-"""What stands in a ROS 2 bag, MCAP or sqlite3: a folder with metadata.yaml, or a bare storage file.
+"""The content of a ROS 2 bag, MCAP or sqlite3: a folder with metadata.yaml, or a bare storage file.
 
-Laws: reading changes nothing, and whatever is wrong with a file is a BagError in one line that names it. The files say
-what is in a bag; metadata.yaml says which files, and what was expected in them. A topic is given whole, under its
-absolute name and with one type and definition, or it is left out with the reason; messages are counted, and fewer than
-the file's own index has are an error.
+Invariants: reading changes nothing, and every fault of a file is a BagError in one line that names the file. The
+content of a bag is taken from its files; metadata.yaml says which files there are, and what was expected in them. A
+topic is given completely, under its absolute name and with one type and definition, or it is left out with the reason;
+messages are counted, and fewer messages than in the file's own index are an error.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ class BagMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """One topic of a bag, with all that a copy of it has to repeat.
+    """One topic of a bag, with everything that a copy has to preserve.
 
     :param info: absolute name, type as ``package/msg/Type``, and what its publishers offered (reliable, volatile, 10
         where that is not recorded)
-    :param recorded_as: the name as it stands in the bag, which may be relative
-    :param definition: of the type, as it stands in the bag
+    :param recorded_as: the name in the bag, which may be relative
+    :param definition: definition of the type in the bag
     :param digest: RIHS01 hash of the type, '' = not recorded
     :param profiles: of all publishers, () = not recorded
     """
@@ -76,11 +76,11 @@ class RecordedTopic:
 
 @dataclass(frozen=True)
 class BagContents:
-    """What a bag has for a link.
+    """The topics of a bag that a link can carry.
 
     :param topics: by absolute name, in its order
-    :param left_out: why a topic is none of them, by absolute name
-    :param differences: where the counts of messages in metadata.yaml and in the files are not the same, a line each
+    :param left_out: why a topic is left out, by absolute name
+    :param differences: one line for each topic whose message counts in metadata.yaml and in the files differ
     """
 
     path: Path
@@ -90,7 +90,7 @@ class BagContents:
 
     @property
     def remarks(self) -> list[str]:
-        """What whoever uses this bag must not miss, one line each: often nothing."""
+        """Warnings for the user of this bag, one line each; often none."""
         return [*(f"{topic} is left out: {why}" for topic, why in self.left_out.items()), *self.differences]
 
     @property
@@ -100,7 +100,7 @@ class BagContents:
         return {name: text.data for name, text in found.items() if text.format is MessageDefinitionFormat.MSG}
 
     def check(self, topic: str, type_name: str) -> None:
-        """Whether messages of a topic can be taken for messages of that type; one that the bag has not can.
+        """Check that messages of a topic have that type; a topic that is not in the bag passes.
 
         :raises ConfigError: the topic is left out, or has another type
         """
@@ -113,7 +113,7 @@ class BagContents:
 
 @contextmanager
 def explained(path: Path, doing: str) -> Iterator[None]:
-    """Whatever goes wrong inside is a BagError that names the file."""
+    """Turn every error inside the ``with`` statement into a BagError that names the file."""
     try:
         yield
     except (MiddlewareError, ConfigError):
@@ -124,7 +124,7 @@ def explained(path: Path, doing: str) -> Iterator[None]:
 
 
 class _Folder(DirectoryReader):
-    """rosbags' reader of a folder, but for its search for topics exactly as metadata.yaml has them."""
+    """rosbags' reader of a folder, but without its requirement that the topics equal those of metadata.yaml."""
 
     STORAGE_PLUGINS = {"mcap": McapStorage, "sqlite3": SqliteStorage}  # noqa: RUF012
 
@@ -140,7 +140,7 @@ class _Folder(DirectoryReader):
 
 
 class _Bag(Reader):
-    """rosbags' reader, with storages that read what a file has and not what its index or metadata.yaml says."""
+    """rosbags' reader, with storages that read the content of a file instead of trusting its index or metadata.yaml."""
 
     STORAGE_PLUGINS = {"dir": _Folder, ".mcap": McapStorage, ".db3": SqliteStorage}  # noqa: RUF012
 
@@ -152,7 +152,7 @@ class _Bag(Reader):
 
     @property
     def expected(self) -> list[Connection]:
-        """The topics of metadata.yaml, none of a bare file."""
+        """The topics of metadata.yaml, empty for a bare file."""
         return self.storage.expected if isinstance(self.storage, _Folder) else []
 
 
@@ -194,7 +194,7 @@ def read_bag(path: str | Path, topics: Collection[str] | None = None) -> Iterato
         for topic, count in read.items():
             differs = f"bag {path}: {count} messages of {topic} were read, and its index counts {counted[topic]}"
             if count < counted[topic]:
-                raise BagError(f"{differs}: it is damaged; have its index made anew")
+                raise BagError(f"{differs}: it is damaged; rebuild its index (ros2 bag reindex)")
             if count > counted[topic]:
                 _log.warning(differs)
 
@@ -242,7 +242,7 @@ def _contents(path: Path, bag: _Bag) -> BagContents:
 
 
 def _kind(connection: Connection) -> str:
-    """Type as ``package/msg/Type``; one of another kind as it stands there."""
+    """Type as ``package/msg/Type``; a type of another kind unchanged."""
     try:
         return normalize_type(connection.msgtype)
     except ConfigError:
@@ -254,7 +254,7 @@ def _unfit(
 ) -> str:
     """Why a link cannot carry a topic, '' where it can.
 
-    :param definitions: of each type the one that counts, and the first topic that has it
+    :param definitions: by type, the definition that is used, and the first topic that has it
     """
     names = list(dict.fromkeys(c.topic for c in connections))
     kinds = list(dict.fromkeys(_kind(c) for c in connections))
@@ -271,7 +271,7 @@ def _unfit(
         return f"it is serialized as {' and '.join(map(repr, formats))}, and a link carries {_CDR!r}"
     (kind,) = kinds
     if "/srv/" in kind or "/action/" in kind:
-        return f"{kind} is of a service or an action, and a link carries messages"
+        return f"{kind} belongs to a service or an action, and a link carries only messages"
     if not _MESSAGE_TYPE.fullmatch(kind):
         return f"{kind!r} is no type of a ROS message"
     where, counts = definitions.get(kind, ("", _NO_DEFINITION))
@@ -302,7 +302,7 @@ def _recorded(
 
 
 def _united(files: Iterable[Sequence[Profile]]) -> list[Profile]:
-    """The profiles of the publishers of one topic: each file has those of its time, the same ones again and again."""
+    """The profiles of the publishers of one topic: each file repeats the profiles that existed at its time."""
     united: list[Profile] = []
     for profiles in files:
         had = list(united)
@@ -344,7 +344,7 @@ def _ext(connection: Connection) -> ConnectionExtRosbag2:
 
 
 def _offered(profile: Profile) -> Qos:
-    """A recorded profile in our terms; of a history that is not known the depth is the default, as on a graph."""
+    """A recorded profile as ``Qos``; an unknown history has the default depth, as on a graph."""
     return Qos(
         "best_effort" if profile.reliability is QosReliability.BEST_EFFORT else "reliable",
         "transient_local" if profile.durability is QosDurability.TRANSIENT_LOCAL else "volatile",

@@ -1,7 +1,8 @@
-"""MCAP as ROS 2 bags have it: written with both times of a message, read whatever its index has.
+"""MCAP files of ROS 2 bags: written with both times of a message, and read even if the index is incomplete.
 
-Laws: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags alone
-writes the first one into both. A message is read although no index leads to it; a schema in no language of ROS is none.
+Invariants: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags
+alone writes the first one into both. A message that is missing in the index is read too; a schema in a language that
+ROS does not use is ignored.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ _PUBLISH_TIME_AT = 1 + 8 + 2 + 4 + 8
 
 
 class _Schemas(dict[int, Schema]):
-    """Schemas by id; rosbags takes one in an unknown language (rosbag2's own is ``unknown``) for an error."""
+    """Schemas by id; rosbags raises an error for an unknown language (rosbag2 writes ``unknown``)."""
 
     def __setitem__(self, number: int, schema: Schema) -> None:
         super().__setitem__(number, schema if schema.encoding in _LANGUAGES else schema._replace(encoding="", data=""))
 
 
 class McapStorage(McapReader):
-    """rosbags' reader, also of files whose chunks have no message index; those it would pass over."""
+    """rosbags' reader, extended to files whose chunks have no message index, which rosbags would skip."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -37,7 +38,7 @@ class McapStorage(McapReader):
         """Open and read the index."""
         super().open()
         if any(not chunk.message_index_offsets for chunk in self.chunks):
-            self.chunks.clear()  # without chunks rosbags reads from the beginning to the end
+            self.chunks.clear()  # without a list of chunks rosbags reads the whole file
 
 
 class TwoTimes(McapWriter):

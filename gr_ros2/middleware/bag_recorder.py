@@ -1,8 +1,8 @@
 """Writes one ROS 2 bag.
 
-Laws: one thread owns the file (sqlite3 demands it), so that publishing waits for the disk, or leaves out a message and
-counts it, only when ``BACKLOG`` messages are behind; after an error nothing more is written, what comes is counted,
-and every call tells the error.
+Invariants: one thread owns the file (sqlite3 requires it), so that publishing waits for the disk, or drops and counts a
+message, only when ``BACKLOG`` messages are waiting; after an error nothing more is written, further messages are
+counted, and every call raises the error.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ BACKLOG = 10_000
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _METADATA_VERSION: Final = 8
-"""Of metadata.yaml; 9 spells QoS in a way that Humble's rosbag2 does not read."""
+"""Version of metadata.yaml; version 9 writes QoS in a form that Humble's rosbag2 does not read."""
 _FOREVER = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
 
 
 class BagChannel(NamedTuple):
-    """One topic of the file as one publisher offers it."""
+    """One topic of the file with the QoS of one publisher."""
 
     topic: str
     type_name: str
@@ -58,9 +58,10 @@ class BagRecorder:
 
     :param path: folder that does not exist yet
     :param storage: ``mcap`` or ``sqlite3``
-    :param definitions: ``.msg`` texts by type name; of other types ROS's
+    :param definitions: ``.msg`` texts by type name; other types have the definition of ROS
     :param count: ``Middleware.count``
-    :param lossless: publishing waits while ``BACKLOG`` messages are behind; else those that come then are counted
+    :param lossless: publishing waits while ``BACKLOG`` messages are waiting; otherwise further messages are dropped and
+        counted
     :raises ConfigError: no such storage
     :raises BagError: exists already, or cannot be made
     """
@@ -103,7 +104,7 @@ class BagRecorder:
         return self._closed
 
     def channel(self, topic: str, type_name: str, qos: Qos) -> BagChannel:
-        """Where messages of a topic go; the same for the same arguments.
+        """The channel of a topic; the same for the same arguments.
 
         :raises ConfigError: the topic is being written with another type
         """
@@ -112,7 +113,7 @@ class BagRecorder:
         )
 
     def copy(self, topic: RecordedTopic) -> BagChannel:
-        """Where messages of a topic of another bag go, which is named, defined and offered here as it is there.
+        """The channel for a topic of another bag, with the same name, definition and offered QoS as there.
 
         :raises ConfigError: the topic is being written with another type
         """

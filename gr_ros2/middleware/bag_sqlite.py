@@ -1,7 +1,7 @@
-"""The sqlite3 files of ROS 2 bags, of all versions of their schema, and as a crash leaves them.
+"""The sqlite3 files of ROS 2 bags, in all versions of their schema, and also after a crash.
 
-Laws: reading changes nothing, neither the file nor its folder; what SQLite keeps beside the file (the write-ahead log
-of a writer that never closed) is part of it, and where it cannot be taken into account the file is refused.
+Invariants: reading changes nothing, neither the file nor its folder; the files that SQLite keeps next to the database
+(the write-ahead log of a writer that never closed) belong to it, and a database is refused where they cannot be used.
 Sources: https://www.sqlite.org/wal.html, sections 5 and 8 (read-only databases, heap memory instead of a -shm file);
 https://www.sqlite.org/lockingv3.html, section 4.2 (hot journals).
 """
@@ -20,7 +20,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from gr_ros2.errors import BagError
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
-"""By rosbag2's name; what is not here, such as its ``unknown``, is no definition."""
+"""By rosbag2's name; other names, such as its ``unknown``, mean that there is no definition."""
 
 
 class SqliteStorage(Sqlite3Reader):
@@ -29,7 +29,7 @@ class SqliteStorage(Sqlite3Reader):
     def open(self) -> None:
         """Open and read which topics there are.
 
-        :raises BagError: for a write that was broken off, or no bag
+        :raises BagError: for an incomplete write, or a file that is not a bag
         """
         path = Path(str(self.path))
         self.dbconn = _connect(path)
@@ -73,7 +73,7 @@ class SqliteStorage(Sqlite3Reader):
 
 
 def _definition(rows: list[tuple[Any, ...]], type_name: str, type_hash: str) -> MessageDefinition:
-    """The text of a type; where the file has several, as of bags that were joined, the hash tells which."""
+    """The text of a type; where the file has several (merged bags), the one with the right hash."""
     for name, encoding, text, digest in rows:
         if name == type_name and encoding in _FORMATS and (digest == type_hash or not (digest and type_hash)):
             return MessageDefinition(_FORMATS[encoding], text)
@@ -87,10 +87,10 @@ def _rows(database: apsw.Connection, query: str) -> list[tuple[Any, ...]]:
 def _connect(path: Path) -> apsw.Connection:
     flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
     place = f"file:{quote(str(path))}"
-    # Of an empty database SQLite would remove what is beside it.
+    # For an empty database SQLite would remove the files next to it.
     if not (path.stat().st_size and any(_has_bytes(path, suffix) for suffix in ("-wal", "-journal"))):
         return apsw.Connection(f"{place}?immutable=1", flags=flags)
-    # Without locks, and with the index of the log in memory, SQLite makes no file beside it.
+    # Without locks, and with the index of the log in memory, SQLite makes no further file.
     database = apsw.Connection(f"{place}?mode=ro&vfs=unix-none", flags=flags)
     database.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
     database.execute("PRAGMA locking_mode = EXCLUSIVE")

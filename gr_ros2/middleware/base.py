@@ -1,9 +1,8 @@
-"""The one interface between the adapter and any ROS graph: serialized bytes in, serialized bytes out.
+"""The interface between the adapter and any ROS graph: serialized bytes in, serialized bytes out.
 
-Laws: payloads are whole CDR messages including the 4-byte encapsulation header and are never looked into;
-callbacks run in a thread of the back-end and must not block it for long, except that a back-end which plays
-recorded data at link speed is meant to be held back by a blocking callback; ``close`` is idempotent, and no
-callback runs after it has returned.
+Invariants: payloads are whole CDR messages including the 4-byte encapsulation header and are never parsed here;
+callbacks run in a thread of the back-end and must not block it for long, except that a blocking callback slows down a
+back-end which plays recorded data at link speed; ``close`` is idempotent, and no callback runs after it has returned.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ MessageCallback = Callable[[bytes], None]
 JOIN_S = 1.0
 """s that closing waits for a callback to return."""
 FOR_EVER_S = 1e9
-"""A duration from which on it is none: what stands for "infinite" differs between DDS, rclpy and bags."""
+"""A duration of this many seconds or more means no limit: DDS, rclpy and bags write "infinite" differently."""
 
 _log = logging.getLogger(__name__)
 
@@ -35,10 +34,10 @@ class Qos:
     :param reliability: None adapts a subscription to the publishers found (reliable only if all offer it);
         a publisher with None is reliable
     :param durability: None adapts likewise; a publisher with None is volatile
-    :param depth: history depth in messages, 0 = unbounded (KeepAll); of a publisher found whose discovery data does
-        not tell it, the default
-    :param lifespan_s: of a publisher: s after which a message of it is of no use to anybody, 0 = for ever
-    :param deadline_s: s within which a publisher promises the next message, or a subscription asks for it, 0 = not
+    :param depth: history depth in messages, 0 = unbounded (KeepAll); the default for a publisher whose discovery data
+        does not contain it
+    :param lifespan_s: of a publisher: s after which its messages are useless, 0 = no limit
+    :param deadline_s: s within which a publisher promises the next message, or a subscription requests it, 0 = none
     """
 
     reliability: Reliability | None = None
@@ -52,13 +51,13 @@ OffersCallback = Callable[[Sequence[Qos]], None]
 
 
 def finite(seconds: float) -> float:
-    """A duration of a graph as a Qos has it: 0 where it is none, or longer than ``FOR_EVER_S``."""
+    """A duration in the form of ``Qos``: 0 where there is no limit, or one longer than ``FOR_EVER_S``."""
     return seconds if 0 < seconds < FOR_EVER_S else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """One topic as discovery sees it, without our own endpoints.
+    """One topic found by discovery, without the endpoints of this participant.
 
     :param topic: absolute name with leading slash
     :param type_name: ``package/msg/Type``
@@ -85,7 +84,7 @@ def grouped(publishers: Iterable[tuple[str, str, Qos]], subscribers: Iterable[tu
 
 
 class Publisher(ABC):
-    """A topic we publish on."""
+    """A publisher of this participant."""
 
     @abstractmethod
     def publish(self, payload: bytes) -> None:
@@ -100,9 +99,9 @@ class Publisher(ABC):
 
 
 class Subscription(ABC):
-    """A topic we listen to.
+    """A subscription of this participant.
 
-    :ivar lost: messages published on it that were lost before they reached the callback, as far as the graph tells
+    :ivar lost: messages that were lost before they reached the callback, as far as the graph reports them
     :ivar calling: for back-ends: held while calling back
     """
 
@@ -117,7 +116,7 @@ class Subscription(ABC):
         """Number of publishers currently matched."""
 
     def follow(self, on_offers: OffersCallback) -> None:
-        """Call ``on_offers`` with what the publishers found offer, now and whenever that has changed.
+        """Call ``on_offers`` with the QoS of the publishers found, now and whenever it has changed.
 
         It runs in the thread of the caller or of the back-end; without any publisher it is not called.
         """
@@ -131,14 +130,14 @@ class Subscription(ABC):
     # For back-ends
 
     def found(self, offers: Sequence[Qos]) -> None:
-        """Let those who follow hear what the publishers found offer now, if that has changed."""
+        """Tell the followers the QoS of the publishers found, if it has changed."""
         with self.calling:
             if list(offers) != self._offers:
                 self._offers = list(offers)
                 self._tell()
 
     def wait_for_callback(self) -> None:
-        """A callback in progress ends first, unless it is the one that closes or takes longer than we may wait."""
+        """Wait until a callback in progress ends, unless this call comes from it or the wait takes too long."""
         if self.calling.acquire(timeout=JOIN_S):
             self.calling.release()
 
@@ -148,12 +147,12 @@ class Subscription(ABC):
 
 
 class Middleware(ABC):
-    """One participant of a ROS graph (or of something that stands in for it).
+    """One participant of a ROS graph (or of a substitute for one).
 
     ``counters`` names what went wrong, for statistics: ``samples_lost:/topic``, ``incompatible_qos:/topic:policy``,
     ``incompatible_type:/topic`` and ``callback_failed:/topic``. The first of each is also logged.
 
-    :ivar domain_id: of its graph; None of one that nobody else can be on, such as a file
+    :ivar domain_id: of its graph; None for a graph that nobody else can join, such as a file
     """
 
     name: ClassVar[str]
@@ -173,10 +172,10 @@ class Middleware(ABC):
 
     @abstractmethod
     def discover(self) -> list[TopicInfo]:
-        """The topics of the graph other than our own endpoints, sorted by name."""
+        """The topics of the graph without the endpoints of this participant, sorted by name."""
 
     def start(self) -> None:  # noqa: B027 - most back-ends deliver from subscribe() on
-        """Begin to deliver. Only finite sources (bags) wait for this; others deliver from subscribe() on."""
+        """Start to deliver. Only finite sources (bags) wait for this call; others deliver from subscribe() on."""
 
     @property
     def finished(self) -> bool:
@@ -195,18 +194,18 @@ class Middleware(ABC):
             _log.log(level, "%s (counted as %s, not logged again)", text, key)
 
     def count_once(self, key: str, text: str) -> None:
-        """Count what lasts, such as endpoints that do not fit, the first time only."""
+        """Count a lasting condition, such as incompatible endpoints, only the first time."""
         if key not in self.counters:
             self.count(key, text)
 
     def count_lost(self, subscription: Subscription, topic: str, text: str, n: int = 1) -> None:
-        """Count messages that a subscription was to hear and will not, from any thread."""
+        """Count messages that a subscription will not receive, from any thread."""
         self.count(f"samples_lost:{topic}", text, n)
         with self._counting:
             subscription.lost += n
 
     def deliver(self, topic: str, callback: MessageCallback, payload: bytes) -> None:
-        """Call back with one message; a callback that raises is counted and logged, and the thread lives on."""
+        """Call back with one message; an exception of the callback is counted and logged, and the thread goes on."""
         try:
             callback(payload)
         except Exception as error:  # noqa: BLE001 - user code: whatever it raises must not stop the other topics

@@ -1,11 +1,12 @@
-"""The one module that knows the symbols of the DDS library: whole CDR messages in and out, no message definition.
+"""The only module that uses the symbols of the DDS library: whole CDR messages in and out, no message definition.
 
 A topic is declared with a descriptor of one octet. The library keeps what follows that octet untouched, so any
 type passes as opaque bytes, under whatever type name the topic carries. Most functions used are the library's
 documented C API (dds.h); those of the serdata family are not, and the layouts here are those of version 11.0.
 
-Laws: entities are plain integers and every function may be called from any thread; calls release the GIL; whatever
-the library refuses is a DdsError that names call and code. An entity deleted elsewhere makes calls fail, never crash.
+Invariants: entities are plain integers and every function may be called from any thread; calls release the GIL; every
+error of the library is a DdsError that names call and code. Calls with an entity that another thread has deleted fail,
+but never crash.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from gr_ros2.middleware import dds_library
 from gr_ros2.middleware.base import Qos, finite
 
 Entity = int
-"""Handle of anything the library made."""
+"""Handle of an object of the library."""
 
 BATCH = 64
 """Samples taken from a reader in one call."""
@@ -37,8 +38,8 @@ _BLOCK_NS = 1_000_000_000
 _OFFERED_INCOMPATIBLE, _REQUESTED_INCOMPATIBLE, _SAMPLE_LOST = 1 << 3, 1 << 4, 1 << 5
 
 _TELLS_HISTORY = bytes((1, 16))
-"""Vendor id of Cyclone DDS. History is no part of a publisher's discovery data in the standard (Fast DDS leaves it out
-and so would seem to be KeepLast 1); Cyclone DDS sends it."""
+"""Vendor id of Cyclone DDS. In the standard, history is not part of a publisher's discovery data (Fast DDS does not
+send it, and would be read as KeepLast 1); Cyclone DDS sends it."""
 
 _POLICIES = {
     2: "durability",
@@ -131,7 +132,7 @@ class _BuiltinEndpoint(c.Structure):
 
 
 class _Status(c.Structure):
-    """The head shared by all status structures; what follows depends on the kind."""
+    """The first fields of all status structures; the rest depends on the kind."""
 
     _fields_ = [
         ("total", c.c_uint32),
@@ -221,7 +222,7 @@ def _checked(code: int, what: str) -> int:
 
 
 def create_domain(domain_id: int, configuration: str) -> Entity:
-    """A domain configured by XML; fails where this process has the domain open already."""
+    """Open a domain configured by XML; fails where this process has the domain open already."""
     return _checked(_create_domain(domain_id, configuration.encode()), f"open domain {domain_id}")
 
 
@@ -240,19 +241,19 @@ def create_participant(domain_id: int, user_data: bytes) -> Entity:
 
 
 def create_topic(participant: Entity, name: str, type_name: str) -> Entity:
-    """A topic of opaque messages: names as DDS sees them, XCDR1 only, no type information announced."""
+    """A topic of opaque messages: names as on DDS, XCDR1 only, no type information announced."""
     descriptor = _Descriptor(1, 1, 1 << 7, 0, type_name.encode(), None, 3, _OCTET, b"", _Serialized(), _Serialized(), 1)
     code = _create_topic(participant, c.byref(descriptor), name.encode(), None, None)
     return _checked(code, f"declare topic {name} of type {type_name}")
 
 
 def delete(entity: Entity) -> None:
-    """Delete an entity and what it contains; one that is gone already is no error."""
+    """Delete an entity and its children; an entity that is deleted already is not an error."""
     _delete(entity)
 
 
 def guid(entity: Entity) -> bytes:
-    """The 16 bytes under which others know a participant, reader or writer."""
+    """The 16-byte GUID of a participant, reader or writer."""
     data = c.create_string_buffer(16)
     _checked(_get_guid(entity, data), "ask for a GUID")
     return data.raw
@@ -266,7 +267,7 @@ def _make_qos(qos: Qos, user_data: bytes) -> int:
     _set_history(pointer, *history)
     _set_limits(pointer, -1, -1, -1)
     _set_durability_service(pointer, 0, *history, -1, -1, -1)
-    _set_lifecycle(pointer, False)  # a publisher that leaves does not dispose what it published
+    _set_lifecycle(pointer, False)  # a publisher that leaves does not dispose its published messages
     _set_representation(pointer, 1, c.byref(c.c_int16(0)))
     if qos.lifespan_s:
         _set_lifespan(pointer, int(qos.lifespan_s * 1e9))
@@ -278,7 +279,7 @@ def _make_qos(qos: Qos, user_data: bytes) -> int:
 
 
 def _read_qos(pointer: int, key: bytes) -> Qos:
-    """The QoS of the endpoint with that GUID, which begins with the vendor of its DDS."""
+    """The QoS of the endpoint with that GUID, whose first bytes are the vendor id of its DDS."""
     kind, depth, nanoseconds = c.c_int(0), _i32(1), _i64(0)
     _get_reliability(pointer, c.byref(kind), c.byref(nanoseconds))
     reliable = kind.value == 1
@@ -310,7 +311,7 @@ def _read_user_data(pointer: int) -> bytes:
 
 
 class _Endpoint:
-    """What readers and writers have in common. ``incompatible`` and ``matched`` ask the library."""
+    """Common part of readers and writers. ``incompatible`` and ``matched`` ask the library."""
 
     _matched_status = ""
     _incompatible_status = ""
@@ -329,7 +330,7 @@ class _Endpoint:
         return int(self._get(self._matched_status).third)
 
     def incompatible(self) -> tuple[int, str]:
-        """Endpoints refused since last asked for incompatible QoS, and the policy of the last."""
+        """Number of endpoints refused for incompatible QoS since the last call, and the policy of the last one."""
         value = self._get(self._incompatible_status)
         return int(value.change), _POLICIES.get(value.third, f"policy_{value.third}")
 
@@ -346,7 +347,7 @@ class Sample(NamedTuple):
 
 
 class RawReader(_Endpoint):
-    """Takes whole messages. Not to be used by two threads at once."""
+    """Takes whole messages. Only one thread may use it at a time."""
 
     _matched_status = "subscription_matched"
     _incompatible_status = "requested_incompatible_qos"
@@ -383,10 +384,10 @@ class RawReader(_Endpoint):
         return messages
 
     def lost(self) -> int:
-        """Samples the library says it lost since last asked.
+        """Samples that the library reports as lost since the last call.
 
-        It tells of those that came too late for the order, not of gaps in what a best-effort publisher sent
-        (upstream says so, and 11.0.1 was seen to).
+        It reports samples that came too late for the order, but not gaps of a best-effort publisher (documented by
+        Cyclone DDS, and observed with 11.0.1).
         """
         return int(self._get("sample_lost").change)
 
@@ -409,10 +410,10 @@ class RawWriter(_Endpoint):
         self._sertype = sertype
 
     def write(self, payload: bytes) -> None:
-        """Send one message, zero-padded to a multiple of 4 (the library would pad with what lies in memory).
+        """Send one message, zero-padded to a multiple of 4 (the library would pad with uninitialised memory).
 
-        :raises MiddlewareError: no CDR
-        :raises DdsError: gone, or not taken within a second by a subscriber that must get it
+        :raises MiddlewareError: not a CDR message
+        :raises DdsError: the writer is deleted, or a reliable subscriber did not take the message within a second
         """
         payload = payload.ljust((len(payload) + 3) // 4 * 4, b"\0")
         serdata = None
@@ -421,13 +422,13 @@ class RawWriter(_Endpoint):
             serdata = _serdata_from(self._sertype, _KEY_OR_DATA, 1, c.byref(buffer), len(payload))
         if not serdata:
             head = payload[:4].hex(" ")
-            raise MiddlewareError(f"message of {len(payload)} bytes, {head} …, is no CDR; not published")
+            raise MiddlewareError(f"message of {len(payload)} bytes, {head} …, is not CDR; not published")
         _checked(_writecdr(self.entity, serdata), "publish")
 
 
 @dataclass(frozen=True)
 class DiscoveredEndpoint:
-    """A publisher or subscriber of the graph, names as DDS sees them."""
+    """A publisher or subscriber of the graph, with names as on DDS."""
 
     key: bytes
     participant: bytes
@@ -438,7 +439,7 @@ class DiscoveredEndpoint:
 
 
 class EndpointWatch:
-    """Discovery of publishers or subscribers, our own included."""
+    """Discovery of publishers or subscribers, those of this participant included."""
 
     def __init__(self, participant: Entity, *, publishers: bool) -> None:
         topic = _PUBLICATIONS if publishers else _SUBSCRIPTIONS
@@ -446,7 +447,7 @@ class EndpointWatch:
         self.condition: Entity = _checked(_create_readcondition(self.entity, _ANY_STATE), "create a condition")
 
     def take(self) -> list[tuple[bytes, DiscoveredEndpoint | None]]:
-        """What changed: key and endpoint, None where it left."""
+        """The changes: key and endpoint, None where it left."""
         samples, infos = (c.c_void_p * BATCH)(), (_SampleInfo * BATCH)()
         taken = _checked(_take(self.entity, samples, infos, BATCH, BATCH), "take discovery")
         changes: list[tuple[bytes, DiscoveredEndpoint | None]] = []
@@ -466,7 +467,7 @@ class EndpointWatch:
 
 
 class WaitSet:
-    """One thread waits for many entities; each is attached with a number that names it when it triggers."""
+    """One thread waits for many entities; each is attached with a number that identifies it when it triggers."""
 
     _CAPACITY = 256
 
@@ -481,7 +482,8 @@ class WaitSet:
         _checked(_waitset_attach(self._waitset, entity, number), "attach to a waitset")
 
     def wait(self, timeout: float | None) -> set[int]:
-        """Numbers of what triggered; empty after ``timeout`` s or :meth:`wake`. None waits for ever."""
+        """Numbers of the entities that triggered; empty after ``timeout`` s or :meth:`wake`. None waits without
+        limit."""
         limit = _INFINITY if timeout is None else int(timeout * 1e9)
         found = _checked(_waitset_wait(self._waitset, self._triggered, self._CAPACITY, limit), "wait")
         numbers = set(self._triggered[: min(found, self._CAPACITY)])

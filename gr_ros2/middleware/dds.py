@@ -1,7 +1,7 @@
-"""The embedded middleware: a DDS participant of our own, visible to and usable by ROS 2 nodes, without a ROS install.
+"""The embedded middleware: a DDS participant that ROS 2 nodes see and communicate with, without a ROS installation.
 
-Laws: one thread per participant receives, discovers and calls back; its tables are guarded by one lock, never held
-while calling back or waiting.
+Invariants: one thread per participant receives, discovers and calls back; one lock protects its tables, and is never
+held during a callback or a wait.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class DdsMiddleware(DdsParticipant):
     :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
     :param node_name: as ``ros2 node list`` shows it
     :param namespace: of the node
-    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY. Where neither says so,
-        ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS count
-    :raises ConfigError: a name, number or environment variable is malformed, or the domain is open otherwise
+    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY. Where both are unset,
+        ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS apply
+    :raises ConfigError: a name, number or environment variable is malformed, or the domain is open with other options
     :raises MiddlewareError: the domain cannot be joined
     """
 
@@ -68,7 +68,7 @@ class DdsMiddleware(DdsParticipant):
         self._gid_bytes = ros_graph.gid_size(os.environ)
         self._closed = False
         self._closing = threading.Lock()
-        self._lock = threading.Lock()  # the tables below; held for moments only, never while calling back
+        self._lock = threading.Lock()  # for the tables below; held only briefly, never during a callback
         self._announcing = threading.Lock()
         self._topics: dict[tuple[str, str], Entity] = {}
         self._services: dict[int, Callable[[], object]] = {}
@@ -147,7 +147,7 @@ class DdsMiddleware(DdsParticipant):
             self.wait_for_thread(self._thread)
             POOL.leave(self.domain_id, self._participant)
 
-    # What publishers and subscriptions ask of their participant.
+    # Methods for publishers and subscriptions.
 
     def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:
         topic = self._topic(subscription.topic, subscription.type_name)
@@ -201,7 +201,7 @@ class DdsMiddleware(DdsParticipant):
                 if not self._closed:
                     _log.error("domain %d: no message will be received any more: %s", self.domain_id, error)
                 return
-            for number in sorted(triggered):  # the watches first: what publishers offer is known before what they say
+            for number in sorted(triggered):  # discovery first, so that a publisher's QoS is known before its messages
                 self._guarded(partial(self._service, number))
             with self._lock:
                 outdated = [subscription for subscription in self._subscriptions if subscription.outdated]
@@ -221,7 +221,7 @@ class DdsMiddleware(DdsParticipant):
             service()
 
     def _guarded(self, step: Callable[[], object]) -> None:
-        """An endpoint that another thread closed between trigger and service fails here: that is its normal end."""
+        """Run a step that fails if another thread closed the endpoint after it triggered; that is a normal end."""
         try:
             step()
         except DdsError as error:
@@ -252,7 +252,7 @@ class DdsMiddleware(DdsParticipant):
         return any(ros_graph.has_short_gids(endpoint.topic, endpoint.user_data) for endpoint in everyone)
 
     def _offers(self, topic: str, type_name: str) -> list[Qos]:
-        """What the publishers of a topic offer; those of another type are counted and left out."""
+        """The QoS of the publishers of a topic; publishers of another type are counted and left out."""
         with self._lock:
             all_of_topic = [e for e in self._found[_PUBLICATIONS].values() if e.topic == ros_graph.dds_topic(topic)]
         ours = ros_graph.dds_type(type_name)
@@ -262,7 +262,7 @@ class DdsMiddleware(DdsParticipant):
         return [e.qos for e in all_of_topic if e.type_name == ours]
 
     def _foreign(self, endpoints: Iterable[DiscoveredEndpoint]) -> Iterator[tuple[str, str, Qos]]:
-        """Topic, type and QoS of those of other participants that are ROS topics."""
+        """Topic, type and QoS of the endpoints of other participants that belong to ROS topics."""
         for endpoint in endpoints:
             topic = ros_graph.ros_topic(endpoint.topic)
             if topic is not None and endpoint.participant != self._guid:
@@ -283,7 +283,7 @@ class DdsMiddleware(DdsParticipant):
             return entity
 
     def _user_data(self, type_name: str) -> bytes:
-        """What an endpoint of ours says: the hash that others on the graph give the type, else that of ROS."""
+        """User data of an endpoint: the type hash that other endpoints on the graph announce, otherwise that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
         name = ros_graph.dds_type(type_name)

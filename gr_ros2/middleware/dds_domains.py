@@ -1,8 +1,8 @@
-"""Which DDS domains this process has open, and whom they look for.
+"""The DDS domains that this process has open, and the range of their discovery.
 
-Law: a domain is configured once, by whoever opens it first, and is shared by all participants of the process; one
-that would need another configuration is refused instead of silently leaving or not leaving the machine.
-Source of what the discovery ranges mean: rmw_cyclonedds and rcl of Jazzy.
+Invariant: a domain is configured once, by the participant that opens it first, and is shared by all participants of the
+process; a participant that needs another configuration is refused, so that its messages never leave the machine against
+its settings. Source of the meaning of the discovery ranges: rmw_cyclonedds and rcl of Jazzy.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ _LOOPBACK = '<NetworkInterface address="127.0.0.1"/>'
 _UNICAST_ONLY = '<NetworkInterface autodetermine="true" multicast="false" priority="3"/>'
 """Cyclone DDS looks for peers through the interface of the highest priority only; the loopback interface has 2."""
 _OFTEN = "<SPDPInterval>250ms</SPDPInterval>"
-"""A node on another interface is heard by nobody on the loopback interface: it finds us when we announce ourselves, and
-not the other way round. Cyclone DDS does so every 8 s by itself. On the loopback interface often costs nothing."""
+"""A node on another interface is not received on the loopback interface; it finds this participant when this
+participant announces itself. Cyclone DDS does that every 8 s by default. On the loopback interface a short interval
+costs nothing."""
 _ASK_AGAIN = "<SPDPInterval>2s</SPDPInterval>"
 _NEVER_FORGET = 'PruneDelay="inf"'
 """By itself Cyclone DDS 11 asks a peer in the first moment and drops its address after 30 s, before it would ask again.
@@ -30,14 +31,14 @@ A peer that starts a second later would never be found. Asking is a packet of 0.
 
 
 def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
-    """The XML of a domain, followed by CYCLONEDDS_URI, which so has the last word; '' = the library's own way."""
+    """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence; '' = the library's default."""
     if options.range == "SYSTEM_DEFAULT":
         return ""
     peers = "".join(f"<Peer Address={quoteattr(peer)} {_NEVER_FORGET}/>" for peer in options.peers)
     interval = _ASK_AGAIN if peers else ""
     if options.range == "OFF":
         general = "<AllowMulticast>false</AllowMulticast>"
-        # Only participants with the same tag find each other.
+        # Only participants with an equal tag find each other.
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>gr_ros2_discovery_off_{os.getpid()}</Tag>"
     elif options.range == "LOCALHOST":
         # Multicast stays on: without it Fast DDS may never match. Peers need another interface, without multicast.
@@ -47,7 +48,7 @@ def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os
         peers = f'<Peer Address="127.0.0.1"/>{peers}'
     else:
         general = "<AllowMulticast>spdp</AllowMulticast>"
-        discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # gives the ports at which peers look for us
+        discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # sets the ports at which peers look for us
     discovery += f"{interval}<Peers>{peers}</Peers>"
     domain = f'<Domain Id="any"><General>{general}</General><Discovery>{discovery}</Discovery></Domain>'
     return f"<CycloneDDS>{domain}</CycloneDDS>,{environment.get('CYCLONEDDS_URI', '')}"
@@ -61,14 +62,14 @@ class _Domain:
 
 
 class DomainPool:
-    """Opens domains when the first of our participants joins, closes them after the last has left."""
+    """Opens a domain when the first participant of this process joins, and closes it after the last one has left."""
 
     def __init__(self) -> None:
         self._domains: dict[int, _Domain] = {}
         self._lock = threading.Lock()
 
     def join(self, domain_id: int, options: DiscoveryOptions, user_data: bytes) -> cdr_dds.Entity:
-        """A new participant.
+        """Create a participant.
 
         :raises ConfigError: the domain is open in this process with other options
         :raises DdsError: it cannot be opened
@@ -90,7 +91,7 @@ class DomainPool:
             return participant
 
     def leave(self, domain_id: int, participant: cdr_dds.Entity) -> None:
-        """Delete a participant with all it contains."""
+        """Delete a participant with all its entities."""
         cdr_dds.delete(participant)
         with self._lock:
             self._domains[domain_id].members -= 1
@@ -105,14 +106,14 @@ class DomainPool:
                 f"{options} needs it opened here first, or another domain"
             )
         if others or not xml:
-            return _Domain(options, None)  # open already, or to be opened by the first participant
+            return _Domain(options, None)  # open already, or opened by the first participant
         return _Domain(options, cdr_dds.create_domain(domain_id, xml))
 
     def _close_unused(self, domain_id: int) -> None:
         domain = self._domains[domain_id]
         if domain.members:
             return
-        # Deleting a domain deletes every participant in it, and other code may have joined the one we opened.
+        # Deleting a domain deletes every participant in it, and other code of this process may have joined it.
         if domain.entity is not None and cdr_dds.participants_in(domain_id):
             return
         del self._domains[domain_id]

@@ -1,9 +1,9 @@
 """Publishers and subscriptions of the embedded DDS.
 
-Laws: a subscription whose reliability or durability is left open asks only for what all publishers found offer, and
-changes readers when that changes: the old reader stays for ``OVERLAP_S`` while the new one is being found, what both
-receive is delivered once, and never a message after a later one of its publisher. A subscription's lock is taken before
-its participant's, never after.
+Invariants: a subscription whose reliability or durability is left open requests only what all publishers found offer,
+and changes readers when that changes: the old reader stays for ``OVERLAP_S`` while publishers discover the new one; a
+message that both receive is delivered once, and never after a later message of its publisher. A subscription's lock is
+taken before its participant's, never after.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos,
 from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter, Sample
 
 OVERLAP_S = 2.0
-"""s an outdated reader stays beside its successor: Fast DDS may take a second to send to a new reader."""
+"""s that an outdated reader stays in parallel to its successor: Fast DDS may take a second to send to a new reader."""
 SLACK = 256
-"""Messages a volatile reader holds beyond its depth: a DDS drops in silence what exceeds a history, so the subscription
-cuts to its depth itself, and counts. A transient-local reader has its depth and no more, else it would get more of the
-past than was asked for; what such a one drops is not counted."""
+"""Messages that a volatile reader holds beyond its depth: DDS silently drops messages that exceed the history, so the
+subscription limits the depth itself, and counts. A transient-local reader has exactly its depth, because it would
+otherwise get more old messages than requested; its drops are not counted."""
 
 _SEEN_PER_PUBLISHER = 256
 _SEEN_PUBLISHERS = 64
 _LEAST = Qos("best_effort", "volatile")
-"""Asks for the least, and so is matched by every publisher."""
+"""The weakest request, which every publisher matches."""
 
 _log = logging.getLogger(__name__)
 
 
 class DdsParticipant(Middleware):
-    """What the endpoints ask of their participant."""
+    """The interface of a participant for its endpoints."""
 
     @property
     @abstractmethod
@@ -50,17 +50,17 @@ class DdsParticipant(Middleware):
 
     @abstractmethod
     def forget(self, endpoint: DdsSubscription | DdsPublisher) -> None:
-        """Take a closed endpoint off the graph."""
+        """Remove a closed endpoint from the graph."""
 
     @abstractmethod
     def announce(self) -> None:
-        """Tell the graph which endpoints belong to our node."""
+        """Announce to the graph which endpoints belong to this node."""
 
     def count_incompatible(self, topic: str, refused: tuple[int, str], ignored: Iterable[str]) -> None:
-        """Count endpoints that refused ours, by the policy that does not fit, unless that is one of ``ignored``."""
+        """Count endpoints with incompatible QoS by policy, except for policies in ``ignored``."""
         amount, policy = refused
         if amount > 0 and policy not in ignored:
-            text = f"{topic}: another endpoint does not match, its {policy} does not fit ours"
+            text = f"{topic}: another endpoint does not match, its {policy} is incompatible with this one's"
             self.count(f"incompatible_qos:{topic}:{policy}", text, amount)
 
 
@@ -74,9 +74,9 @@ class DdsPublisher(Publisher):
         self._closed = False
 
     def publish(self, payload: bytes) -> None:
-        """Publish; the payload arrives with up to 3 zeros behind it.
+        """Publish; the payload arrives with up to 3 zero bytes appended.
 
-        :raises MiddlewareError: closed, no CDR (less than 5 bytes, unknown encapsulation), or a reliable subscriber
+        :raises MiddlewareError: closed, not CDR (less than 5 bytes, unknown encapsulation), or a reliable subscriber
             did not take unbounded or large messages within a second (counted as ``publish_blocked:/topic``)
         """
         if self._closed or self._middleware.closed:
@@ -94,7 +94,7 @@ class DdsPublisher(Publisher):
         return 0 if self._closed or self._middleware.closed else self.writer.matched()
 
     def service(self) -> None:
-        """Called by the thread when the library has something to tell about this writer."""
+        """Called by the thread when the library reports a status of this writer."""
         self._middleware.count_incompatible(self._topic, self.writer.incompatible(), ())
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class DdsPublisher(Publisher):
 
 
 class DdsSubscription(Subscription):
-    """A reader, and for a while its predecessors. ``calling`` is held while readers change, too."""
+    """A reader, and for some seconds its predecessors. ``calling`` is also held while readers change."""
 
     def __init__(
         self, middleware: DdsParticipant, topic: str, type_name: str, qos: Qos, callback: MessageCallback
@@ -124,11 +124,12 @@ class DdsSubscription(Subscription):
 
     @property
     def qos(self) -> Qos | None:
-        """What the reader currently asks for."""
+        """The QoS that the reader requests now."""
         return self._qos
 
     def adapt(self, offers: Iterable[Qos]) -> None:
-        """Ask for what all publishers offer. Without any, leave things as they are, at first the least."""
+        """Request the QoS that all publishers offer. Without publishers nothing changes; the first request is the
+        weakest."""
         offers = list(offers)
         with self.calling:
             if self._closed or (self._reader and not offers):
@@ -147,12 +148,12 @@ class DdsSubscription(Subscription):
 
     @property
     def outdated(self) -> float | None:
-        """When the oldest outdated reader is due (time.monotonic()), None without any."""
+        """When to delete the oldest outdated reader (time.monotonic()), None without one."""
         outdated = self._outdated
         return outdated[0][0] if outdated and not self._closed else None
 
     def retire(self, now: float) -> None:
-        """Delete readers whose time is over, with what they still hold delivered."""
+        """Deliver the remaining messages of readers whose time is over, and delete these readers."""
         with self.calling:
             if self._closed:
                 return
@@ -165,9 +166,9 @@ class DdsSubscription(Subscription):
                 self._middleware.announce()
 
     def service(self, reader: RawReader) -> int:
-        """Deliver what one reader holds (BATCH at a time where the depth is unbounded); returns how many there were."""
+        """Deliver the messages of one reader (BATCH at a time where the depth is unbounded); returns their number."""
         with self.calling:
-            if reader is self._reader:  # its predecessors may hold what came before
+            if reader is self._reader:  # its predecessors may hold earlier messages
                 for _, older in self._outdated:
                     self._serve_all(older)
             return self._serve(reader)
@@ -188,7 +189,7 @@ class DdsSubscription(Subscription):
         fresh = [sample for sample in samples if self._is_next(sample, reader)] if self._open_policies else samples
         excess = len(fresh) - self._wanted.depth
         if self._wanted.depth and excess > 0 and not reader.latched:
-            text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest go"
+            text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest are dropped"
             self._middleware.count_lost(self, self.topic, text, excess)
             fresh = fresh[excess:]
         for sample in fresh:
@@ -198,22 +199,24 @@ class DdsSubscription(Subscription):
         return len(samples)
 
     def _count_lost(self, reader: RawReader) -> None:
-        """Of outdated readers only what they lost before they were: what they miss from then on, another may have."""
+        """Count lost samples. For an outdated reader only those from before its replacement count: another reader may
+        have received later ones."""
         lost = reader.lost()
         if lost and reader is self._reader:
             self._middleware.count_lost(self, self.topic, f"{self.topic}: the DDS lost messages", lost)
 
     def _is_next(self, sample: Sample, reader: RawReader) -> bool:
-        """Whether a message is to be delivered: neither had by another reader nor overtaken by a later one.
+        """Whether to deliver a message: another reader has not received it, and no later message was delivered.
 
-        Order is by the publisher's clock, which may be set back, hence only among readers that are there at once. What
-        is older than all that was heard of a publisher counts as published before our time.
+        The order is that of the publisher's clock. Since that clock may be set back, only messages of readers that
+        exist at the same time are compared. A message older than all received ones of its publisher counts as published
+        before the subscription.
         """
         stamps = self._seen.get(sample.source)
         heard_by = None if stamps is None else next(iter(stamps.values()))
         now = self._reader
         if now is not None and now is not reader and now.brings_past and heard_by in (None, now.entity):
-            return False  # that one brings this message too, in its place
+            return False  # that reader delivers this message too, in the right order
         if stamps is None:
             if len(self._seen) >= _SEEN_PUBLISHERS:
                 del self._seen[next(iter(self._seen))]
@@ -224,7 +227,7 @@ class DdsSubscription(Subscription):
         last = next(reversed(stamps))
         if self._outdated and sample.stamp < last and stamps[last] != reader.entity:
             if sample.stamp > next(iter(stamps)):
-                # As if we had joined a moment later.
+                # As if the subscription had joined a moment later.
                 text = f"{self.topic}: a message came after a later one while the QoS changed; not delivered"
                 self._middleware.count(f"overtaken:{self.topic}", text, level=logging.INFO)
             return False
@@ -241,7 +244,7 @@ class DdsSubscription(Subscription):
         return [*([self._reader] if self._reader else []), *(reader for _, reader in self._outdated)]
 
     def mute(self) -> None:
-        """No callback begins from now on."""
+        """Start no callback from now on."""
         self._closed = True
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""Where the C library of Cyclone DDS is: inside PyPI's cyclonedds 11.0, or inside our own wheel.
+"""Finds the C library of Cyclone DDS: in PyPI's cyclonedds 11.0, or in the wheel of gr-ros2.
 
-Law: the Python part of that package is not imported. There is none for Python 3.14, while the C library serves every
-Python; for those that PyPI has no cyclonedds for, setup.py puts the library beside this module.
+Invariant: the Python part of that package is not imported. It does not exist for Python 3.14, while the C library works
+with every Python; for Python versions without cyclonedds on PyPI, setup.py puts the library next to this module.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from pathlib import Path
 from runpy import run_path
 
 VERSION = "11.0."
-"""What the version begins with that our calls were written for."""
+"""First part of the version for which the calls are written."""
 
 
 def load() -> ctypes.CDLL:
     """The library, loaded.
 
-    :raises ImportError: there is none, or one of another version
+    :raises ImportError: the library is missing, or has another version
     """
     try:
         return ctypes.CDLL(_path())
@@ -32,7 +32,7 @@ def _path() -> str:
     if ours is not None and ours.origin is not None:
         return ours.origin
     if not (found := version("cyclonedds")).startswith(VERSION):
-        raise ImportError(f"cyclonedds {found} is installed, which lacks a layout this was written for")
+        raise ImportError(f"cyclonedds {found} is installed, whose layouts differ from those of version {VERSION}x")
     package = find_spec("cyclonedds")
     if package is None or package.origin is None:
         raise ImportError("cyclonedds is installed without its Python package; install it again")

@@ -1,7 +1,7 @@
-"""How most back-ends call back: one thread per participant, and a queue of bounded depth per subscription.
+"""Callbacks of most back-ends: one thread per participant, and a queue of bounded depth per subscription.
 
-Laws: everything that is called back runs in the participant's thread, one step after the other; of a full queue the
-oldest message goes, and is counted; no step begins once ``close`` was called.
+Invariants: all callbacks run in the participant's thread, one after the other; a full queue drops and counts its oldest
+message; no step begins after ``close`` was called.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback,
 class CallbackThread:
     """The thread in which a participant calls back.
 
-    :param middleware: whose it is, its domain known
+    :param middleware: the participant, whose domain is set
     :param node_name: of the participant, for the thread's name
     """
 
@@ -32,14 +32,14 @@ class CallbackThread:
         self._thread.start()
 
     def call(self, step: Callable[[], object]) -> None:
-        """Let the thread do something, after all it was asked for before; nothing once closed. From any thread."""
+        """Run a step in the thread, after all earlier steps; does nothing after ``close``. Any thread may call."""
         with self._changed:
             if not self._closed:
                 self._steps.append(step)
                 self._changed.notify()
 
     def close(self) -> None:
-        """Begin no further step, and wait a while for the one under way, unless called from it. Idempotent."""
+        """Start no further step, and wait up to ``JOIN_S`` for the current one, unless called from it. Idempotent."""
         with self._changed:
             self._closed = True
             self._steps.clear()
@@ -58,12 +58,12 @@ class CallbackThread:
 
 
 class QueuedSubscription(Subscription):
-    """A subscription whose messages wait until the participant's thread calls back with them.
+    """A subscription whose messages wait until the participant's thread delivers them.
 
-    A back-end calls :meth:`push` with what it receives and :meth:`look` when publishers have come or gone.
+    A back-end calls :meth:`push` with each received message, and :meth:`look` when publishers have joined or left.
 
-    :param middleware: where messages are counted that do not reach the callback
-    :param thread: where they are called back
+    :param middleware: counts messages that do not reach the callback
+    :param thread: runs the callbacks
     :param topic: absolute name
     :param depth: messages that wait at most, 0 = unbounded
     """
@@ -83,7 +83,7 @@ class QueuedSubscription(Subscription):
 
     @abstractmethod
     def offers(self) -> Sequence[Qos]:
-        """What the publishers found offer now."""
+        """The QoS of the publishers found now."""
 
     @abstractmethod
     def leave(self) -> None:
@@ -99,13 +99,13 @@ class QueuedSubscription(Subscription):
                 self._waiting.popleft()
             self._waiting.append(payload)
         if full:
-            text = f"{self.topic}: callbacks do not keep up, depth {self._depth} is full, the oldest go"
+            text = f"{self.topic}: callbacks do not keep up, depth {self._depth} is full, the oldest are dropped"
             self._participant.count_lost(self, self.topic, text)
         else:
             self._thread.call(self._take)
 
     def look(self) -> None:
-        """Let those who follow hear what the publishers offer now, if that has changed. From any thread."""
+        """Tell the followers the QoS of the publishers, if it has changed. Any thread may call."""
         self._thread.call(self._look)
 
     def follow(self, on_offers: OffersCallback) -> None:

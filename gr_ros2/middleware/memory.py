@@ -1,8 +1,8 @@
-"""A ROS graph inside one process: what tests use where a DDS would only add noise.
+"""A ROS graph inside one process, for tests that do not need a DDS.
 
-Laws: participants with the same domain id share a graph and behave as DDS has it: history depth, late joiners of
+Invariants: participants with the same domain id share a graph and behave as DDS has it: history depth, late joiners of
 transient-local publishers, requested against offered QoS; each participant calls back from one thread of its own,
-in the order of publication. Unlike a DDS it counts every message that a subscription's depth pushes out.
+in the order of publication. Unlike a DDS it counts every message that is dropped because of a subscription's depth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gr_ros2.registry import normalize_type
 
 
 class _Graph:
-    """What the participants of one domain share. Every method is called with ``lock`` held."""
+    """State shared by the participants of one domain. Every method is called with ``lock`` held."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -41,7 +41,7 @@ class _Graph:
             return
         refused = refused_policies(publisher.qos, subscription.qos)
         for policy in refused:
-            text = f"{publisher.topic}: the {policy} of publisher and subscription do not fit"
+            text = f"{publisher.topic}: the {policy} of publisher and subscription is incompatible"
             for middleware in {publisher.middleware, subscription.middleware}:
                 middleware.count(f"incompatible_qos:{publisher.topic}:{policy}", text)
         if not refused:
@@ -63,7 +63,7 @@ class _Graph:
         endpoint.matches.clear()
 
     def replay(self, subscription: MemorySubscription) -> None:
-        """Hand over what was published before the match, where transient-local holds for all publishers."""
+        """Deliver messages published before the match, where all publishers are transient-local."""
         wanted = subscription.qos.durability
         latched = all(publisher.qos.durability == "transient_local" for publisher in subscription.matches)
         if wanted == "transient_local" or (wanted is None and latched):
@@ -75,7 +75,7 @@ class _Graph:
 
 
 _graphs: WeakValueDictionary[int, _Graph] = WeakValueDictionary()
-"""Graphs in use; one that no participant refers to any more is gone."""
+"""Graphs in use; a graph without participants is deleted."""
 _graphs_lock = threading.Lock()
 
 
@@ -94,7 +94,7 @@ class MemoryPublisher(Publisher):
         self.closed = False
 
     def publish(self, payload: bytes) -> None:
-        """Hand a message to every matched subscription; never blocks.
+        """Deliver a message to every matched subscription; never blocks.
 
         :raises MiddlewareError: once closed
         """
@@ -127,7 +127,7 @@ class MemorySubscription(QueuedSubscription):
         self.middleware = middleware
         self.type_name = type_name
         self.qos = qos
-        self.matches: dict[MemoryPublisher, int] = {}  # messages published before that are yet to be replayed
+        self.matches: dict[MemoryPublisher, int] = {}  # earlier messages that are still to be replayed
 
     def offers(self) -> list[Qos]:
         with self.middleware.graph.lock:
@@ -139,7 +139,7 @@ class MemorySubscription(QueuedSubscription):
     def leave(self) -> None:
         graph = self.middleware.graph
         with graph.lock:
-            if self in graph.subscriptions:  # else the participant has just left, and all that is its
+            if self in graph.subscriptions:  # otherwise the participant has just left, with all its endpoints
                 graph.left(self)
 
 

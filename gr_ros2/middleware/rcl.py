@@ -1,6 +1,6 @@
-"""What rclpy leaves to its environment: how rcl is told a setting, and what its errors become.
+"""Helpers around rclpy: a setting that rcl reads from the environment, and the translation of its errors.
 
-Law: nothing here imports rclpy.
+Invariant: nothing here imports rclpy.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _environment = threading.Lock()
 
 @contextlib.contextmanager
 def told(localhost_only: bool | None) -> Iterator[None]:
-    """ROS_LOCALHOST_ONLY as given: rcl reads it when a context is initialised, and has no other way to be told."""
+    """Set ROS_LOCALHOST_ONLY: rcl reads it when a context is initialised, and offers no other interface for it."""
     if localhost_only is None:
         yield
         return
@@ -34,7 +34,7 @@ def told(localhost_only: bool | None) -> Iterator[None]:
 
 
 class translated(contextlib.AbstractContextManager[None]):
-    """RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
+    """Raises RuntimeErrors of rclpy (RCLError, InvalidHandle) as MiddlewareError."""
 
     def __init__(self, what: str) -> None:
         self._what = what

@@ -1,12 +1,12 @@
-"""A ROS graph through rclpy, for people with a sourced ROS 2 (Humble or later).
+"""A ROS graph through rclpy, for users with a sourced ROS 2 (Humble or later).
 
-Laws: this is the only module of the package that imports rclpy; context, node and executor are our own, so a host
-application keeps its own node, arguments and signal handlers; endpoints are destroyed, and callbacks run, in the
-executor's thread only, hence a subscription is silent once ``close`` has returned; no exception of a callback or of
-rclpy ends that thread, each is counted and its first logged.
+Invariants: this is the only module of the package that imports rclpy; it has its own context, node and executor, so a
+host application keeps its node, arguments and signal handlers; only the executor's thread destroys endpoints and runs
+callbacks, so no callback runs after ``close`` has returned; no exception of a callback or of rclpy ends that thread:
+each is counted, and the first of a kind is logged.
 
-Adaptive subscriptions follow adapt.Adaptation; while one joins anew, messages under way may be missed, and what latched
-publishers then send once more is left out.
+Adaptive subscriptions follow adapt.Adaptation; while one joins again, messages in transit may be missed, and repeated
+messages of transient-local publishers are dropped.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ ADAPT_PERIOD_S = 0.1
 """How often adaptive subscriptions look for publishers; rclpy has no callback for changes of the graph."""
 
 ENCAPSULATION = 4
-"""Bytes of the header every serialized message starts with."""
+"""Bytes of the encapsulation header of a serialized message."""
 
 
 def message_class(type_name: str) -> Any:
@@ -70,7 +70,7 @@ def message_class(type_name: str) -> Any:
         kind = getattr(import_module(f"{package}.msg"), name)
         if kind.__class__._TYPE_SUPPORT is None:
             kind.__class__.__import_type_support__()
-    # The import runs generated code and loads C libraries, which fail in more ways than ImportError.
+    # The import runs generated code and loads C libraries, which may raise other errors than ImportError.
     except Exception as error:
         raise ConfigError(
             f"type {package}/msg/{name} cannot be imported ({error}); source the workspace that has it "
@@ -80,7 +80,7 @@ def message_class(type_name: str) -> Any:
 
 
 def _to_profile(qos: Qos) -> QoSProfile:
-    """A publisher's None are the defaults of base.Qos; a subscription is settled before."""
+    """The rclpy profile. None of a publisher means the default of base.Qos; a subscription has no None here."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST if qos.depth else HistoryPolicy.KEEP_ALL,
         depth=qos.depth,
@@ -88,7 +88,7 @@ def _to_profile(qos: Qos) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL
         if qos.durability == "transient_local"
         else DurabilityPolicy.VOLATILE,
-        lifespan=Duration(nanoseconds=int(qos.lifespan_s * 1e9)),  # 0: not specified, which is for ever
+        lifespan=Duration(nanoseconds=int(qos.lifespan_s * 1e9)),  # 0: not specified, which means no limit
         deadline=Duration(nanoseconds=int(qos.deadline_s * 1e9)),
     )
 
@@ -98,7 +98,7 @@ def _policies(profile: Any) -> tuple[object, object]:
 
 
 def _from_profile(profile: Any) -> Qos:
-    """Discovery of some RMWs does not carry the history; its depth is then the default."""
+    """The Qos of a profile. Some RMWs do not announce the history; the depth is then the default."""
     if profile.history == HistoryPolicy.KEEP_LAST:
         depth = int(profile.depth)
     else:
@@ -123,7 +123,7 @@ def _policy_name(event: Any) -> str:
 class RclpyMiddleware(Middleware):
     """One ROS 2 node in a context of its own, spinning in a thread of its own.
 
-    ``counters`` also has ``executor_failed``: errors of rclpy itself, a message it could not take, say.
+    ``counters`` also has ``executor_failed``: errors of rclpy itself, for instance a message that it could not take.
 
     :param domain_id: 0..232; -1 takes ROS_DOMAIN_ID
     :param node_name: base name of the node
@@ -148,7 +148,8 @@ class RclpyMiddleware(Middleware):
         node_name, namespace = check_node(node_name, namespace)
         self._context = Context()
         try:
-            # Context.init, not rclpy.init: it leaves signals alone; args=[]: or it would parse our own command line.
+            # Context.init does not touch signal handlers, unlike rclpy.init; without args=[] it would parse the command
+            # line.
             with told(localhost_only):
                 self._context.init(args=[], domain_id=domain_id)
             self._node = Node(
@@ -168,7 +169,7 @@ class RclpyMiddleware(Middleware):
         self._subscriptions: list[_RclpySubscription] = []
         self._closing = threading.Event()
         self._failed = False
-        # Reentrant, or an error of rclpy while it takes a message would block the whole group for good.
+        # Reentrant; otherwise an error of rclpy while it takes a message would block the whole group permanently.
         self._group = ReentrantCallbackGroup()
         self._wake = self._node.create_guard_condition(self._tend, callback_group=self._group)
         # Steady, so that a paused simulation clock does not stop it.
@@ -200,7 +201,8 @@ class RclpyMiddleware(Middleware):
         return _RclpyPublisher(self, topic, type_name, qos)
 
     def discover(self) -> list[TopicInfo]:
-        """See base. One row per type where a topic has several; depths only where the RMW announces them."""
+        """See base. A topic with several types has one row per type; depths are known only where the RMW announces
+        them."""
         self.check_open()
         node = self._node
         found = []
@@ -226,7 +228,7 @@ class RclpyMiddleware(Middleware):
 
     @property
     def closing(self) -> bool:
-        """No callback begins from now on."""
+        """Whether the middleware is closing; no callback starts then."""
         return self._closing.is_set()
 
     def check_open(self) -> None:
@@ -235,7 +237,8 @@ class RclpyMiddleware(Middleware):
             raise MiddlewareError("rclpy: the middleware is closed")
 
     def publishers_of(self, topic: str, type_name: str) -> dict[bytes, Qos]:
-        """What the publishers of a topic and type offer, our own included, by their ids; others are counted."""
+        """The QoS of the publishers of a topic and type, this node's included, by their ids; publishers of other types
+        are counted."""
         with translated(f"publishers of {topic} cannot be read"):
             infos = self._node.get_publishers_info_by_topic(topic)
         strangers = {i.topic_type for i in infos} - {type_name}
@@ -261,11 +264,12 @@ class RclpyMiddleware(Middleware):
 
     def destroy(self, kind: str, endpoint: Any) -> None:
         """Destroy an endpoint, in the executor's thread."""
-        with contextlib.suppress(InvalidHandle):  # gone with its node already
+        with contextlib.suppress(InvalidHandle):  # destroyed with its node already
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
     def in_executor(self, work: Callable[[], None]) -> None:
-        """Run it in the executor's thread, waiting ``JOIN_S`` at most; not once closed: all is destroyed then."""
+        """Run work in the executor's thread, and wait at most ``JOIN_S``; does nothing after ``close``, when everything
+        is destroyed."""
         if threading.current_thread() is self._thread:
             work()
             return
@@ -275,7 +279,7 @@ class RclpyMiddleware(Middleware):
             done.wait(JOIN_S)
 
     def forget(self, subscription: _RclpySubscription) -> None:
-        """No longer adapt it."""
+        """Stop adapting a subscription."""
         with contextlib.suppress(ValueError):
             self._subscriptions.remove(subscription)
 
@@ -289,7 +293,8 @@ class RclpyMiddleware(Middleware):
             return self._open
 
     def _foreign(self, infos: Iterable[Any], topic: str, own_endpoints: Iterable[Any]) -> list[Any]:
-        """Without our own: of the endpoints under our node's name, as many as we have, for another node may bear it."""
+        """The endpoints of other nodes. Another node may have the same name; so from the endpoints with this node's
+        name, as many are removed as this node has."""
         name = self._node.get_name(), self._node.get_namespace()
         others = list(infos)
         for endpoint in own_endpoints:
@@ -303,7 +308,7 @@ class RclpyMiddleware(Middleware):
         return others
 
     def _tend(self) -> None:
-        """In the executor's thread: work that was handed in, then adaptive subscriptions."""
+        """In the executor's thread: run queued work, then adapt subscriptions."""
         while self._work:
             work, done = self._work.popleft()
             try:
@@ -328,7 +333,7 @@ class RclpyMiddleware(Middleware):
                     self.count("executor_failed", f"rclpy failed in the executor: {type(error).__name__}: {error}")
                     _log.debug("in the executor", exc_info=True)
                     self._failed = True
-                    self._closing.wait(0.01)  # a lasting error must not take the whole core
+                    self._closing.wait(0.01)  # a lasting error must not use the whole core
         finally:
             self._tear_down()
 
@@ -343,7 +348,7 @@ class RclpyMiddleware(Middleware):
 
 
 class _RclpySubscription(Subscription):
-    """Made, adapted and destroyed in the executor's thread once ``subscribe`` has returned.
+    """Adapted and destroyed in the executor's thread after ``subscribe`` has returned.
 
     ``calling`` is held while it adapts: the first join is in the caller's thread, with the executor's already at work.
     """
@@ -363,7 +368,7 @@ class _RclpySubscription(Subscription):
         self._closed = False
 
     def adapt(self) -> None:
-        """Join the graph, or join it anew, where the publishers call for it."""
+        """Join the graph, or join it again, where the publishers require it."""
         with self.calling:
             if not self._closed:
                 publishers = self._middleware.publishers_of(self._topic, self._type_name)
@@ -374,7 +379,8 @@ class _RclpySubscription(Subscription):
                     self._join()
 
     def revive(self) -> None:
-        """Join anew where rclpy failed to take a message (an empty one, say): it never listens there again."""
+        """Join again after rclpy failed to take a message (for instance an empty one), because it then never receives
+        on that endpoint again."""
         if self._endpoint is not None and not self._closed and getattr(self._endpoint, "_executor_event", True):
             self._join()
 
@@ -422,12 +428,12 @@ class _RclpySubscription(Subscription):
 
     def _on_incompatible(self, event: Any) -> None:
         policy = _policy_name(event)
-        if self._adaptation.adapts(policy):  # about to be put right
+        if self._adaptation.adapts(policy):  # the next adaptation corrects this
             self.adapt()
             return
         self._middleware.count(
             f"incompatible_qos:{self._topic}:{policy}",
-            f"{self._topic}: a publisher does not offer the {policy} this subscription asks for; nothing comes from it",
+            f"{self._topic}: a publisher does not offer the {policy} this subscription requests; no messages from it",
             event.total_count_change,
         )
 
@@ -454,8 +460,8 @@ class _RclpyPublisher(Publisher):
         if self._closed:
             raise MiddlewareError(f"{self._topic}: the publisher is closed")
         self._middleware.check_open()
-        if len(payload) < ENCAPSULATION:  # an empty one makes rclpy's subscribers deaf
-            raise MiddlewareError(f"{self._topic}: {len(payload)} bytes are no serialized message")
+        if len(payload) < ENCAPSULATION:  # an empty message makes rclpy's subscribers stop receiving
+            raise MiddlewareError(f"{self._topic}: {len(payload)} bytes are not a serialized message")
         with translated(f"{self._topic}: publishing {len(payload)} bytes failed"):
             self._endpoint.publish(payload)
 
@@ -474,6 +480,6 @@ class _RclpyPublisher(Publisher):
         policy = _policy_name(event)
         self._middleware.count(
             f"incompatible_qos:{self._topic}:{policy}",
-            f"{self._topic}: a subscriber asks for another {policy} than this publisher offers; it gets nothing",
+            f"{self._topic}: a subscriber requests another {policy} than this publisher offers; it gets no messages",
             event.total_count_change,
         )

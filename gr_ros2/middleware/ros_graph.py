@@ -1,6 +1,6 @@
-"""How ROS 2 names appear on DDS, and what a participant says to be listed as a ROS node.
+"""ROS 2 names on DDS, and the announcement with which a participant is listed as a ROS node.
 
-Laws: pure functions of their arguments and, where said, of the environment; nothing here touches a DDS.
+Invariants: pure functions of their arguments and, where stated, of the environment; nothing here uses a DDS.
 Sources: the ROS 2 design articles "Topic and Service name mapping to DDS" and "Node to Participant mapping";
 rmw_dds_common/msg/ParticipantEntitiesInfo of Humble (24-byte Gid) and of Iron (16-byte Gid).
 """
@@ -49,7 +49,8 @@ PARTICIPANT_USER_DATA = b"enclave=/;"
 
 _OURS = b"gr_ros2=;"
 DISCOVERY_USER_DATA = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e;" + _OURS
-"""Of our own endpoint on ros_discovery_info: the hash of its type since Iron, and that it is ours."""
+"""User data of this package's endpoint on ros_discovery_info: the hash of its type since Iron, and a mark of this
+package."""
 
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
 _TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
@@ -63,7 +64,7 @@ def dds_topic(topic: str) -> str:
 
 
 def ros_topic(name: str) -> str | None:
-    """The inverse of :func:`dds_topic`; None for what is no ROS topic (services, plain DDS)."""
+    """The inverse of :func:`dds_topic`; None for a name that is not a ROS topic (services, plain DDS)."""
     return name[2:] if name.startswith("rt/") else None
 
 
@@ -74,7 +75,7 @@ def dds_type(type_name: str) -> str:
 
 
 def ros_type(name: str) -> str:
-    """The inverse of :func:`dds_type`; a name that is no ROS type stays as it is."""
+    """The inverse of :func:`dds_type`; a name that is not a ROS type is returned unchanged."""
     match = _DDS_TYPE.fullmatch(name)
     return f"{match[1]}/{match[2]}/{match[3]}" if match else name
 
@@ -82,7 +83,7 @@ def ros_type(name: str) -> str:
 def resolve_domain_id(domain_id: int, environment: Mapping[str, str] = os.environ) -> int:
     """The DDS domain, 0..232; -1 takes ROS_DOMAIN_ID, default 0.
 
-    :raises ConfigError: out of range, or ROS_DOMAIN_ID is no number
+    :raises ConfigError: out of range, or ROS_DOMAIN_ID is not a number
     """
     origin, text = "domain_id", str(domain_id)
     if domain_id == -1:
@@ -97,11 +98,11 @@ DiscoveryRange = Literal["SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"]
 
 @dataclass(frozen=True)
 class DiscoveryOptions:
-    """Whom a participant looks for, as ROS 2 has it since Iron (rmw_discovery_options_t).
+    """The discovery range of a participant, as in ROS 2 since Iron (rmw_discovery_options_t).
 
-    :param range: SUBNET, whom multicast reaches; LOCALHOST, this machine; OFF, nobody outside this process;
-        SYSTEM_DEFAULT, what the DDS does by itself
-    :param peers: addresses or names of machines to look for besides; for the first two ranges only
+    :param range: SUBNET, all that multicast reaches; LOCALHOST, this machine; OFF, only this process; SYSTEM_DEFAULT,
+        the default of the DDS
+    :param peers: addresses or names of further machines; only for the first two ranges
     """
 
     range: DiscoveryRange = "SUBNET"
@@ -115,10 +116,11 @@ class DiscoveryOptions:
 def discovery_options(
     localhost_only: bool | None = None, environment: Mapping[str, str] = os.environ
 ) -> DiscoveryOptions:
-    """What ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS ask for; the first wins, as in rcl.
+    """The options of ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS; the first takes
+    precedence, as in rcl.
 
     :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
-    :raises ConfigError: for a value that means nothing (where rcl assumes one and warns)
+    :raises ConfigError: for an invalid value (where rcl assumes a value and warns)
     """
     text = environment.get("ROS_LOCALHOST_ONLY", "").strip() or "0"
     if text not in ("0", "1"):
@@ -134,31 +136,32 @@ def discovery_options(
 
 
 def gid_size(environment: Mapping[str, str] = os.environ) -> int:
-    """Bytes of a Gid in ros_discovery_info to begin with: 24 up to Humble, 16 since Iron.
+    """Initial size in bytes of a Gid in ros_discovery_info: 24 up to Humble, 16 since Iron.
 
-    Where ROS_DISTRO is not set, 24 is assumed until the graph says otherwise (:func:`has_short_gids`).
+    Where ROS_DISTRO is not set, 24 is assumed until the graph shows otherwise (:func:`has_short_gids`).
     """
     return 24 if environment.get("ROS_DISTRO", "").strip().lower() in _24_BYTE_GID_DISTROS else 16
 
 
 def has_short_gids(topic: str, user_data: bytes) -> bool:
-    """Whether an endpoint is that of a ROS node since Iron: a foreign one on ros_discovery_info with a type hash.
+    """Whether an endpoint belongs to a ROS node since Iron: an endpoint of another program on ros_discovery_info with a
+    type hash.
 
-    :param topic: as DDS sees it
+    :param topic: its name on DDS
     """
     return topic == DISCOVERY_TOPIC and bool(hash_told(user_data)) and _OURS not in user_data
 
 
 def endpoint_user_data(type_hash: str) -> bytes:
-    """What an endpoint says about its type since Iron (REP-2016); nodes up to Humble do not read it.
+    """User data with which an endpoint announces its type since Iron (REP-2016); nodes up to Humble do not read it.
 
-    :param type_hash: '' where it is not known
+    :param type_hash: '' where the hash is not known
     """
     return f"typehash={type_hash};".encode() if type_hash else b""
 
 
 def hash_told(user_data: bytes) -> str:
-    """The inverse of :func:`endpoint_user_data`, of anybody's endpoint."""
+    """The inverse of :func:`endpoint_user_data`, for an endpoint of any program."""
     match = _TYPE_HASH.search(user_data)
     return match[1].decode() if match else ""
 
@@ -172,7 +175,7 @@ def participant_entities_info(
     *,
     gid_bytes: int = 24,
 ) -> bytes:
-    """ros_discovery_info's message for one node, CDR little endian.
+    """The message on ros_discovery_info for one node, CDR little endian.
 
     :param participant: GUID, 16 bytes; likewise those of readers and writers
     """

@@ -1,8 +1,8 @@
-"""Message definitions, for those places that want more than bytes: bags and type hashes.
+"""Message definitions, for the parts that need more than bytes: bags and type hashes.
 
-Laws: a type that is not known is no error anywhere; it has no definition, and its bytes pass all the same. A definition
-that came with the messages counts, also where ROS ships another one of that name: types grow from one distribution to
-the next.
+Invariants: an unknown type is never an error; it has no definition, and its bytes pass anyway. A definition that came
+with the messages takes precedence over the one that ROS ships under the same name: types change from one distribution
+to the next.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 UNKNOWN = "# The definition of this type was not known where it was recorded; the bytes are complete.\n"
-"""Stands in a bag for a definition nobody had. It parses as a type without members."""
+"""Placeholder in a bag for an unknown definition. It parses as a type without members."""
 _IDL = "=" * 80 + "\nIDL: "
-"""How rosbag2 begins a definition in IDL."""
+"""First line of a definition in IDL, as rosbag2 writes it."""
 
 
 class Definition(NamedTuple):

@@ -1,11 +1,12 @@
 """A ROS graph through Zenoh, as nodes with rmw_zenoh see it. Experimental until it has met a real rmw_zenoh.
 
-Laws: one thread per participant calls back, in the order of arrival; the tables are guarded by one lock, never held
-while calling back or while calling Zenoh, whose own threads take it; a message beyond a subscription's depth, and one
-whose number never came, is counted.
+Invariants: one thread per participant calls back, in the order of arrival; the tables are guarded by one lock, never
+held during a callback or a call of Zenoh, whose own threads take it; a message beyond a subscription's depth, and a
+message whose number never came, are counted.
 
-Zenoh has no incompatible QoS: every publisher matches every subscription, and a subscription that adapts asks for what
-the publishers keep. Like rmw_zenoh it needs a router (``ros2 run rmw_zenoh_cpp rmw_zenohd``, or ``zenohd``).
+Zenoh has no incompatible QoS: every publisher matches every subscription, and an adaptive subscription requests the
+messages that the publishers keep. Like rmw_zenoh it needs a router (``ros2 run rmw_zenoh_cpp rmw_zenohd``, or
+``zenohd``).
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ _DEFAULTS = {
     "scouting/delay": "1",
     "timestamping/enabled": "true",
 }
-"""rmw_zenoh's session: a peer on this machine that finds others through the router."""
+"""Session configuration of rmw_zenoh: a peer on this machine that finds others through the router."""
 _ROUTER_S = 3.0
-"""s after which a router that has not been found is missed."""
+"""s without a router after which a warning is logged."""
 _HEARTBEAT_S = 0.5
 _PUBLISHERS_REMEMBERED = 1024
 
@@ -60,7 +61,7 @@ _log = logging.getLogger(__name__)
 
 
 def session_config(environment: Mapping[str, str] = os.environ) -> Any:
-    """What rmw_zenoh would open its session with.
+    """The session configuration that rmw_zenoh would use.
 
     ZENOH_SESSION_CONFIG_URI names a file to take instead of the defaults, ZENOH_CONFIG_OVERRIDE changes single keys
     (``key=value;key=value``, values in JSON5).
@@ -100,11 +101,11 @@ class ZenohMiddleware(Middleware):
         self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self._node_name, self._namespace = ros_graph.check_node(node_name, namespace)
         self._has_hashes = ros_graph.gid_size() != 24
-        self._declaring = threading.RLock()  # held while Zenoh declares for us, so that close() comes before or after
-        self._tables = threading.Lock()  # guards what follows
+        self._declaring = threading.RLock()  # held during a declaration, so that close() comes before or after
+        self._tables = threading.Lock()  # guards the attributes below
         self._closed = False
         self._endpoints: list[_ZenohPublisher | _ZenohSubscription] = []
-        self._entities: dict[str, Entity] = {}  # of others and ourselves, by token
+        self._entities: dict[str, Entity] = {}  # of all participants, by token
         self._numbers = 0
         config = session_config()
         with _failures("no session"):
@@ -119,11 +120,11 @@ class ZenohMiddleware(Middleware):
         self._patience = threading.Timer(_ROUTER_S, self.thread.call, [self._miss_router])
         self._patience.daemon = True
         self._patience.start()
-        atexit.register(self.close)  # an open session would keep the interpreter from ending
+        atexit.register(self.close)  # an open session would prevent the interpreter from ending
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
-        # What is left open asks for everything: Zenoh matches all the same.
+        # A policy that is left open requests the strongest value: Zenoh matches anyway.
         asked = replace(qos, reliability=qos.reliability or "reliable", durability=qos.durability or "transient_local")
         with self._declaring:
             self.check_open(f"subscribe {topic}")
@@ -136,7 +137,7 @@ class ZenohMiddleware(Middleware):
             return _ZenohPublisher(self, self._entity("MP", topic, type_name, offered(qos)))
 
     def discover(self) -> list[TopicInfo]:
-        """The topics seen so far; a fresh session needs a moment to see any."""
+        """The topics found so far; a new session needs a moment to find any."""
         with self._tables:
             others = [entity for entity in self._entities.values() if entity.session != self._session_id]
         found = [[(e.topic, e.type_name, e.qos) for e in others if e.kind == kind] for kind in ("MP", "MS")]
@@ -169,7 +170,7 @@ class ZenohMiddleware(Middleware):
             raise MiddlewareError(f"{what}: the middleware is closed")
 
     def join(self, endpoint: _ZenohPublisher | _ZenohSubscription) -> Any:
-        """Show an endpoint to the graph; its liveliness token."""
+        """Announce an endpoint to the graph; returns its liveliness token."""
         with self._tables:
             self._endpoints.append(endpoint)
             others = list(self._entities.values())
@@ -178,7 +179,7 @@ class ZenohMiddleware(Middleware):
         return self._session.liveliness().declare_token(endpoint.entity.token(self.domain_id))
 
     def leave(self, endpoint: _ZenohPublisher | _ZenohSubscription, declared: Iterable[Any]) -> None:
-        """Take an endpoint off the graph."""
+        """Remove an endpoint from the graph."""
         with self._tables:
             self._endpoints.remove(endpoint)
         with self._declaring, _failures(f"close {endpoint.entity.topic}"):
@@ -186,7 +187,7 @@ class ZenohMiddleware(Middleware):
                 thing.undeclare()
 
     def matches(self, entity: Entity) -> list[Entity]:
-        """Entities of the other kind with that topic and type; none once closed."""
+        """Entities of the other kind with that topic and type; empty after ``close``."""
         wanted = ("MS" if entity.kind == "MP" else "MP", entity.topic, entity.type_name)
         with self._tables:
             found = [e for e in self._entities.values() if (e.kind, e.topic, e.type_name) == wanted]
@@ -206,12 +207,12 @@ class ZenohMiddleware(Middleware):
             self._numbers += 1
             number = self._numbers
             seen = next((e.type_hash for e in self._entities.values() if e.type_name == type_name), "")
-        # What others of the graph say of a type counts more than what we believe: it need not be one that ROS ships.
+        # The type hash that other nodes announce takes precedence: the type need not be one that ROS ships.
         known = seen or (type_hash(type_name) if self._has_hashes else "") or NO_HASH
         return Entity(self._session_id, number, kind, self._node_name, self._namespace, topic, type_name, known, qos)
 
     def _graph_changed(self, sample: Any) -> None:
-        """A token came or went. Called in a thread of Zenoh."""
+        """A token appeared or disappeared. Called in a thread of Zenoh."""
         token = str(sample.key_expr)
         entity = read_token(token)
         if entity is None:
@@ -230,21 +231,22 @@ class ZenohMiddleware(Middleware):
                 endpoint.look()
 
     def _compare(self, endpoint: _ZenohPublisher | _ZenohSubscription, other: Entity) -> None:
-        """Count what cannot meet although its topic is the same."""
+        """Count endpoints of the same topic that cannot match."""
         own = endpoint.entity
         if other.topic != own.topic or {own.kind, other.kind} != {"MP", "MS"}:
             return
         if other.type_name != own.type_name:
-            text = f"{own.topic}: another endpoint has type {other.type_name}, ours {own.type_name}"
+            text = f"{own.topic}: another endpoint has type {other.type_name}, this one {own.type_name}"
         elif own.kind == "MP" and other.type_hash != own.type_hash:
-            text = f"{own.topic}: a subscriber has type hash {other.type_hash}, we {own.type_hash}; set ROS_DISTRO"
+            hashes = f"a subscriber has type hash {other.type_hash}, this publisher {own.type_hash}"
+            text = f"{own.topic}: {hashes}; set ROS_DISTRO"
         else:
             return
         self.count_once(f"incompatible_type:{own.topic}", text)
 
 
 class _ZenohPublisher(Publisher):
-    """Volatile or, with a cache that late joiners ask, transient-local."""
+    """Volatile or, with a cache that late joiners query, transient-local."""
 
     def __init__(self, middleware: ZenohMiddleware, entity: Entity) -> None:
         self.entity = entity
@@ -275,7 +277,7 @@ class _ZenohPublisher(Publisher):
             self._token = middleware.join(self)
 
     def publish(self, payload: bytes) -> None:
-        """Publish from any thread; the bytes arrive as they are.
+        """Publish from any thread; the bytes arrive unchanged.
 
         :raises MiddlewareError: once closed, or when Zenoh fails
         """
@@ -298,7 +300,7 @@ class _ZenohPublisher(Publisher):
 
 
 class _ZenohSubscription(QueuedSubscription):
-    """Takes messages of its topic and type whatever the type's hash, since it never looks into them."""
+    """Receives messages of its topic and type with any type hash, since it never parses them."""
 
     def __init__(self, middleware: ZenohMiddleware, entity: Entity, callback: MessageCallback) -> None:
         super().__init__(middleware, middleware.thread, entity.topic, entity.qos.depth, callback)
@@ -352,7 +354,7 @@ class _ZenohSubscription(QueuedSubscription):
 
 @contextlib.contextmanager
 def _failures(what: str) -> Iterator[None]:
-    """Turns Zenoh's errors within into ours."""
+    """Raises errors of Zenoh as MiddlewareError."""
     try:
         yield
     except zenoh.ZError as error:

@@ -1,6 +1,6 @@
-"""How a ROS graph appears on Zenoh: the key expressions, attachments and liveliness tokens of rmw_zenoh.
+"""The ROS graph on Zenoh: the key expressions, attachments and liveliness tokens of rmw_zenoh.
 
-Laws: pure functions of their arguments; what another program wrote and does not parse is None, never an error.
+Invariants: pure functions of their arguments; data of another program that does not parse gives None, never an error.
 Source: the design document and sources of rmw_zenoh_cpp, as of its releases for Humble, Jazzy and later.
 """
 
@@ -16,12 +16,12 @@ from gr_ros2.middleware.base import FOR_EVER_S, Durability, Qos, Reliability
 from gr_ros2.middleware.ros_graph import dds_type, ros_type
 
 NO_HASH = "TypeHashNotSupported"
-"""Stands for the type hash up to Humble, where types have none."""
+"""Placeholder of the type hash up to Humble, where types have none."""
 DEFAULT_DEPTH = 42
-"""rmw_zenoh's history depth where a profile has none."""
+"""rmw_zenoh's default history depth."""
 
 Kind = Literal["NN", "MP", "MS"]
-"""A node, a publisher, a subscription; services (SS, SC) are not ours."""
+"""A node, a publisher, a subscription; services (SS, SC) are ignored."""
 
 _LIVELINESS = "@ros2_lv"
 _ENCLAVE = "/"
@@ -37,7 +37,7 @@ _QOS = re.compile(
 
 
 def topic_key(domain_id: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Where messages of a topic are put: ``0/robot_1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_…``.
+    """Key expression of a topic: ``0/robot_1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_…``.
 
     :param type_hash: ``*`` to subscribe whatever the hash
     """
@@ -45,7 +45,7 @@ def topic_key(domain_id: int, topic: str, type_name: str, type_hash: str) -> str
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """What travels beside a message, 33 bytes: its number from 1, ns since the epoch, and its publisher."""
+    """The attachment of a message, 33 bytes: its number from 1, ns since the epoch, and its publisher."""
     return _ATTACHMENT.pack(sequence, stamp_ns, _GID, gid)
 
 
@@ -84,7 +84,7 @@ class Entity:
         return "/".join(names)
 
     def gid(self, domain_id: int) -> bytes:
-        """16 bytes that stand for it in attachments, derived from its token; peers only compare them."""
+        """16 bytes that identify it in attachments, derived from its token; peers only compare them."""
         return hashlib.blake2b(self.token(domain_id).encode(), digest_size=_GID).digest()
 
 
@@ -94,7 +94,7 @@ def tokens_of(domain_id: int) -> str:
 
 
 def read_token(text: str) -> Entity | None:
-    """The node, publisher or subscription behind a token; None for anything else."""
+    """The node, publisher or subscription of a token; None for anything else."""
     parts = text.split("/")
     if len(parts) < 9 or parts[0] != _LIVELINESS or not parts[4].isdecimal():
         return None
@@ -120,7 +120,7 @@ def _demangled(name: str) -> str:
 
 
 def _qos_text(qos: Qos) -> str:
-    """Reliability, durability, history and depth, deadline, lifespan; what is at its default may be left empty."""
+    """Reliability, durability, history and depth, deadline, lifespan; a default value may be left empty."""
     reliability = "2" if qos.reliability == "best_effort" else "1"
     durability = "1" if qos.durability == "transient_local" else "2"
     history = f"{_KEEP_LAST},{qos.depth}" if qos.depth else f"{_KEEP_ALL},{DEFAULT_DEPTH}"
@@ -128,7 +128,7 @@ def _qos_text(qos: Qos) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Seconds and nanoseconds, nothing for no limit."""
+    """Seconds and nanoseconds, empty for no limit."""
     return f"{int(seconds)},{round(seconds % 1 * 1e9)}" if seconds else ","
 
 
@@ -142,7 +142,7 @@ def _read_qos(text: str) -> Qos | None:
 
 
 def _seconds(text: str) -> float:
-    """The inverse of :func:`_duration`; a limit of ages is none."""
+    """The inverse of :func:`_duration`; a very long limit counts as no limit."""
     seconds, _, nanoseconds = text.partition(",")
     total = int(seconds or 0) + int(nanoseconds or 0) * 1e-9
     return total if total < FOR_EVER_S else 0.0

@@ -1,13 +1,14 @@
-"""The gate in front of a simulated transmitter: packets pass at the pace of the air, and credits flow back.
+"""The gate in front of a simulated transmitter: packets pass one per airtime, and credits flow back.
 
-Laws: no packet passes before its airtime is over, or ``early`` before that where a device spends the time (`throttle`
-would let bursts through); the queue is unbounded and counted; samples are never touched.
+Invariants: no packet passes before its airtime is over, or ``early`` before that where a device spends the time
+(`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from array import array
 from collections.abc import Callable
 from typing import Any
 
@@ -15,8 +16,9 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS
-from gr_ros2.phy.threads import BlockThread, quicken_threads
+from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 
 _JOIN_S = 1.0
 _ONE = pmt.from_long(1)
@@ -29,6 +31,9 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     :param airtime_of: the same by the packet's bytes, at most ``airtime``; None = that of all
     :param lead: s before the air is free at which a credit is given
     :param early: s before its airtime is over at which a packet passes, see :class:`AirtimeClock`
+    :param times: keep when each packet passed; a link that runs for ever would keep too many
+    :ivar lateness: of packets against when they were to pass
+    :ivar passed_at: s, monotonic, of every packet; empty unless asked for
     :raises ConfigError: for a value out of range
     """
 
@@ -39,15 +44,19 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         airtime_of: Callable[[int], float] | None = None,
         lead: float = LEAD_S,
         early: float = 0.0,
+        times: bool = False,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, early)
         self.passed = 0
+        self.lateness = Lateness()
+        self.passed_at = array("d")
+        self._times = times
         self._changed = threading.Condition()
         self._running = False
         self._thread: threading.Thread | None = None
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.message_port_register_out(CREDIT)
@@ -59,8 +68,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return self._clock.backlog
 
     def start(self) -> bool:
-        quicken_threads()
-        self._block_thread.keep()
+        shorten_switch_interval()
+        self._thread_state.keep()
         with self._changed:
             self._running = True
         self._thread = threading.Thread(target=self._run, name="gr-ros2-airtime", daemon=True)
@@ -74,7 +83,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def _arrive(self, pdu: Any) -> None:
@@ -96,9 +105,14 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 self.message_port_pub(CREDIT, _ONE)
 
     def _step(self) -> tuple[list[Any], int]:
-        """What is due, after waiting for it if nothing is yet."""
+        """What is due; waits until something is due."""
         now = time.monotonic()
+        due = self._clock.first_due
         pdus, credits = self._clock.due(now), self._clock.grants(now)
+        if pdus and due is not None:
+            self.lateness.happened(due, now)
+            if self._times:
+                self.passed_at.extend([now] * len(pdus))
         if not pdus and not credits:
             at = self._clock.next_timeout(now)
             self._changed.wait(None if at is None else max(0.0, at - now))

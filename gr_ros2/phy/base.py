@@ -1,8 +1,8 @@
-"""What the adapter asks of a physical layer: packets in, packets out, and how long one is on the air.
+"""The interface of a physical layer: packets in, packets out, and the airtime of a packet.
 
 A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
 and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
-on the message port itself. Law: how long a packet is on the air depends on its length alone.
+on the message port itself. Invariant: how long a packet is on the air depends on its length alone.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Samples = npt.NDArray[np.complex64]
 class PacketTransmitter(Protocol):
     """A GNU Radio block: message port `pdus` in, one complex stream out.
 
-    :class:`gr_ros2.phy.flowgraph.Transmitter` is the base of ours.
+    :class:`gr_ros2.phy.flowgraph.TransmitterBlock` is the base class in this package.
     """
 
     @property
     def refused(self) -> int:
-        """PDUs that were no packet of the right length, as far as it tells."""
+        """PDUs that were not a packet of the right length, as far as the PHY reports them."""
 
     def packets_sent(self) -> int:
         """Packets that have left it as samples."""
@@ -39,28 +39,29 @@ class PacketTransmitter(Protocol):
 
 
 class SymbolSource(Protocol):
-    """What shows the symbols that packets are read from."""
+    """A source of the symbols from which packets are decoded, for display."""
 
     def samples(self) -> Samples | None:
-        """The newest ones, None before the first packet."""
+        """The newest symbols, None before the first packet."""
 
 
 class PacketReceiver(Protocol):
     """A GNU Radio block: one complex stream in, message port `pdus` out.
 
-    :class:`gr_ros2.phy.flowgraph.Receiver` is the base of ours.
+    :class:`gr_ros2.phy.flowgraph.ReceiverBlock` is the base class in this package.
     """
 
     @property
     def damaged(self) -> int:
-        """Packets heard that were not whole, as far as it tells."""
+        """Packets received with errors, as far as the PHY reports them."""
 
     @property
     def snr_db(self) -> float | None:
-        """SNR of the newest packets, dB over the sampled band; None before the first, or where it does not tell."""
+        """SNR of the newest packets, dB over the sampled band; None before the first, or where the PHY does not measure
+        it."""
 
     def tap_symbols(self) -> SymbolSource | None:
-        """Let the symbols that packets are read from be seen; None where that cannot be. Before the start, once."""
+        """Make the decoded symbols visible; None where the PHY cannot. Call it once, before the start."""
 
     def release(self) -> None:
         """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
@@ -68,7 +69,7 @@ class PacketReceiver(Protocol):
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PhyOptions:
-    """Of a PHY without settings beside packet length and sample rate."""
+    """Options of a PHY that has no settings except packet length and sample rate."""
 
 
 class Phy(ABC):
@@ -76,10 +77,10 @@ class Phy(ABC):
 
     :param packet_len: bytes of the longest packet, 14..4095
     :param sample_rate: samples/s of the complex stream; ignored where ``has_samples`` is False
-    :param kernels: what works on the samples: ``auto`` = compiled kernels where there are any, or ``numpy``
+    :param kernels: what processes the samples: ``auto`` = compiled kernels where they exist, or ``numpy``
     :param options: fields of ``Options``
     :raises ConfigError: for an option that is unknown or out of range, a sample rate that is not above 0 where one is
-        needed, or kernels there are none of
+        needed, or kernels that do not exist
     """
 
     name: ClassVar[str]
@@ -133,7 +134,7 @@ class Phy(ABC):
         return 1.0
 
     def check_channel(self, channel: ChannelConfig) -> None:
-        """Refuse a channel that cannot be had here.
+        """Refuse channel settings that this PHY cannot apply.
 
         :raises ConfigError: for a setting that acts on samples where there are none, or a Doppler shift beyond what
             the samples show; names it
@@ -152,7 +153,7 @@ class Phy(ABC):
             )
 
     def runs_on(self) -> str:
-        """What works on the samples, in a few words; '' where there are none."""
+        """What processes the samples, in a few words; '' for a PHY without samples."""
         return ""
 
     def leaves_tags(self) -> bool:
@@ -160,7 +161,7 @@ class Phy(ABC):
         return False
 
     def prefer_latency(self) -> None:  # noqa: B027 - most PHYs have nothing to do
-        """Called once a flowgraph with this PHY runs in real time: trade throughput for latency where that helps."""
+        """Called when a flowgraph with this PHY runs in real time: prefer latency to throughput where that helps."""
 
     @abstractmethod
     def transmitter(self) -> PacketTransmitter:
@@ -170,10 +171,10 @@ class Phy(ABC):
         """
 
     @abstractmethod
-    def receiver(self, aside: bool = False) -> PacketReceiver:
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
-        :param aside: in a process of its own where it works in Python, which keeps the ROS side free; it takes a
-            second to start, and packets come a moment after the samples have passed
+        :param own_process: run a receiver that is written in Python in a process of its own, so that it does not slow
+            down the ROS side; it takes a second to start, and packets come a moment after their samples
         :raises PhyError: for a PHY without samples
         """

@@ -1,8 +1,8 @@
 """Bursts without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
 
-Laws: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so what comes out is what went in; a packet comes
-out as soon as its last sample is in; samples between bursts are looked at once, a damaged frame is counted and the
-search goes on right behind its first sample, so that it cannot hide the next one.
+Invariants: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so each output packet equals the packet
+sent; a packet comes out as soon as its last sample is in; samples between bursts are examined once; a damaged frame is
+counted and the search continues right after its first sample, so that it cannot hide the next one.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ CRC_LEN = 4
 _KEPT = 128
 """Frames: the code of a long one takes some 100 kB."""
 _LOOKED_BACK = 16
-"""Packets whose SNRs make one: a single preamble is short, and says it to a decibel."""
+"""Packets whose SNRs are averaged (median): a single preamble is short, and gives the SNR only to 1 dB."""
 _LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
-"""Beyond these a preamble says nothing: no packet arrives, or what is left is rounding."""
+"""Limits of a measured SNR: below no packet arrives, above only rounding errors remain."""
 _SPARE = 1 << 16
-"""Samples a receiver's memory holds beside one burst; more of it means less moving."""
+"""Samples that a receiver's memory holds in addition to one burst; a larger memory is moved less often."""
 
 
 class Frame:
-    """Packet, filling, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
+    """Packet, fill bytes, CRC-32 (IEEE 802.3, little-endian, as GNU Radio's ``crc32_bb``); whitened, then coded.
 
     :param packet_len: bytes of the packet
-    :param fill: zero bytes behind the packet, within the CRC
+    :param fill: zero bytes after the packet, covered by the CRC
     :param mask: what the bytes are whitened with
     :param code: for all bits of the frame
     :param order: whether a byte's first bit on the air is its highest or its lowest
@@ -67,7 +67,7 @@ class Frame:
         return self._code.encode(np.unpackbits(np.frombuffer(whole, np.uint8) ^ self._mask, bitorder=self._order))
 
     def unwrap(self, soft: Soft) -> bytes | None:
-        """The packet that soft bits mean, or None where the CRC-32 does not match."""
+        """The packet of these soft bits, or None where the CRC-32 does not match."""
         whole = (np.packbits(self._code.decode(soft[: self.bits]), bitorder=self._order) ^ self._mask).tobytes()
         filled = whole[:-CRC_LEN]
         if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
@@ -105,7 +105,7 @@ class Frames:
         """The frame of a packet of so many bytes."""
 
     def __reduce__(self) -> Any:
-        # Codes hold GNU Radio's objects, which cannot be sent to another process: it makes its own.
+        # Codes hold GNU Radio objects, which cannot be sent to another process: that process makes its own.
         return self._again, ()
 
     @property
@@ -137,7 +137,7 @@ class Frames:
 
 @lru_cache
 def whitening(length: int) -> Octets:
-    """PN9 (x^9 + x^5 + 1, all ones at the start), as many bytes as asked for."""
+    """PN9 (x^9 + x^5 + 1, all ones at the start), ``length`` bytes."""
     state, bits = 0x1FF, np.empty(8 * length, np.uint8)
     for i in range(8 * length):
         bits[i] = state & 1
@@ -147,9 +147,9 @@ def whitening(length: int) -> Octets:
 
 @dataclass(frozen=True)
 class Search:
-    """What a modem found in samples: where a burst begins, or how far there is none.
+    """Result of a search: where a burst begins, or how many samples contain none.
 
-    :param searched: samples from the front that need not be looked at again
+    :param searched: samples from the front that need not be examined again
     :param start: index of a burst's reference sample, None where there is none (yet)
     """
 
@@ -159,12 +159,12 @@ class Search:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a burst says.
+    """A demodulated burst.
 
     :param length: bytes of its packet
-    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; filling may follow
-    :param points: what they were read from, for people to look at; magnitude about 1
-    :param snr: mean power of the burst over that of the noise in the sampled band, as its preamble shows them
+    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; fill bits may follow
+    :param points: the received constellation points, for display; magnitude about 1
+    :param snr: mean power of the burst over that of the noise in the sampled band, measured on its preamble
     :param end: index behind its last sample that was needed
     """
 
@@ -176,13 +176,13 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Constants:
-    """What a compiled kernel has to know of a modem.
+class ModemConstants:
+    """The parameters of a modem that a compiled kernel needs.
 
     :param kernel: name of the kernel
-    :param values: its parameters, by the names it has for them
-    :param soft_bits: of a reading at most, with those that say the length
-    :param points: of a reading at most
+    :param values: the kernel's parameters by name
+    :param soft_bits: number of soft bits of a reading at most, with those that say the length
+    :param points: number of points of a reading at most
     """
 
     kernel: str
@@ -198,9 +198,9 @@ class BurstModem(ABC):
     """
 
     margin = 0
-    """Samples before a burst's reference sample that ``read`` may look at."""
+    """Samples before a burst's reference sample that ``read`` may use."""
     stretch = 8192
-    """Samples searched at a time beside a preamble: what lies behind a burst is looked at again after it."""
+    """Samples searched at a time in addition to a preamble; the samples after a burst are searched again after it."""
 
     def __init__(self, frames: Frames) -> None:
         self.frames = frames
@@ -239,14 +239,14 @@ class BurstModem(ABC):
 
     @abstractmethod
     def end(self, samples: Samples, start: int) -> int:
-        """Index behind the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
+        """Index after the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
 
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
-        """The burst whose reference sample stands at ``start``, None where there is none after all."""
+        """The burst whose reference sample is at ``start``, None where the close examination finds no burst."""
 
-    def constants(self) -> Constants | None:
-        """What a compiled kernel has to know to do the same; None where there is no kernel."""
+    def constants(self) -> ModemConstants | None:
+        """The parameters of the compiled kernel of this modem; None where there is no kernel."""
         return None
 
     def lengths(self) -> dict[str, Any]:
@@ -270,7 +270,7 @@ class BurstReceiver:
         self._start: int | None = None
         self._last: int | None = None
         self.points = np.empty(0, np.complex64)
-        """What the newest packet was read from."""
+        """The constellation points of the newest packet."""
         self.damaged = 0
         """Bursts found whose CRC-32 was wrong; noise taken for a preamble counts too."""
         self._snrs: tuple[float, ...] = ()

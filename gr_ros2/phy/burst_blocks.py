@@ -1,6 +1,6 @@
-"""GNU Radio shells around a burst modem: PDUs in, samples out, and back.
+"""GNU Radio blocks around a burst modem: PDUs in, samples out, and back.
 
-Laws: a PDU that is no packet of a length there is is counted and dropped, never sent; each burst leaves at once,
+Invariants: a PDU that is no packet of a length there is is counted and dropped, never sent; each burst leaves at once,
 its gap behind it; all behaviour is in the modem.
 """
 
@@ -19,18 +19,18 @@ from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.aside import ReceiverProcess
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
 from gr_ros2.phy.fec import CodeName
-from gr_ros2.phy.flowgraph import Receiver, Transmitter
+from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
+from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
-from gr_ros2.phy.threads import Held
+from gr_ros2.phy.threads import KeptAlive
 
 STOCK = "GNU Radio's blocks"
-"""What PHYs of blocks by others run on."""
+"""Text of ``runs_on`` for PHYs made of GNU Radio's own blocks."""
 _log = logging.getLogger(__name__)
 
 
@@ -84,7 +84,7 @@ class BurstPhy(Phy):
 
     @cached_property
     def running_modem(self) -> BurstModem:
-        """The modem as it runs here."""
+        """The modem that runs here: compiled or numpy."""
         return fastest(self.modem, self.kernels)
 
     def runs_on(self) -> str:
@@ -92,19 +92,19 @@ class BurstPhy(Phy):
 
     @property
     def receiver_taps(self) -> Any:
-        """The filter the samples pass before the modem sees them; None = none."""
+        """The filter in front of the modem; None = no filter."""
         return None
 
     def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
-        # Compiled kernels leave Python's lock to others, so that a process of its own would only be one hop more.
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
+        # Compiled kernels release Python's lock, so that a process of their own would only add a hop.
         compiled = self.running_modem is not self.modem
-        return BurstSink(self, aside and not compiled and len(os.sched_getaffinity(0)) > 1)
+        return BurstSink(self, own_process and not compiled and len(os.sched_getaffinity(0)) > 1)
 
 
-class BurstTransmitter(Transmitter):
+class BurstTransmitter(TransmitterBlock):
     """Message port `pdus` in, complex stream out."""
 
     def __init__(self, phy: BurstPhy) -> None:
@@ -122,8 +122,8 @@ class BurstTransmitter(Transmitter):
         return self._modulator.sent
 
 
-class TakesPackets(Held):
-    """Message port `pdus` in of a Python block inside a hier block; stands before GNU Radio's class.
+class TakesPackets(KeptAlive):
+    """Mix-in with message port `pdus` in, for a Python block inside a hier block; list it before GNU Radio's class.
 
     :param lengths: bytes a packet may have; anything else is dropped and counted
     :param args: of GNU Radio's class
@@ -139,7 +139,7 @@ class TakesPackets(Held):
 
     @abstractmethod
     def take_packet(self, packet: bytes) -> None:
-        """What becomes of a packet."""
+        """Process a packet."""
 
     def _take(self, message: Any) -> None:
         vector = pmt.cdr(message) if pmt.is_pair(message) else message
@@ -157,8 +157,8 @@ class TakesPackets(Held):
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     """Message port `pdus` in, samples out: each packet's burst and gap.
 
-    One block and not a modulator before ``pdu_to_tagged_stream``: that one asks for room for a whole packet, and where
-    there is none sleeps until the next message comes, or 250 ms.
+    This is one block instead of a modulator before ``pdu_to_tagged_stream``: that block needs buffer space for a whole
+    packet, and without it sleeps until the next message comes, or 250 ms.
     """
 
     def __init__(self, phy: BurstPhy) -> None:
@@ -191,12 +191,12 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         return done
 
 
-class BurstSink(Receiver):
+class BurstSink(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
-    def __init__(self, phy: BurstPhy, aside: bool) -> None:
+    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx")
-        self._demodulator = _Demodulator(phy, aside)
+        self._demodulator = _Demodulator(phy, own_process)
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)
         else:
@@ -214,17 +214,17 @@ class BurstSink(Receiver):
         return self._demodulator.snr_db
 
     def tap_symbols(self) -> SymbolTap:
-        """Let the points that packets are read from be seen."""
+        """Make the received constellation points visible."""
         return SymbolTap(self._demodulator.points)
 
 
-class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
+class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Filtered samples in, message port `pdus` out."""
 
-    def __init__(self, phy: BurstPhy, aside: bool) -> None:
+    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
         self._modem = phy.running_modem
-        self._aside = aside
+        self._own_process = own_process
         self._engine: BurstReceiver | ReceiverProcess | None = None
         self._damaged = 0
         self._failed = False
@@ -241,12 +241,12 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         return self._snr_db if engine is None else engine.snr_db
 
     def points(self) -> Samples:
-        """What the newest packet was read from; empty before the first."""
+        """The constellation points of the newest packet; empty before the first."""
         engine = self._engine
         return np.empty(0, np.complex64) if engine is None else engine.points
 
     def start(self) -> bool:
-        self._engine = ReceiverProcess(self._modem, self._publish) if self._aside else BurstReceiver(self._modem)
+        self._engine = ReceiverProcess(self._modem, self._publish) if self._own_process else BurstReceiver(self._modem)
         return super().start()
 
     def stop(self) -> bool:
@@ -262,10 +262,10 @@ class _Demodulator(Held, gr.sync_block):  # type: ignore[misc]
         assert self._engine is not None
         try:
             return self._engine.feed(samples)
-        except Exception as error:  # noqa: BLE001 - raised in ``work`` it would end the block's thread, and all reception
+        except Exception as error:  # noqa: BLE001 - an exception from ``work`` would end the block's thread, and all reception
             if not self._failed:
                 self._failed = True
-                _log.exception("%s: begins anew after %s", self.name(), error)
+                _log.exception("%s: starts again after %s", self.name(), error)
             self._end_engine()
             self._engine = BurstReceiver(self._modem)
             return []

@@ -1,9 +1,9 @@
 """The simulated channel as GNU Radio blocks: fading, taps, offsets and noise on the samples, losses on the packets.
 
-Laws: noise is set from the mean power of a burst as it arrives, so `snr_db` means the same for every PHY; tags stop
-here (a transmitter's length tag would otherwise overrule the header the receiver parses); equal seeds give equal
-noise, fading and losses; every packet lost here is counted. Fading moves on with the samples, which flow while
-something is on the air.
+Invariants: noise is set from the mean power of a burst as it arrives, so `snr_db` means the same for every PHY; tags
+are removed here (a transmitter's length tag would otherwise override the header that the receiver parses); equal seeds
+give equal noise, fading and losses; every packet lost here is counted. Fading advances with the samples, which flow
+only while something is on the air.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import ThreadState
 
 _SINUSOIDS = 16
-"""Of which a fading tap is the sum; GNU Radio's manual recommends 8 or more."""
+"""Number of sinusoids that are added to one fading tap; GNU Radio's manual recommends 8 or more."""
 _FADING_SEEDS = 1009
-"""Apart, so that neighbouring seeds share no tap: GNU Radio seeds the taps seed, seed + 1, ..."""
+"""Distance between the seeds of two channels, so that neighbouring seeds share no tap: GNU Radio seeds the taps with
+seed, seed + 1, ..."""
 _LARGEST_SEED = 2**31 - 1
 
 
@@ -67,7 +68,8 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
         self.connect(self, *faded, self._model, self)
 
     def set_snr_db(self, snr_db: float | None) -> None:
-        """dB, None = no noise; heard about 8192 samples later, since the noise source has filled its buffer by then.
+        """Set the SNR in dB, None = no noise. It takes effect about 8192 samples later, because the noise source has
+        filled its buffer in advance.
 
         :raises ConfigError: out of range
         """
@@ -87,7 +89,7 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
 
 
 def _fading(config: ChannelConfig, sample_rate: float) -> Any:
-    """A block in which every tap that is not zero fades by itself."""
+    """A block in which every tap that is not zero fades independently."""
     shift, seed = config.doppler_hz / sample_rate, config.seed * _FADING_SEEDS % _LARGEST_SEED
     delays = [float(delay) for delay, tap in enumerate(config.taps) if tap]
     mags = [abs(tap) for tap in config.taps if tap]
@@ -95,9 +97,10 @@ def _fading(config: ChannelConfig, sample_rate: float) -> Any:
 
 
 class PacketLoss(gr.basic_block):  # type: ignore[misc]
-    """Message port `pdus` in and out: packets are dropped as the channel says, and counted either way.
+    """Message port `pdus` in and out: drops packets as the channel settings say, and counts all packets.
 
-    :param config: what drops packets and its seed: same seed, same losses for the same order of packets
+    :param config: the settings that drop packets, and their seed: an equal seed gives equal losses for the same order
+        of packets
     """
 
     def __init__(self, config: ChannelConfig) -> None:
@@ -106,7 +109,7 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         self.epoch = time.monotonic()
         """s, monotonic: when the run began; outages count from here."""
         self.received = 0
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.set_msg_handler(PDUS, self._pass)
@@ -122,11 +125,11 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self.epoch = time.monotonic()
-        self._block_thread.keep()
+        self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def _pass(self, pdu: Any) -> None:

@@ -29,5 +29,5 @@ class DirectPhy(Phy):
     def transmitter(self) -> PacketTransmitter:
         raise PhyError("phy direct has no transmitter; connect the source's `pdus` to the sink's")
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:  # noqa: ARG002
+    def receiver(self, own_process: bool = False) -> PacketReceiver:  # noqa: ARG002
         raise PhyError("phy direct has no receiver; connect the source's `pdus` to the sink's")

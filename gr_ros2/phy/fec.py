@@ -1,8 +1,8 @@
-"""Forward error correction of a frame's bits, by GNU Radio's FEC objects, called without its scheduler.
+"""Forward error correction of a frame's bits with GNU Radio's FEC objects, called without its scheduler.
 
-Laws: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a 1;
-what a code sends is spread over the whole frame, so that a fade takes a little of everything; a code only guesses,
-whether a frame is right its CRC says.
+Invariants: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a
+1; coded bits are interleaved over the whole frame, so that a fade affects all parts a little; a decoder always gives a
+result, and only the CRC says whether the frame is right.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ CodeName = Literal["none", "cc", "ldpc", "polar"]
 _CONSTRAINT, _POLYNOMIALS = 7, [0o117, 0o155]
 _CC_TAIL = 2 * (_CONSTRAINT - 1)
 _CC_MIDDLE, _CC_STEP = 127.5, 12.0
-"""The Viterbi decoder takes bytes: a soft bit of 10, which is certain enough, is next to their end."""
+"""Scaling of soft bits to the bytes that the Viterbi decoder takes: a soft bit of 10 is almost certain, and close to
+the end of the range."""
 _LDPC = ((152, 300, "n_0300_k_0152_gap_03"), (902, 1800, "n_1800_k_0902_gap_28"))
 """GNU Radio's codes of rate one half: data bits, coded bits, file."""
 _LDPC_ROUNDS = 25
 _LIMIT = 20.0
-"""Beyond this a soft bit is certain; the LDPC decoder works with its exponential."""
+"""Largest magnitude of a soft bit; the LDPC decoder computes its exponential."""
 _LEAST = 1e-3
 _POLAR_MOST = 2048
 _POLAR_RATE = 0.625
-"""Above this rate a code of twice the length is taken."""
+"""Above this rate a code of twice the length is used."""
 _POLAR_ROOM = int(_POLAR_MOST * _POLAR_RATE)
 _POLAR_DESIGN_DB = 1.0
 _GOLDEN = 0.618
@@ -55,15 +56,15 @@ class Code(ABC):
 
     @abstractmethod
     def encode(self, bits: Bits) -> Bits:
-        """``bits`` zeros and ones to ``coded_bits`` of them."""
+        """Encode ``bits`` bits into ``coded_bits`` bits."""
 
     @abstractmethod
     def decode(self, soft: Soft) -> Bits:
-        """``coded_bits`` soft bits to the likeliest ``bits``."""
+        """Decode ``coded_bits`` soft bits into the likeliest ``bits`` bits."""
 
 
 class Uncoded(Code):
-    """Bits as they are."""
+    """No coding."""
 
     def __init__(self, bits: int) -> None:
         super().__init__(bits)
@@ -77,7 +78,7 @@ class Uncoded(Code):
 
 
 class Spread(Code):
-    """Another code, with its bits sent in another order: neighbours end up far apart."""
+    """Interleaver around another code: it moves neighbouring bits far apart."""
 
     def __init__(self, inner: Code) -> None:
         super().__init__(inner.bits)
@@ -120,9 +121,10 @@ class Convolutional(Code):
 
 
 class Blocks(Code):
-    """A block code for any number of bits: cut into as few blocks as do, each of the same number of bits.
+    """A block code for any number of bits: the bits are divided into as few blocks as possible, each of the same number
+    of bits.
 
-    Bits a block has room for beyond that are zeros that both ends know and nobody sends ("shortening").
+    The remaining data bits of a block are zeros that both ends know and that are not sent ("shortening").
 
     :param room: data bits of a block
     """
@@ -189,7 +191,7 @@ class Ldpc(Blocks):
         out = []
         for block in self.blocks_of(bits):
             word[: self.each] = block
-            # The data stand behind the checks.
+            # The data bits follow the check bits.
             out.append(_work(matrix.encoder, word, matrix.size)[: matrix.checks + self.each])
         return np.concatenate(out)
 
@@ -197,7 +199,7 @@ class Ldpc(Blocks):
         matrix = self._matrix
         levels = np.full(matrix.size, -_LIMIT, np.float32)
         out = []
-        # It also divides by what is 0 for a bit of which nothing is known.
+        # The decoder also divides by a value that is 0 for an unknown bit.
         known = np.where(np.abs(soft) < _LEAST, np.float32(_LEAST), np.clip(soft, -_LIMIT, _LIMIT))
         for block in known.reshape(self.count, -1):
             levels[: block.size] = block
@@ -207,7 +209,8 @@ class Ldpc(Blocks):
 
 
 def _ldpc_decoder(path: str) -> Any:
-    """One that takes log likelihood ratios: GNU Radio's own do from 3.10.8 on, before that those of a sigma of √½."""
+    """A decoder that takes log-likelihood ratios: GNU Radio's decoder does so from 3.10.8 on; before, it takes those of
+    a sigma of √½."""
     try:
         return fec.ldpc_decoder.make(path, 0.5**0.5, _LDPC_ROUNDS)
     except TypeError:
@@ -242,7 +245,8 @@ class Polar(Blocks):
 
 
 def capacities(size: int, design_db: float) -> NDArray[np.float64]:
-    """Of a polar code's bit channels, for an erasure channel as good as white noise at this Es/N0 (Arikan, 2009).
+    """Capacities of a polar code's bit channels, for an erasure channel with the capacity of white noise at this Es/N0
+    (Arikan, 2009).
 
     :param size: coded bits, a power of 2
     """

@@ -1,7 +1,7 @@
-"""Flowgraphs and hier blocks that begin and end cleanly.
+"""Flowgraphs and hier blocks that start and stop cleanly.
 
-Laws: after a flowgraph's ``stop`` none of its threads runs, whatever state it was in; after a hier block's
-``release`` nothing holds it, its blocks or their buffers but who made it.
+Invariants: after a flowgraph's ``stop`` none of its threads runs, whatever its state was; after a hier block's
+``release`` only its creator still refers to it, its blocks or their buffers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import SymbolSource
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.threads import start_flowgraph
 
 _Self = TypeVar("_Self", bound="Flowgraph")
 
@@ -24,7 +24,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
     """Blocks that start and stop together, for instance in a ``with`` statement.
 
     :param name: in GNU Radio's log
-    :param called: in errors
+    :param called: its name in errors
     """
 
     def __init__(self, name: str, called: str) -> None:
@@ -39,11 +39,11 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
         """
         self._running = True
         try:
-            begin(partial(super().start, max_noutput_items))
+            start_flowgraph(partial(super().start, max_noutput_items))
         except PhyError as error:
             self.stop()
             raise PhyError(f"{self._called}: {error}") from error
-        except BaseException:  # Ctrl-C: nobody is there yet to stop what has begun
+        except BaseException:  # Ctrl-C: the caller cannot stop a flowgraph that has not started completely
             self.stop()
             raise
 
@@ -67,7 +67,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
 class HierBlock(gr.hier_block2):  # type: ignore[misc]
     """A hier block with message ports.
 
-    GNU Radio's ``disconnect_all`` forgets stream connections only. The message connections would go on holding it, and
+    GNU Radio's ``disconnect_all`` forgets stream connections only. The message connections would keep it alive, and
     with it shared memory, of which a system has 4096 segments: an OFDM receiver of stock blocks takes 60.
     """
 
@@ -83,13 +83,13 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
     def release(self) -> None:
         """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
         while self._messages:
-            # From a port of its own GNU Radio disconnects, and then raises, since nobody has subscribed to that.
+            # GNU Radio disconnects a hier block's own port, but then raises, because nothing has subscribed to it.
             with suppress(RuntimeError):
                 self.msg_disconnect(*self._messages.pop())
         self.disconnect_all()
 
 
-class Transmitter(HierBlock):
+class TransmitterBlock(HierBlock):
     """Message port `pdus` in, complex stream out.
 
     :param name: in GNU Radio's log
@@ -104,11 +104,12 @@ class Transmitter(HierBlock):
 
     @property
     def refused(self) -> int:
-        """PDUs that were no packet of the right length; 0 where GNU Radio's own blocks take them and do not tell."""
+        """PDUs that were not a packet of the right length; 0 where GNU Radio's own blocks receive them and do not
+        report this."""
         return 0
 
     def leave_by(self, block: Any) -> None:
-        """Let samples leave from a block within."""
+        """Connect the output to a block inside."""
         self._last = block
         self.connect(block, self)
 
@@ -116,12 +117,12 @@ class Transmitter(HierBlock):
         """Packets that have left as samples; 0 before the flowgraph runs."""
         try:
             return int(self._last.nitems_written(0)) // self._airtime_samples
-        except RuntimeError:  # GNU Radio's counters exist while the block is part of a running flowgraph only
+        except RuntimeError:  # GNU Radio's counters exist only while the block is part of a running flowgraph
             return 0
 
 
-class Receiver(HierBlock):
-    """Complex stream in, message port `pdus` out. What it does not tell of packets has no number.
+class ReceiverBlock(HierBlock):
+    """Complex stream in, message port `pdus` out. Values that a receiver does not measure are 0 or None.
 
     :param name: in GNU Radio's log
     """
@@ -132,7 +133,7 @@ class Receiver(HierBlock):
 
     @property
     def damaged(self) -> int:
-        """Packets heard that were not whole."""
+        """Packets received with errors."""
         return 0
 
     @property
@@ -141,5 +142,5 @@ class Receiver(HierBlock):
         return None
 
     def tap_symbols(self) -> SymbolSource | None:
-        """Let the points that packets are read from be seen."""
+        """Make the received constellation points visible."""
         return None

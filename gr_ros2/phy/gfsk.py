@@ -1,9 +1,9 @@
 """The `gfsk` PHY: binary frequency-shift keying, Gaussian pulses, modulation index 1/2 (GMSK), constant envelope.
 
-Law: what is sent is what GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher frequency), so a
-discriminator can receive it too; this receiver does not use one. At modulation index 1/2 the signal is, but for a few
-percent of its energy, a sequence of overlapping pulses whose phase steps by a quarter turn, forwards or back (Laurent,
-IEEE Trans. Commun. 34-2, 1986): it is received coherently, about 4 dB better than by a discriminator behind a filter.
+Invariant: what is sent is what GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher frequency), so a
+discriminator can receive it too; this receiver does not use one. At modulation index 1/2 the signal is, except for a
+few percent of its energy, a sequence of overlapping pulses whose phase steps by plus or minus 90 degrees (Laurent, IEEE
+Trans. Commun. 34-2, 1986). It is received coherently, about 4 dB better than by a filter and a discriminator.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PULSE_SYMBOLS = 4
 _LEAD, _TAIL = 4, _PULSE_SYMBOLS + 2
 """Filler bits around preamble and payload, for the pulses that reach beyond them."""
 _DESIGN_NOISE = 0.1
-"""Noise over symbol energy the receiver's filter is made for: 10 dB."""
+"""Noise over symbol energy for which the receiver's filter is designed: 10 dB."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -75,8 +75,9 @@ class GfskModem(LinearModem):
 
     @property
     def before_payload(self) -> int | None:
-        # A bit is 1 where the phase is that of the symbol before, the first one's before is the preamble's last. With a
-        # code the bits were sent so that the phases themselves are the bits, since a decoder minds errors in pairs.
+        # A bit is 1 where the phase equals that of the symbol before; before the first bit comes the last symbol of the
+        # preamble. With a code the bits are precoded so that the phases themselves are the bits, because errors in
+        # pairs would disturb the decoder.
         return None if self.frames.coded else int(self._last)
 
 
@@ -111,9 +112,9 @@ def main_pulse(pulse: Reals, sps: int) -> Reals:
 
 
 def wiener(pulse: Reals, sps: int) -> Reals:
-    """The filter after which symbols of this pulse differ least from what was sent, in noise of ``_DESIGN_NOISE``.
+    """The Wiener filter for symbols of this pulse in noise of ``_DESIGN_NOISE``.
 
-    Every second neighbour lies a quarter turn beside the decision and does not count. The filter is as long as the
+    Every second neighbour is orthogonal to the decision (90 degrees) and does not count. The filter is as long as the
     pulse, so that its tail is over with the burst.
     """
     size = len(pulse)
@@ -130,8 +131,8 @@ def wiener(pulse: Reals, sps: int) -> Reals:
 class GfskPhy(LinearPhy):
     """For cheap transmitters and nonlinear amplifiers: the envelope is constant while a burst lasts.
 
-    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 1..4095 B. The computed curve is that
-    of antipodal pulses, which GMSK comes near to at a bandwidth-time product of 0.5 (MSK is equal).
+    Carrier offset up to 5 % of the bit rate, clocks within 100 ppm; packets of 1..4095 B. The computed curve is that of
+    antipodal pulses; GMSK is close to it at a bandwidth-time product of 0.5 (MSK equals it).
 
     :param options: see :class:`GfskOptions`
     :raises ConfigError: for an option that is unknown or out of range

@@ -1,8 +1,8 @@
 """How a burst says how long its packet is: 32 bits of which any two differ in 8 at least.
 
-Law: the word of a length is the 32 bits of the header of GNU Radio's OFDM frames (``packet_header_default``): 12 bits
-length, 12 bits frame number, CRC-8. GNU Radio counts frames in the number; here it is the parity of the length in the
-extended Golay code (24, 12, 8), so that the likeliest length is right where a packet with a code can be read.
+Invariant: the word of a length is the 32 bits of the header of GNU Radio's OFDM frames (``packet_header_default``): 12
+bits length, 12 bits frame number, CRC-8. GNU Radio counts frames in the number; here it is the parity of the length in
+the extended Golay code (24, 12, 8), so that the likeliest length is right where a packet with a code can be read.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Single-carrier bursts: phase-shift keying with a known preamble, synchronised feed-forward.
 
-Laws: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is one
-only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
+Invariants: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is
+one only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
 preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before; the
 payload begins with the word of its length, where lengths differ.
 """
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frames, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.length_word import WORD_BITS, LengthWord
@@ -29,21 +29,21 @@ PREAMBLE = 64
 _SLACK = 4
 """Samples after the last symbol that interpolation and a late start may need."""
 _THRESHOLD = 0.31
-"""Correlation of the phase steps over the most that equal ones could have, from which on samples are looked at closely:
-noise alone passes once in 500, a burst that can be read with a code has 0.35, without one 0.7."""
+"""Threshold of the normalised correlation of the phase steps, above which samples are examined closely. Noise alone
+passes once in 500; a readable burst has 0.35 with a code, 0.7 without one."""
 _ALIKE = 0.28
-"""Share of the preamble's power in a single carrier, from which on it is one: a burst that can be read has 0.3, noise
-once in several 10^6 samples."""
+"""Threshold of the share of the preamble's power in a single carrier, above which it is a burst. A readable burst has
+0.3; noise reaches the threshold once in several 10^6 samples."""
 _RISE = 16
-"""Symbols before its summit at which the correlation of a strong burst may pass the threshold."""
+"""Symbols before its peak at which the correlation of a strong burst may pass the threshold."""
 _CHUNK = 256
-"""Symbols between two looks at the timing: clocks may differ by 100 ppm."""
+"""Symbols between two estimates of the timing: clocks may differ by 100 ppm."""
 _BLOCK = 64
 """Symbols per estimate of the phase."""
 _EDGE = 4
-"""Symbols at either end of the preamble that what lies beside it may reach into."""
+"""Symbols at either end of the preamble that may be disturbed by the neighbouring samples."""
 _REACH = 3
-"""Half symbols either side of a symbol from which something of it may come: echoes, and the pulse's own tails."""
+"""Half symbols on either side of a symbol that contribute to it: echoes, and the tails of the pulse."""
 _TINY = 1e-30
 
 
@@ -57,7 +57,7 @@ def preamble_steps() -> NDArray[np.int8]:
 
 
 class _Carrier(NamedTuple):
-    """A preamble's symbols without their signs, and the carrier that is left.
+    """A preamble's symbols without their signs, and the remaining carrier.
 
     :param symbols: as received
     :param frequency: radians per symbol, without the modulation's own turn
@@ -131,10 +131,10 @@ class LinearModem(BurstModem):
     @property
     @abstractmethod
     def preamble(self) -> Samples:
-        """The beginning of every burst, as sent."""
+        """The first samples of every burst, as sent."""
 
     def _prepare_estimate(self) -> None:
-        """Learn what the preamble is like behind the filter, without noise."""
+        """Compute the preamble after the receive filter, without noise."""
         pause = np.zeros(2 * _RISE * self.sps)
         clean = np.convolve(np.concatenate((pause, self.preamble, pause)), self.taps).astype(np.complex64)
         start = self.find(clean).start
@@ -144,7 +144,7 @@ class LinearModem(BurstModem):
         shifts = [round(half * self.sps / 2) for half in range(-_REACH, _REACH + 1)]
         columns = np.stack([clean[places + shift] for shift in shifts], axis=1) * self._known[inner, None].conj()
         self._clean_energy = float((np.abs(columns[:, _REACH]) ** 2).sum())
-        # A carrier that is measured wrongly turns a column in proportion to the place.
+        # An error of the measured carrier rotates a column in proportion to its position.
         columns = np.concatenate((columns, columns[:, _REACH : _REACH + 1] * (inner[:, None] - PREAMBLE / 2)), axis=1)
         basis, _ = np.linalg.qr(columns)
         self._explained = np.asarray(basis.conj().T, np.complex64)
@@ -231,7 +231,9 @@ class LinearModem(BurstModem):
             known_at, known = float(places[-1]), float(drift[-1])
             if first + count < symbols:
                 model = turned * np.exp(-1j * drift) * self.constellation.nearest(straight).conj()
-                late += summit(*(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1)))
+                late += parabola_peak(
+                    *(float((_at(samples, at + off, sps, count) * model).real.sum()) for off in (-1, 0, 1))
+                )
         decided = self.constellation.nearest(points)
         gain, noise = spread_about(points, decided)
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
@@ -239,19 +241,19 @@ class LinearModem(BurstModem):
 
     @property
     def before_payload(self) -> int | None:
-        """The last bit before the payload where a bit of the frame says whether the phase stays; None where it is the
-        phase."""
+        """The last bit before the payload where a bit of the frame says whether the phase stays (differential); None
+        where the bit is the phase."""
         return None
 
     def meant(self, soft: Soft) -> Soft:
-        """Soft bits of the frame from those of the phases: the same unless the modulation has memory."""
+        """Soft bits of the frame from the soft bits of the phases: equal unless the modulation has memory."""
         if self.before_payload is None:
             return soft
         certain = np.float32(np.inf if self.before_payload else -np.inf)
         before = np.concatenate(([certain], soft[:-1]))
         return np.asarray(np.sign(soft) * np.sign(before) * np.minimum(np.abs(soft), np.abs(before)), np.float32)
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         bits, points = self.constellation.bits, self.payload_symbols(self.frames.packet_len)
         before = self.before_payload
         values = {
@@ -279,24 +281,24 @@ class LinearModem(BurstModem):
             "points": self.constellation.points,
             "marks": self.constellation.marks,
         }
-        return Constants("linear", values, points * bits, points)
+        return ModemConstants("linear", values, points * bits, points)
 
     def _measure(self, samples: Samples, start: int) -> tuple[float, float, float]:
         """Carrier frequency and phase from the preamble, in radians per symbol and radians, and SNR.
 
-        The turn of the modulation counts as carrier here.
+        The rotation of the modulation counts as carrier frequency here.
         """
         symbols, frequency, _ = self._carrier(samples, start)
         straight = symbols * np.exp(-1j * frequency * np.arange(PREAMBLE))
         return frequency + self._turn, float(np.angle(straight.sum())), self._snr(straight[_EDGE:-_EDGE])
 
     def _carrier(self, samples: Samples, start: int) -> _Carrier:
-        """Look closely at a preamble."""
+        """Examine a preamble closely."""
         size = 4 * PREAMBLE
         symbols = samples[start : start + PREAMBLE * self.sps : self.sps] * self._known.conj()
         height = np.abs(np.fft.fft(symbols, size))
         peak = int(np.argmax(height))
-        place = peak + summit(height[peak - 1], height[peak], height[(peak + 1) % size])
+        place = peak + parabola_peak(height[peak - 1], height[peak], height[(peak + 1) % size])
         frequency = 2 * np.pi * ((place + size / 2) % size - size / 2) / size
         power = PREAMBLE * float(np.vdot(symbols, symbols).real)
         return _Carrier(symbols, frequency, float(height[peak]) ** 2 / max(power, _TINY))
@@ -304,7 +306,8 @@ class LinearModem(BurstModem):
     def _snr(self, received: Samples) -> float:
         """Mean power of a burst over that of the noise, from its preamble's inner symbols.
 
-        What an echo, a place between samples or the pulse itself adds to a symbol from its neighbours is no noise.
+        Interference from neighbouring symbols (by an echo, a timing between samples or the pulse) does not count as
+        noise.
         """
         explained = self._explained @ received
         unknowns, count = self._explained.shape
@@ -314,13 +317,13 @@ class LinearModem(BurstModem):
         return float((total - count * noise) / (self._clean_energy * noise))
 
     def _lateness(self, samples: Samples, start: int, frequency: float) -> float:
-        """Samples by which the preamble's symbols lie behind ``start``, -0.5..0.5."""
+        """Samples by which the preamble's symbols are later than ``start``, -0.5..0.5."""
         model = self._known.conj() * np.exp(-1j * (frequency - self._turn) * np.arange(PREAMBLE))
         heights = (
             abs((samples[at : at + PREAMBLE * self.sps : self.sps] * model).sum())
             for at in (start - 1, start, start + 1)
         )
-        return summit(*(float(height) for height in heights))
+        return parabola_peak(*(float(height) for height in heights))
 
 
 class LinearPhy(BurstPhy):
@@ -346,7 +349,7 @@ class LinearPhy(BurstPhy):
 
 
 def shape(symbols: NDArray[_T], taps: Reals, sps: int) -> NDArray[_T]:
-    """Symbols one pulse each, ``sps`` samples apart: (symbols - 1) * sps + taps samples."""
+    """One pulse per symbol, ``sps`` samples apart: (symbols - 1) * sps + taps samples."""
     out = np.zeros((len(symbols) - 1) * sps + len(taps), symbols.dtype)
     for phase in range(sps):
         part = np.convolve(symbols, taps[phase::sps])
@@ -355,7 +358,7 @@ def shape(symbols: NDArray[_T], taps: Reals, sps: int) -> NDArray[_T]:
 
 
 def _at(samples: Samples, at: float, step: int, count: int) -> NDArray[np.complex64]:
-    """``count`` values ``step`` samples apart from a fractional place on, by cubic interpolation."""
+    """``count`` values ``step`` samples apart, from a fractional position on, by cubic interpolation."""
     base = int(np.floor(at))
     x = at - base
     weights = (-x * (x - 1) * (x - 2) / 6, (x + 1) * (x - 1) * (x - 2) / 2, -(x + 1) * x * (x - 2) / 2,
@@ -367,7 +370,7 @@ def _at(samples: Samples, at: float, step: int, count: int) -> NDArray[np.comple
     return total
 
 
-def summit(before: float, at: float, after: float) -> float:
-    """Where the parabola through three neighbours is highest, -0.5..0.5 from the middle one."""
+def parabola_peak(before: float, at: float, after: float) -> float:
+    """Position of the maximum of the parabola through three neighbours, -0.5..0.5 from the middle one."""
     bend = before - 2 * at + after
     return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0 else 0.0

@@ -1,16 +1,18 @@
 """One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, sink.
 
-Laws: any PHY of the table goes in; one without samples skips transmitter, channel and receiver; no block stands here
-that does nothing, since each Python block costs a packet as much as source or sink do.
+Invariants: any PHY of the table works here; a PHY without samples skips transmitter, channel and receiver; a block that
+would do nothing is left out, since each Python block costs as much time per packet as source or sink.
 """
 
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import PacketLoss
@@ -27,14 +29,14 @@ class LoopbackLink(PacketPath, Flowgraph):
     :param phy: which physical layer
     :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``, and `credit` in where
         ``paced``
-    :param sink: block with message port `pdus` in, which counts the PDUs it is done with in ``handled``
+    :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
     :param pace: `airtime` as on the air (:class:`AirtimeGate`), `flow` as fast as the flowgraph takes it
         (:class:`CreditWindow`)
-    :param paced: their credits pace the source; False offers every packet at once, as the paper does. With a PHY
-        without samples there is nothing to pace by, except with pace `flow`
-    :param instrumented: build in what a person at a dashboard uses: packet loss that can be set on any PHY, a channel
-        that can be changed, and taps for spectrum and constellation
+    :param paced: credits pace the source; False offers every packet at once, as the paper does. A PHY without samples
+        has no airtime to pace by, except with pace `flow`
+    :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
+        changed, and taps for spectrum and constellation
     :raises ConfigError: for a channel that this PHY cannot have
     """
 
@@ -58,14 +60,16 @@ class LoopbackLink(PacketPath, Flowgraph):
         self._pace = pace
         last = source
         if phy.has_samples and pace == "airtime":
-            self._gate = AirtimeGate(phy.airtime(), airtime_of=phy.airtime if phy.any_length else None)
+            airtime_of = phy.airtime if phy.any_length else None
+            self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)
         if phy.has_samples:
             # The channel also stops tags.
             faded = instrumented or bool(self.channel.on_samples()) or phy.leaves_tags()
             self._receive(self._transmit(last), faded=faded, shown=instrumented)
             last = self._receiver
-            # A hier block with message ports holds itself, and 60 of the system's 4096 shared memory segments for OFDM.
+            # A hier block with message ports keeps itself alive, and with it, for OFDM, 60 of the system's 4096 shared
+            # memory segments.
             for hier_block in (self._transmitter, self._receiver):
                 if hier_block is not None:
                     weakref.finalize(self, hier_block.release)
@@ -73,7 +77,7 @@ class LoopbackLink(PacketPath, Flowgraph):
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)
         self._follow(last, sink)
-        # Kept, since GNU Radio holds no reference to a Python block.
+        # Keep a reference, since GNU Radio holds none to a Python block.
         self._pacer = CreditWindow(self._progress) if pace == "flow" else self._gate
         if paced and self._pacer is not None:
             source.use_credit()
@@ -85,9 +89,17 @@ class LoopbackLink(PacketPath, Flowgraph):
             self.phy.prefer_latency()
 
     def run_began(self, now: float) -> None:
-        """Let the channel's outages count from now, s, monotonic, and not from the start of the flowgraph."""
+        """Count the channel's outages from ``now`` (s, monotonic) instead of from the start of the flowgraph."""
         if self._loss is not None:
             self._loss.epoch = now
+
+    def gate_lateness(self) -> Lateness | None:
+        """Of the gate; None where there is none."""
+        return None if self._gate is None else self._gate.lateness
+
+    def passed_at(self) -> Sequence[float]:
+        """s, monotonic, when each packet passed the gate; () where there is none."""
+        return () if self._gate is None else self._gate.passed_at
 
     def _offered(self) -> int:
         return int(self.source.emitted)
@@ -96,7 +108,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         return int(self.sink.handled)
 
     def _progress(self) -> int:
-        """Packets that are through, as far as a window has to know."""
+        """Packets that have passed the link, for the credit window."""
         if self._transmitter is None:
             return self._handled() + (0 if self._loss is None else self._loss.dropped.total())
         return int(self._transmitter.packets_sent())

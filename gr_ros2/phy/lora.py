@@ -1,9 +1,9 @@
-"""The `lora` PHY: chirp spread spectrum after LoRa's example, for links far below the noise.
+"""The `lora` PHY: chirp spread spectrum similar to LoRa, for links far below the noise.
 
-Laws: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame, whose length is told
-by chirps before it where lengths differ; the format is our own (it has LoRa's chirps, Gray code, diagonal interleaver
-and Hamming code, but CRC-32, PN9 and no header), so it does not talk to LoRa modems. With `implementation: lora_sdr`
-all of this is that module's.
+Invariants: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame, whose length is
+told by chirps before it where lengths differ; the format is our own (it has LoRa's chirps, Gray code, diagonal
+interleaver and Hamming code, but CRC-32, PN9 and no header), so it does not talk to LoRa modems. With `implementation:
+lora_sdr` the module gr-lora_sdr determines all of this.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
-from gr_ros2.phy.burst import CRC_LEN, BurstModem, Constants, Frames, Reading, Samples, Search
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
-from gr_ros2.phy.linear import summit
+from gr_ros2.phy.linear import parabola_peak
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 
@@ -33,28 +33,28 @@ _HEAD = _UP + len(_SYNC) + _DOWN
 _TELLING = 4
 """Chirps that tell the length: with fewer a code's gain would end where they are misheard."""
 _LOOK = 6
-"""Up-chirps added up to see a burst."""
+"""Up-chirps whose spectra are added to detect a burst."""
 _LIMIT, _THRESHOLD = 10.0, 36.0
-"""Powers over the mean of all bins: what one chirp counts at most, and what a burst's chirps add up to. A burst that
-can be read has 50, noise alone passes once in 10^6 symbols."""
+"""Powers relative to the mean of all bins: the limit for one chirp, and the detection threshold for the sum of a
+burst's chirps. A readable burst has 50; noise alone passes once in 10^6 symbols."""
 _MEDIAN = (1 - 1 / (9 * _LOOK)) ** 3
-"""Of the noise in a bin that so many chirps add up to, over its mean: a chi-squared distribution's."""
+"""Median over mean of the noise in a bin after adding ``_LOOK`` chirps (chi-squared distribution)."""
 _TINY = 1e-20
 _FINE = 4
-"""Parts of a bin that peaks are searched in."""
+"""Steps per bin in the search for peaks."""
 _CHUNK = 2048
-"""Samples between two looks at the timing, at least a symbol."""
+"""Samples between two estimates of the timing, at least a symbol."""
 _GAIN, _PACE_GAIN = 0.3, 0.05
-"""Of the timing loop, per look: place, and speed of its change."""
+"""Gains of the timing loop, per estimate: of the timing, and of its rate of change."""
 _CERTAIN = 50.0
-"""Of a soft bit."""
+"""Largest magnitude of a soft bit."""
 _NIBBLE = np.array([8, 4, 2, 1])
 """Weights of a nibble's bits, in the order they come."""
 _SINC = 12
-"""Samples to either side that a value between two samples is made from."""
+"""Samples on either side from which a value between two samples is interpolated."""
 _SDR_ONLY = ("oversampling", "sync_word", "ldro", "carrier_hz")
 _SDR_GAP, _SDR_LEAST_GAP = 32, 24
-"""Chips; what filter and synchroniser of the module's receiver hold back are 20."""
+"""Default and least gap, chips; filter and synchroniser of the module's receiver delay by 20."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -88,8 +88,8 @@ class LoraOptions(BurstOptions):
     carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9)] | None = None
 
 
-class _Place(NamedTuple):
-    """Where a burst's payload begins, carrier offset in bins, and SNR."""
+class _ChirpPlace(NamedTuple):
+    """Position of a burst's payload, carrier offset in bins, and SNR."""
 
     begin: float
     carrier: float
@@ -97,7 +97,8 @@ class _Place(NamedTuple):
 
 
 class LoraModem(BurstModem):
-    """See :class:`LoraOptions`. The reference sample is the first of an up-chirp early in the preamble, about."""
+    """See :class:`LoraOptions`. The reference sample is approximately the first of an up-chirp early in the
+    preamble."""
 
     def __init__(self, frames: Frames, options: LoraOptions) -> None:
         super().__init__(frames)
@@ -159,8 +160,8 @@ class LoraModem(BurstModem):
         powers = np.abs(np.fft.fft(samples[: count * self.chips].reshape(count, -1) * self._down)) ** 2
         mean = powers.mean(axis=1, keepdims=True)
         powers = np.where(np.isfinite(mean), powers / np.maximum(mean, _TINY), 0.0)
-        # Neighbours count together: a burst that starts between two samples shares its peak between two bins. However
-        # strong, one chirp counts no more than a few times the noise: data repeat a value now and then, and end.
+        # Neighbouring bins are added: a burst that starts between two samples has its peak in two bins. The power of
+        # one chirp is limited to a few times the noise, because data may repeat a value and then end.
         pairs = np.minimum(powers + np.roll(powers, 1, axis=1), _LIMIT)
         # Not as differences of running sums: strong chirps add up to the same, and rounding would choose among them.
         pairs = np.add.reduce([pairs[first : count - _LOOK + 1 + first] for first in range(_LOOK)])
@@ -168,7 +169,7 @@ class LoraModem(BurstModem):
         if not len(above):
             return Search((count - _LOOK) * self.chips)
         first = int(above[0])
-        if first + _LOOK >= len(pairs):  # a strong burst is seen as it comes in; the best place is yet to come
+        if first + _LOOK >= len(pairs):  # a strong burst is detected early; its best position is still to come
             return Search(first * self.chips)
         best = first + int(np.argmax(pairs[first : first + _LOOK + 1].max(axis=1)))
         late = int(np.argmax(np.minimum(powers[best : best + _LOOK], _LIMIT).sum(axis=0)))
@@ -176,19 +177,20 @@ class LoraModem(BurstModem):
 
     def end(self, samples: Samples, start: int) -> int:
         place = self._place(samples, start)
-        # What is no burst need not be waited for; of one, clocks and channel may keep back a few samples.
+        # Samples without a burst need no waiting; the end of a burst may come a few samples late, by clocks and
+        # channel.
         return start + self.span if place is None else self._end(place, self._length(samples, place))
 
-    def _end(self, place: _Place, length: int) -> int:
+    def _end(self, place: _ChirpPlace, length: int) -> int:
         return round(place.begin) + (self._before + self.symbols(length)) * self.chips - _SINC
 
-    def _tones(self, samples: Samples, place: _Place, first: float, count: int) -> NDArray[np.complex64]:
+    def _tones(self, samples: Samples, place: _ChirpPlace, first: float, count: int) -> NDArray[np.complex64]:
         """So many chirps from a place on, as tones, by rows."""
         turn = np.exp(-2j * np.pi * place.carrier * np.arange(self.chips) / self.chips) * self._down
         rows = _delayed(samples, first, count * self.chips).reshape(count, self.chips)
         return np.asarray(rows * turn, np.complex64)
 
-    def _length(self, samples: Samples, place: _Place) -> int:
+    def _length(self, samples: Samples, place: _ChirpPlace) -> int:
         """Bytes of the packet."""
         if not self._before:
             return self.frames.packet_len
@@ -220,7 +222,7 @@ class LoraModem(BurstModem):
             begin += pace - _GAIN * late
         return Reading(length, self._collect(soft), points, place.snr, self._end(place, length))
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         symbols = self.symbols(self.frames.packet_len)
         values = {
             **self.lengths(),
@@ -247,25 +249,25 @@ class LoraModem(BurstModem):
             "tapered": self._tapered,
             "words": self._words,
         }
-        return Constants("lora", values, self.blocks(self.frames.packet_len) * self.spreading_factor * 4, symbols)
+        return ModemConstants("lora", values, self.blocks(self.frames.packet_len) * self.spreading_factor * 4, symbols)
 
     def _soft(self, heights: NDArray[np.float64]) -> Soft:
         """Log-likelihood ratios of the bits of chirps, from the height of each bin."""
         powers = (heights**2).sum(axis=1)
         peaks = heights.max(axis=1)
         noise = max(float((powers - peaks**2).mean()) / (self.chips - 1), _TINY)
-        # For a bin's height h, of amplitude a if its chirp was sent: log I0(2 a h / noise) is 2 a h / noise, nearly.
+        # For a bin of height h, and amplitude a if its chirp was sent, log I0(2 a h / noise) is about 2 a h / noise.
         likely = heights * (2 * peaks.mean() / noise)
         bits = [likely[:, ones].max(1) - likely[:, zeros].max(1)
                 for ones, zeros in zip(self._ones, self._zeros, strict=True)]  # fmt: skip
-        # Beside certainties without limit, those of noisier chirps in the same code word would count for nothing.
+        # Without a limit, very certain bits would hide the bits of noisier chirps in the same code word.
         return np.asarray(np.clip(np.stack(bits, axis=1), -_CERTAIN, _CERTAIN), np.float32)
 
     def _late(self, tones: NDArray[np.complex64], peaks: NDArray[np.int64]) -> float:
-        """Samples by which windows lie behind their chirps, -0.5..0.5.
+        """Samples by which windows are later than their chirps, -0.5..0.5.
 
-        Not simply how far a tone lies above its bin: where a chirp jumps back by the whole band, lateness turns the
-        phase. Lateness turns each sample by the chirp's frequency there.
+        This is more than the distance of a tone from its bin: where a chirp jumps back by the whole band, a delay
+        rotates the phase. A delay rotates each sample by the chirp's frequency at that sample.
         """
         n = np.arange(self.chips)
         still = tones * self._roots[peaks[:, None] * -n % self.chips]
@@ -275,8 +277,8 @@ class LoraModem(BurstModem):
         turned = float((part * whole.conj()).imag.sum())
         return float(np.clip(turned * 6 / (np.pi * max(power, _TINY)), -0.5, 0.5))
 
-    def _place(self, samples: Samples, start: int) -> _Place | None:
-        """Look closely at a preamble; None where this is no burst."""
+    def _place(self, samples: Samples, start: int) -> _ChirpPlace | None:
+        """Examine a preamble closely; None where this is no burst."""
         windows = samples[start : start + (_HEAD + 1) * self.chips]
         windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
         falls = self._powers(windows, self._up)
@@ -288,9 +290,9 @@ class LoraModem(BurstModem):
             return None
         fall = self._bin(pairs[at])
         rise = self._bin(self._powers(windows[: at - len(_SYNC)], self._down).sum(axis=0))
-        # Lateness moves rising and falling chirps apart, carrier offset moves them together.
+        # A delay moves up-chirps and down-chirps in opposite directions, a carrier offset in the same direction.
         begin = start + (at + _DOWN) * self.chips + round((fall - rise) / 2)
-        # Once more where the windows meet the chirps: between two chirps a fraction of a sample turns the phase.
+        # Repeat it with windows aligned to the chirps: between two chirps a fraction of a sample rotates the phase.
         first = begin - (_DOWN + len(_SYNC) + _LOOK) * self.chips
         if first < 0 or begin > len(samples):
             return None
@@ -299,7 +301,7 @@ class LoraModem(BurstModem):
         rise = self._bin(rises)
         fall = self._bin(self._powers(windows[-_DOWN:], self._up).sum(axis=0))
         snr = self._snr(windows[:_LOOK], float(rises.max()))
-        return _Place(begin + (fall - rise) / 2, (fall + rise) / 2, snr)
+        return _ChirpPlace(begin + (fall - rise) / 2, (fall + rise) / 2, snr)
 
     def _snr(self, chirps: Samples, top: float) -> float:
         """Power of a burst over that of the noise.
@@ -307,20 +309,20 @@ class LoraModem(BurstModem):
         :param chirps: its up-chirps
         :param top: of the spectrum that they add up to
         """
-        # Tapered, since a chirp between two samples breaks off where it jumps back, and is heard in all bins; the
-        # median, since an echo has a bin of its own.
+        # A window function, since a chirp between two samples has a jump whose power is in all bins; the median, since
+        # an echo has its own bin.
         powers = (np.abs(np.fft.fft(chirps * self._tapered)) ** 2).sum(axis=0)
         noise = max(float(np.median(powers)) * self._median_share, _TINY)
         return (top / (_LOOK * self.chips) - noise) / (noise * self.chips)
 
     def _powers(self, windows: Samples, chirp: Samples) -> NDArray[np.float64]:
-        """Spectra of windows against a chirp, ``_FINE`` places a bin."""
+        """Spectra of windows multiplied with a chirp, ``_FINE`` values per bin."""
         return np.asarray(np.abs(np.fft.fft(windows * chirp, _FINE * self.chips)) ** 2)
 
     def _bin(self, powers: NDArray[np.float64]) -> float:
-        """The strongest place of such a spectrum, in bins either side of 0."""
+        """Position of the maximum of such a spectrum, in bins on either side of 0."""
         top = int(np.argmax(powers))
-        place = (top + summit(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
+        place = (top + parabola_peak(powers[top - 1], powers[top], powers[(top + 1) % len(powers)])) / _FINE
         return (place + self.chips / 2) % self.chips - self.chips / 2
 
     def _spread(self, bits: Bits) -> NDArray[np.int64]:
@@ -353,7 +355,8 @@ class LoraModem(BurstModem):
 
 @lru_cache
 def code_words(check_bits: int) -> NDArray[np.int64]:
-    """The 16 words of 4 data bits and so many check bits; with 3 any two differ in 3 bits, with 4 in 4."""
+    """The 16 code words of 4 data bits and ``check_bits`` check bits; with 3 check bits any two differ in 3 bits, with
+    4 in 4."""
     data = np.arange(16)
     d = [(data >> i) & 1 for i in range(4)]
     parity = d[0] ^ d[1] ^ d[2] ^ d[3]
@@ -377,7 +380,7 @@ def telling(lengths: range, chips: int) -> NDArray[np.int64]:
 
 
 def _delayed(samples: Samples, at: float, count: int) -> Samples:
-    """``count`` samples from a fractional place on, by a windowed sinc; zeros beyond the end."""
+    """``count`` samples from a fractional position on, by a windowed sinc; zeros after the end."""
     base = int(np.floor(at))
     x = np.arange(-_SINC + 1, _SINC + 1) - (at - base)
     taps = np.sinc(x) * np.cos(np.pi * x / (2 * _SINC + 2)) ** 2
@@ -471,7 +474,7 @@ class LoraPhy(BurstPhy):
     def computed_pdr(self, snr_db: float) -> float:
         """A block of code words is right if no symbol is wrong, or one where the Hamming code corrects an error.
 
-        For hard decisions, and an upper bound on their loss: two wrong symbols need not meet in a code word.
+        This holds for hard decisions, and is pessimistic: two wrong symbols may affect different code words.
         """
         chips, check_bits = 1 << self.options.spreading_factor, self.options.coding_rate
         samples = chips if self._sdr is None else self._sdr.symbol_samples
@@ -493,5 +496,5 @@ class LoraPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
-        return super().receiver(aside) if self._sdr is None else SdrReceiver(self._sdr)
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
+        return super().receiver(own_process) if self._sdr is None else SdrReceiver(self._sdr)

@@ -1,8 +1,8 @@
 """LoRa frames by the out-of-tree module gr-lora_sdr: `implementation: lora_sdr` of the `lora` PHY.
 
-Laws: a frame is that of LoRa modems (explicit header, payload CRC-16), its payload a packet and its CRC-32; what comes
-out has the right CRC-32, so it is what went in; packets pass the module as streams of nibbles and bytes, since its
-message ports make a PMT symbol of each, which stays in memory for ever.
+Invariants: a frame is that of LoRa modems (explicit header, payload CRC-16), its payload is a packet and its CRC-32;
+every output packet has the right CRC-32, so it equals the packet sent; packets pass the module as streams of nibbles
+and bytes, since its message ports make a PMT symbol of each packet, which stays in memory until the process ends.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from gnuradio.filter import firdes
 from gr_ros2.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
 from gr_ros2.phy.burst_blocks import TakesPackets
-from gr_ros2.phy.flowgraph import Receiver, Transmitter
+from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.pdus import PDUS, pdu_of
-from gr_ros2.phy.threads import Held, keep_messages
+from gr_ros2.phy.threads import KeptAlive, lift_message_limit
 
 MAX_PAYLOAD = 255
 """Bytes; the header has 8 bits for them."""
 MAX_SYMBOL = 2048
-"""Samples. A preamble that begins late in a symbol makes the module read up to a quarter of a symbol before the place
-it stands at, and before the buffer where that is its beginning (gr-lora_sdr, issue 144). GNU Radio guards its buffers
-with a page, 512 samples; beyond it the process ends."""
+"""Samples. For a preamble that begins late in a symbol the module reads up to a quarter of a symbol before its current
+position, and thus before the buffer when it is at its start (gr-lora_sdr, issue 144). GNU Radio guards its buffers with
+one page, 512 samples; a read beyond it ends the process."""
 _PREAMBLE, _HEAD_QUARTERS = 8, 17
-"""Up-chirps, and quarters of a chirp behind them: two of the sync word, two and a quarter down-chirps."""
+"""Up-chirps, and the quarters of a chirp after them: two chirps of the sync word, two and a quarter down-chirps."""
 _HEADER_NIBBLES, _CRC_NIBBLES = 5, 4
 _HEADER_SYMBOLS = 8
-"""Of the first block, which has two bits fewer per symbol and four check bits always."""
+"""Symbols of the first block, which always has two bits fewer per symbol and four check bits."""
 _HEADER_CHECKS = (0xF00, 0x8E1, 0x49A, 0x257, 0x12F)
-"""Which bits of a header's first three nibbles each of its check bits adds up."""
+"""For each check bit of a header, the bits of its first three nibbles that it adds up."""
 _LARGEST = 2**32 - 1
-"""Hz of carrier frequency that the module takes. It looks at the quotient of carrier and bandwidth only, from which a
-carrier offset becomes a clock offset; this and 1 Hz make that 0."""
+"""Largest carrier frequency that the module accepts, Hz. The module uses only the quotient of carrier and bandwidth, to
+compute a clock offset from a carrier offset; this value and 1 Hz make the clock offset 0."""
 _TX_KEY = "frame_len"
 _FRAME = pmt.intern("frame_info")
 _PAY_LEN = pmt.intern("pay_len")
@@ -64,7 +64,7 @@ def load() -> Any:
 
 @dataclass(frozen=True)
 class SdrFrame:
-    """What is sent for a packet.
+    """The LoRa frame of a packet.
 
     :param oversampling: samples per chip
     :param sync_word: two nibbles, none of them 0
@@ -84,13 +84,13 @@ class SdrFrame:
 
     @property
     def blocks(self) -> int:
-        """Blocks of code words behind the first."""
+        """Blocks of code words after the first."""
         nibbles = _HEADER_NIBBLES + 2 * (self.packet_len + CRC_LEN) + _CRC_NIBBLES - (self.spreading_factor - 2)
         return max(0, -(-nibbles // (self.spreading_factor - 2 * self.ldro)))
 
     @property
     def symbols(self) -> int:
-        """Behind the preamble."""
+        """Symbols after the preamble."""
         return _HEADER_SYMBOLS + self.blocks * (4 + self.coding_rate)
 
     @property
@@ -99,13 +99,13 @@ class SdrFrame:
 
     @property
     def airtime_samples(self) -> int:
-        """Gap included."""
+        """Samples of a frame, gap included."""
         quarters = 4 * (_PREAMBLE + self.symbols) + _HEAD_QUARTERS
         return quarters * self.symbol_samples // 4 + self.gap
 
     @property
     def carrier_and_bandwidth(self) -> tuple[int, int]:
-        """As the module wants them: whole numbers below 2^32."""
+        """Carrier frequency and bandwidth for the module: integers below 2^32."""
         if self.carrier is None:
             return _LARGEST, 1
         bandwidth = max(1, int(_LARGEST / self.carrier))
@@ -140,13 +140,13 @@ def whitening(length: int) -> Octets:
     return out
 
 
-class SdrTransmitter(Transmitter):
-    """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
+class SdrTransmitter(TransmitterBlock):
+    """Message port `pdus` in, complex stream out: each packet is sent at once, followed by its gap."""
 
     def __init__(self, frame: SdrFrame) -> None:
         super().__init__("gr_ros2_lora_sdr_tx", frame.airtime_samples)
         lora = load()
-        keep_messages()
+        lift_message_limit()
         factor, rate = frame.spreading_factor, frame.coding_rate
         self._framer = _Framer(frame)
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
@@ -180,7 +180,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 
 
-class SdrReceiver(Receiver):
+class SdrReceiver(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: SdrFrame) -> None:
@@ -188,7 +188,7 @@ class SdrReceiver(Receiver):
         lora = load()
         self._collector = _Collector(frame)
         factor, per_chip = frame.spreading_factor, frame.oversampling
-        # The module takes every so many samples, so that noise beside the band would fall into it.
+        # The module decimates without a filter, so that noise outside the band would alias into it.
         band = filter.fir_filter_ccf(1, firdes.low_pass(1, per_chip, 0.52, 0.1, window.WIN_HAMMING))
         sync = lora.frame_sync(*frame.carrier_and_bandwidth, factor, False, [frame.sync_word], per_chip, _PREAMBLE)
         header = lora.header_decoder(False, frame.coding_rate, MAX_PAYLOAD, True, int(frame.ldro), False)
@@ -209,11 +209,11 @@ class SdrReceiver(Receiver):
 
     @property
     def damaged(self) -> int:
-        """Frames whose header was right, but not their length or CRC-32."""
+        """Frames whose header was right, but whose length or CRC-32 was wrong."""
         return self._collector.damaged
 
 
-class _Collector(Held, gr.sync_block):  # type: ignore[misc]
+class _Collector(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Bytes of frames in, message port `pdus` out."""
 
     def __init__(self, frame: SdrFrame) -> None:

@@ -1,7 +1,7 @@
 """Packets through a simulated channel, without a source, a sink or a clock: the share that arrives.
 
-Laws: what a PHY's own transmitter sends is recorded once and played to its own receiver through any number of channels;
-equal seeds give equal packets and equal noise.
+Invariants: what a PHY's own transmitter sends is recorded once and played to its own receiver through any number of
+channels; equal seeds give equal packets and equal noise.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.pdus import PDUS, pdu_of
-from gr_ros2.phy.threads import begin, finish, run_through
+from gr_ros2.phy.threads import run_flowgraph, start_flowgraph, wait_for_end
 
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
 _BATCH_SAMPLES = 1 << 22
 _BATCH_SEEDS = 7919
-"""Apart, so that no batch has the noise of another scenario's neighbouring seed."""
+"""Distance between the seeds of two batches, so that no batch has the noise of a scenario with a neighbouring seed."""
 _SEEDS = 2**31 - 1
 _TAIL = 2048
-"""Zero samples behind the last packet, for what channel and receiver hold back."""
+"""Zero samples after the last packet, so that channel and receiver release everything."""
 
 
-class _Outlet(gr.basic_block):  # type: ignore[misc]
-    """A message port to send from."""
+class _PacketPort(gr.basic_block):  # type: ignore[misc]
+    """A block with one message port, from which packets are sent."""
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_outlet", None, None)
@@ -43,8 +43,8 @@ class _Outlet(gr.basic_block):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Packets and the samples they became.
+class SampleRecording:
+    """Packets and their modulated samples.
 
     :param packets: in the order they were sent
     :param samples: of all packets, gaps included
@@ -54,8 +54,8 @@ class Recording:
     samples: npt.NDArray[np.complex64]
 
 
-def record(phy: Phy, count: int, seed: int = 0) -> Recording:
-    """Send random packets into the void.
+def record(phy: Phy, count: int, seed: int = 0) -> SampleRecording:
+    """Modulate random packets.
 
     :param count: packets
     :raises PhyError: for a PHY without samples, or when the samples do not come
@@ -64,19 +64,19 @@ def record(phy: Phy, count: int, seed: int = 0) -> Recording:
     return modulated(phy, [source.randbytes(phy.packet_len) for _ in range(count)])
 
 
-def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
-    """The samples a PHY's transmitter makes of packets, one behind the other.
+def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
+    """The samples that a PHY's transmitter makes of packets, one after the other.
 
     :param packets: of lengths the PHY takes
     :raises PhyError: for a PHY without samples, or when the samples do not come
     """
     top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
     top.connect(transmitter, sink)
-    outlet = _Outlet()
+    outlet = _PacketPort()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
     wanted = sum(phy.airtime_samples(len(packet)) for packet in packets)
     try:
-        begin(top.start)
+        start_flowgraph(top.start)
         for packet in packets:
             outlet.message_port_pub(PDUS, pdu_of(packet))
         came, deadline = 0, time.monotonic() + _PATIENCE_S
@@ -88,36 +88,36 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> Recording:
             time.sleep(_POLL_S)
     finally:
         top.stop()
-        finish(top)
+        wait_for_end(top)
         transmitter.release()
-    return Recording(list(packets), np.array(sink.data(), np.complex64))
+    return SampleRecording(list(packets), np.array(sink.data(), np.complex64))
 
 
-def deliver(phy: Phy, recording: Recording, channel: ChannelConfig) -> list[bytes]:
-    """The packets a receiver makes of a recording behind a channel (``packet_loss`` is not applied)."""
+def deliver(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> list[bytes]:
+    """The packets that a receiver finds in a recording after a channel (``packet_loss`` is not applied)."""
     top, receiver, log = gr.top_block(), phy.receiver(), blocks.message_debug()
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
     top.msg_connect(receiver, "pdus", log, "store")
-    run_through(top)
+    run_flowgraph(top)
     receiver.release()
     vectors = (pmt.cdr(log.get_message(place)) for place in range(log.num_messages()))
     return [bytes(pmt.u8vector_elements(vector)) for vector in vectors]
 
 
-def pdr(phy: Phy, recording: Recording, channel: ChannelConfig) -> float:
+def pdr(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> float:
     """Share of a recording's packets that arrive unaltered, 0..1."""
     arrived = set(deliver(phy, recording, channel))
     return sum(packet in arrived for packet in recording.packets) / len(recording.packets)
 
 
-class Passage:
+class BatchChannel:
     """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
 
-    Nothing of one batch is on the air with another; noise and fading of each are their own.
+    The batches do not overlap on the air; each has its own noise and fading.
 
     :param phy: with samples
-    :param channel: what acts on samples of it
+    :param channel: its settings that act on samples
     :raises ConfigError: for a channel this PHY cannot have
     """
 
@@ -130,7 +130,8 @@ class Passage:
         """Packets at most at a time, for their samples to fit in memory."""
 
     def send(self, packets: Sequence[bytes]) -> list[tuple[int, bytes]]:
-        """What a batch becomes: place among the packets sent, and bytes, of each one that arrived, in order."""
+        """Send a batch; returns, for each packet that arrived, its index among the packets sent and its bytes, in
+        order."""
         seed = (self._channel.seed + self._batches * _BATCH_SEEDS) % _SEEDS
         self._batches += 1
         arrived = deliver(self._phy, modulated(self._phy, packets), replaced(self._channel, seed=seed))
@@ -138,9 +139,10 @@ class Passage:
 
 
 def _places(packets: Sequence[bytes], arrived: Sequence[bytes]) -> list[int]:
-    """Which of the packets sent each of those that arrived, in their order, was.
+    """For each packet that arrived, in order, its index among the packets sent.
 
-    One that was not sent like this was altered on the way: it takes the place behind the one that arrived before it.
+    A packet that does not equal any sent one was altered on the way: it gets the index after that of the previous
+    arrival.
     """
     sent: dict[bytes, deque[int]] = {}
     for place, packet in enumerate(packets):

@@ -1,8 +1,8 @@
-"""The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, by a modem of our own or by those blocks.
+"""The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, sent and received by this package's modem or by those blocks.
 
-Law: own and stock send the same samples for the same packet, but for the number in the header, and take the same time
-but for the gap (packets of which a CRC-32 would not fit the stock header excepted). Ours are as long as they need where
-``lengths`` is not fixed, and the stock receiver understands them all the same.
+Invariant: both implementations send the same samples for the same packet, except for the number in the header, and take
+the same time except for the gap (not for packets whose CRC-32 does not fit the stock header). Ours are as long as they
+need where ``lengths`` is not fixed, and the stock receiver understands them all the same.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
-from gr_ros2.phy.ofdm_layout import CRC_LEN, Layout, point_power
+from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
@@ -54,7 +54,7 @@ class OfdmOptions(BurstOptions):
 
 
 class OfdmPhy(BurstPhy):
-    """OFDM against echoes: by default FFT 64, cyclic prefix 16, 48 data carriers, BPSK, CRC-32 per frame.
+    """OFDM, for channels with echoes: by default FFT 64, cyclic prefix 16, 48 data carriers, BPSK, CRC-32 per frame.
 
     Carrier offset up to four carriers, clocks within 100 ppm.
 
@@ -75,7 +75,7 @@ class OfdmPhy(BurstPhy):
                 f"phy ofdm: cp_len = {cp_len}: {fft_len // 4} to {fft_len // 2} samples with fft_len = {fft_len}"
             )
         carriers = (chosen.carriers, chosen.pilots)
-        self.layout = layout = Layout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, *carriers)
+        self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, *carriers)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
         if threshold == "stock":
@@ -135,5 +135,5 @@ class OfdmPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self, aside: bool = False) -> PacketReceiver:
-        return super().receiver(aside) if self._stock is None else StockReceiver(self._stock)
+    def receiver(self, own_process: bool = False) -> PacketReceiver:
+        return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)

@@ -1,7 +1,7 @@
-"""The frame of the `ofdm` PHY on the air: carriers, sync words, constellations, as GNU Radio's blocks have them.
+"""The frame format of the `ofdm` PHY: carriers, sync words and constellations, as in GNU Radio's blocks.
 
-Laws: at equal settings every implementation makes the same samples; numpy's global generator, which the stock sync
-words reseed, is left as it was.
+Invariants: with equal settings every implementation makes the same samples; numpy's global generator, which the stock
+sync words reseed, is restored.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _HEADER_SEED = 0x6F
 
 
 @dataclass(frozen=True)
-class Layout:
-    """What transmitter and receiver must agree on.
+class OfdmLayout:
+    """The settings on which transmitter and receiver must agree.
 
     :param fft_len: carriers, used or not, a power of 2 from 64 on
     :param cp_len: samples of the cyclic prefix
     :param modulation: of the payload, a name of ``BITS``
     :param scramble: header and payload bits
-    :param edge: outermost carrier used, either side of the middle one, which is not; None = 26 of 64
-    :param pilot_places: carriers of the pilots; None = 7 and 21 either side of 64, spread over more as far
-    :raises ConfigError: for carriers that cannot be, or too few of them for data
+    :param edge: outermost carrier used, on either side of the unused middle carrier; None = 26 of 64
+    :param pilot_places: carriers of the pilots; None = 7 and 21 on either side for 64 carriers, scaled for more
+    :raises ConfigError: for carriers that do not exist, or too few carriers for data
     """
 
     fft_len: int
@@ -93,7 +93,7 @@ class Layout:
         return 3 if self.bits_per_carrier % 3 == 0 else 1
 
     def fill(self, packet_len: int) -> int:
-        """Bytes a packet is filled up with, so that it and its CRC-32 take whole constellation points."""
+        """Fill bytes of a packet, so that packet and CRC-32 take an integer number of constellation points."""
         return -(packet_len + CRC_LEN) % self.multiple
 
     def fits_header(self, packet_len: int) -> bool:
@@ -101,7 +101,7 @@ class Layout:
         return packet_len + self.fill(packet_len) + CRC_LEN <= _MAX_FRAME_LEN
 
     def symbols(self, bits: int) -> int:
-        """Of a frame with so many bits of payload: sync words, header, payload."""
+        """Symbols of a frame with ``bits`` payload bits: sync words, header, payload."""
         return HEAD_SYMBOLS + -(-bits // (self.bits_per_carrier * len(self.data[0])))
 
     def power(self, bits: int) -> float:
@@ -116,7 +116,7 @@ class Layout:
         return (head + tail + points * point_power(self.modulation)) / symbols
 
     def mask(self, length: int) -> NDArray[np.uint8]:
-        """What scrambling adds to the bytes of a payload, zeros where it is off."""
+        """The scrambling sequence for the bytes of a payload, zeros where scrambling is off."""
         seed = _SCRAMBLER["seed"] if self.scramble else 0
         return np.packbits(_register(seed, 8 * length), bitorder="little")
 
@@ -134,22 +134,22 @@ class Layout:
 
     @property
     def outermost(self) -> int:
-        """Outermost carrier used, either side."""
+        """Outermost carrier used, on either side."""
         return 26 * self.fft_len // 64 if self.edge is None else self.edge
 
     @property
     def data(self) -> tuple[tuple[int, ...], ...]:
-        """Data carriers: all up to the edge without pilots and the middle one."""
+        """Data carriers: all up to the edge, without pilots and the middle carrier."""
         edge = self.outermost
         return (tuple(place for place in range(-edge, edge + 1) if place and place not in self.pilots[0]),)
 
     @property
     def pilot_symbols(self) -> tuple[tuple[int, ...], ...]:
-        """What the pilots carry."""
+        """Symbols of the pilots."""
         return (tuple((1, 1, 1, -1)[place % 4] for place in range(len(self.pilots[0]))),)
 
     def sync_words(self) -> list[list[complex]]:
-        """Those of the stock blocks."""
+        """The sync words of the stock blocks."""
         with _numpy_state_kept():
             arguments = (self.fft_len, self.data, self.pilots)
             return [
@@ -165,7 +165,7 @@ class Layout:
         )
 
     def scrambler(self, key: str) -> Any:
-        """Scrambles or descrambles bytes, afresh with each packet."""
+        """Block that scrambles or descrambles bytes, reset for each packet."""
         seed = _SCRAMBLER["seed"] if self.scramble else 0
         return digital.additive_scrambler_bb(
             _SCRAMBLER["mask"], seed, _SCRAMBLER["len"], 0, bits_per_byte=8, reset_tag_key=key
@@ -199,7 +199,7 @@ def point_power(modulation: str) -> float:
 
 @contextmanager
 def _numpy_state_kept() -> Iterator[None]:
-    """The stock sync words reseed numpy's global generator; that is the user's, so put it back."""
+    """Restore numpy's global generator, which belongs to the user; the stock sync words reseed it."""
     state = np.random.get_state()
     try:
         yield

@@ -1,8 +1,9 @@
-"""OFDM bursts without GNU Radio's scheduler: found by a repeated half symbol, read with every symbol as reference.
+"""OFDM bursts without GNU Radio's scheduler: detected by a repeated half symbol, demodulated with all symbols as
+reference.
 
-Laws: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a short
-impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the payload
-is decided to be, weighted with how sure that is; how long that is the header says, where lengths differ.
+Invariants: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a
+short impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the
+payload is decided to be, weighted with how sure that is; how long that is the header says, where lengths differ.
 """
 
 from __future__ import annotations
@@ -12,55 +13,56 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Frames, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.fec import Soft
 from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits
-from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, Layout, constellation
+from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 """Complex numbers of single or double precision."""
 
 _FALSE_ALARM = 1e-3
-"""Share of samples of noise that are looked at closely."""
+"""Share of noise samples that are examined closely."""
 _ALIKE = 0.2
-"""Correlation of the sync words over their power, from which on a burst is one: noise has it once in 10^5 looks."""
+"""Threshold of the normalised correlation of the sync words; noise passes once in 10^5 examinations."""
 _SHIFTS = (-4, -2, 0, 2, 4)
-"""Carriers by which the signal may be off, beside the one that the repeated half symbol tells."""
+"""Carrier offsets that are tried, in addition to the fractional offset that the repeated half symbol gives."""
 _CHUNK = 16
-"""Payload symbols decided together, and between two looks at timing and channel."""
+"""Payload symbols decided together; timing and channel are estimated once for each such group."""
 _PACE_GAIN = 0.5
-"""Of the timing loop, for the speed of its change."""
+"""Gain of the timing loop for the rate of change of the timing."""
 _MEMORY = 32.0
-"""Symbols the channel estimate remembers."""
+"""Symbols over which the channel estimate averages."""
 _RIDGE = 0.001
-"""Noise over signal per carrier that the channel estimate is made for."""
+"""Noise over signal per carrier for which the channel estimate is designed."""
 _TURN = 0.4
-"""Radians per symbol that the carrier offset may still be wrong by after the sync words."""
+"""Largest error of the carrier offset after the sync words, radians per symbol."""
 _DOUBT = 1e-3
-"""Of the power of what was sent: with less doubt about it symbols are not decided again in order to estimate."""
+"""Share of the power sent: with less uncertainty than this, symbols are not decided again for a better estimate."""
 _TINY = 1e-20
 _FILL_MARK = 0x555
 """In the number field of a header, for each byte that the frame is filled up with."""
 
 
-class _Place(NamedTuple):
-    """Where a burst is: first sample, radians per sample, and how much of the power is sync words, 0..1."""
+class _FramePlace(NamedTuple):
+    """Position of a burst: first sample, carrier offset in radians per sample, and the share of sync words in the
+    power, 0..1."""
 
     begin: int
     frequency: float
     alike: float
 
 
-class _Clock(NamedTuple):
-    """Where a burst's first sample would be, and samples by which each symbol comes later than the one before."""
+class _SymbolClock(NamedTuple):
+    """Position of a burst's first sample, and samples by which each symbol is later than the one before."""
 
     begin: float
     pace: float
 
 
 class _Channel(NamedTuple):
-    """Gain of each used carrier, the weight of what it was estimated from, and the noise on each."""
+    """Gain of each used carrier, the weight of its estimate, and the noise on each carrier."""
 
     gains: NDArray[np.complex128]
     weight: NDArray[np.float64]
@@ -75,7 +77,7 @@ class OfdmModem(BurstModem):
     :param threshold: of the preamble's metric, 0..1; None = by the share of false alarms
     """
 
-    def __init__(self, frames: Frames, layout: Layout, threshold: float | None) -> None:
+    def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None) -> None:
         super().__init__(frames)
         self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
         self._bpsk = Points(np.array([-1, 1], complex), "little")
@@ -184,7 +186,7 @@ class OfdmModem(BurstModem):
 
     def find(self, samples: Samples) -> Search:
         half, window = self._half, self._window
-        # What a closer look at the last place needs, and as far again for it to be moved.
+        # Samples that the close examination of the last position needs, and the same again because it may move.
         positions = len(samples) - 2 * self._symbol - self._prefix
         if positions <= 0:
             return Search(0)
@@ -198,7 +200,7 @@ class OfdmModem(BurstModem):
         at = 0
         while at < len(above):
             first = int(above[at])
-            if first + self._symbol > positions:  # the highest point may still be to come
+            if first + self._symbol > positions:  # the maximum may still come
                 return Search(first)
             ratio = alike[first : first + self._symbol] / (power[first : first + self._symbol] + _TINY)
             best = first + int(np.argmax(ratio))
@@ -212,7 +214,7 @@ class OfdmModem(BurstModem):
         if self._word is None:
             return start + self._needed(self.frames.packet_len)
         begin, frequency, _ = self._place(samples, start)
-        rows = self._rows(samples, _Clock(float(begin), 0.0), frequency, 0, HEAD_SYMBOLS)
+        rows = self._rows(samples, _SymbolClock(float(begin), 0.0), frequency, 0, HEAD_SYMBOLS)
         return start + self._needed(self._head(rows)[1])
 
     def _needed(self, packet_len: int) -> int:
@@ -228,7 +230,7 @@ class OfdmModem(BurstModem):
 
     def read(self, samples: Samples, start: int) -> Reading:
         begin, frequency, _ = self._place(samples, start)
-        clock = _Clock(float(begin), 0.0)
+        clock = _SymbolClock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
         snr = self._snr(rows[:2])
         channel, length = self._head(rows)
@@ -244,11 +246,11 @@ class OfdmModem(BurstModem):
             soft.append(self.constellation.soft(likely))
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
-            clock = _Clock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
+            clock = _SymbolClock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
         end = start + self._needed(length)
         return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end)
 
-    def constants(self) -> Constants:
+    def constants(self) -> ModemConstants:
         points = -(-self.frames.bits(self.frames.packet_len) // self.constellation.bits)
         values = {
             **self.lengths(),
@@ -294,10 +296,10 @@ class OfdmModem(BurstModem):
             "word_weight": self._word_weight,
             "marks": self.constellation.marks,
         }
-        return Constants("ofdm", values, points * self.constellation.bits, points)
+        return ModemConstants("ofdm", values, points * self.constellation.bits, points)
 
-    def _place(self, samples: Samples, at: int) -> _Place:
-        """Look closely at a place where the first half of a symbol is repeated."""
+    def _place(self, samples: Samples, at: int) -> _FramePlace:
+        """Examine a position closely where the first half of a symbol is repeated."""
         at = max(0, at)
         window = samples[at : at + self._window + self._half]
         step = self._repeat * np.vdot(window[: -self._half], window[self._half :])
@@ -305,14 +307,14 @@ class OfdmModem(BurstModem):
         first = max(0, at + self._prefix - self._back)
         part = samples[first : first + self._symbol + self._size]
         if len(part) < self._symbol + self._size:
-            return _Place(at, frequency, 0.0)
+            return _FramePlace(at, frequency, 0.0)
         part = part * np.exp(-1j * frequency * np.arange(len(part)))
         spectra = np.fft.fft(np.stack((part[: self._size], part[self._symbol :])))
         shift = _SHIFTS[int(np.argmax(np.abs(self._turns @ (spectra[0].conj() * spectra[1]))))]
         if shift:
             frequency += 2 * np.pi * shift / self._size
             spectra = np.roll(spectra, -shift, axis=1)
-            # A roll leaves what the carriers turn between the two symbols.
+            # A carrier shift leaves the rotation of the carriers between the two symbols.
             spectra[1] *= np.exp(-2j * np.pi * shift * self._symbol / self._size)
         gains = spectra * self._whole
         turn = float(np.angle(np.vdot(gains[0], gains[1])))
@@ -321,10 +323,10 @@ class OfdmModem(BurstModem):
         power = float(np.vdot(spectra, spectra).real)
         alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
         late = (peak + self._half) % self._size - self._half
-        return _Place(first - self._prefix + late, frequency + turn / self._symbol, alike)
+        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, alike)
 
     def _rows(
-        self, samples: Samples, clock: _Clock, frequency: float, symbol: int, count: int
+        self, samples: Samples, clock: _SymbolClock, frequency: float, symbol: int, count: int
     ) -> NDArray[np.complex64]:
         """Used carriers of some of a burst's symbols."""
         drift = clock.pace * (symbol + np.arange(count))
@@ -340,7 +342,7 @@ class OfdmModem(BurstModem):
         return np.asarray(spectra, np.complex64)
 
     def _advance(self, samples: Any) -> NDArray[np.complex128]:
-        """What brings carriers forward by a fraction of a sample, or some."""
+        """Factors that advance carriers by a number of samples, fractional or not."""
         return np.asarray(np.exp(2j * np.pi / self._size * self._carriers * samples))
 
     def _first_estimate(self, rows: NDArray[np.complex64]) -> _Channel:
@@ -352,8 +354,8 @@ class OfdmModem(BurstModem):
     def _snr(self, rows: NDArray[np.complex64]) -> float:
         """Mean power of a burst over that of the noise in the sampled band, from both sync words.
 
-        Noise is what stands on carriers that the first word leaves empty, and what both words differ by on the others:
-        unlike the rest of an estimate of the channel it holds nothing of the channel, whatever that is like.
+        The noise is measured on the carriers that the first word leaves empty, and from the difference of both words on
+        the others. So it does not depend on the channel.
         """
         first, second = rows[:, self._twice] * self._crosswise
         alike = abs(complex(np.vdot(first, second)))
@@ -366,12 +368,12 @@ class OfdmModem(BurstModem):
     def _decide(
         self, rows: Complexes, channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
     ) -> tuple[_Channel, NDArray[np.float32], Samples, float]:
-        """Symbols to likelihoods of points, with a channel estimate that they have made better.
+        """Likelihoods of constellation points for some symbols, with a channel estimate improved by these symbols.
 
-        Also tells by how many samples they came late.
+        Also returns the delay of the symbols in samples.
 
-        :param used: symbols by data carriers: which hold a point
-        :param rounds: how often to decide in order to estimate, at most
+        :param used: symbols by data carriers: which of them carry a point
+        :param rounds: most rounds of decision and estimation
         """
         gains, noise = channel.gains, channel.noise
         turn = self._tone(rows[:, self._pilots] @ (gains[self._pilots] * self._known[self._pilots]).conj())
@@ -408,7 +410,7 @@ class OfdmModem(BurstModem):
         return points.weigh(seen, np.tile(noise / power, len(used))[used.reshape(-1)]), seen
 
     def _tone(self, turns: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """What straightens symbols of which each is turned further than the one before by the same angle."""
+        """Factors that remove a constant phase step from symbol to symbol."""
         count = len(turns)
         size = 8 << max(0, (count - 1).bit_length())
         spectrum = np.fft.fft(turns, size)
@@ -426,13 +428,13 @@ class OfdmModem(BurstModem):
         return np.asarray(back * np.exp(-1j * phase), np.complex64)
 
     def _late(self, turns: NDArray[np.complex128]) -> float:
-        """Samples by which symbols come late, from by how little their carriers are turned."""
+        """Delay of symbols in samples, from the phase slope over their carriers."""
         slope = float(self._carriers @ turns.imag) / max(float(self._carriers**2 @ np.abs(turns.real)), _TINY)
         return -slope * self._size / (2 * np.pi)
 
 
 def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:
-    """Values at the places that are used, zeros elsewhere."""
+    """Values at the used places, zeros elsewhere."""
     out = np.zeros(used.shape, values.dtype)
     out[used] = values
     return out

@@ -1,7 +1,7 @@
 """GNU Radio's OFDM blocks as a transmitter and a receiver: `detection_threshold: stock`.
 
-Laws: wired as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, at equal settings with the same samples; every packet is
-followed by ``gap`` zero samples, so that the receiver never sees two frames back to back (its header/payload
+Invariants: wired as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, at equal settings with the same samples; every packet
+is followed by ``gap`` zero samples, so that the receiver never sees two frames back to back (its header/payload
 demultiplexer then swallows a trigger now and then) and the last frame is pushed out of it at once; transmitter and
 receiver use different tag keys, so that a loopback cannot leak a length past the channel; every buffer holds a whole
 frame, since a tagged stream block that cannot get one stalls the flowgraph; frames whose bits do not fill whole points
@@ -20,19 +20,20 @@ from typing import Any
 import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
-from gr_ros2.phy.flowgraph import HierBlock, Receiver, Transmitter
-from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, Layout, constellation
+from gr_ros2.phy.flowgraph import HierBlock, ReceiverBlock, TransmitterBlock
+from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, OfdmLayout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
-from gr_ros2.phy.threads import keep_messages, only_warnings
+from gr_ros2.phy.threads import lift_message_limit, log_warnings_only
 
 STOCK_THRESHOLD = 0.9
-"""What GNU Radio's ``ofdm_rx`` uses. A lower one gains decibels and triggers beside a frame now and then."""
+"""What GNU Radio's ``ofdm_rx`` uses. A lower one gains some dB, but sometimes triggers outside a frame."""
 
 _TX_KEY, _RX_KEY, _RX_FRAME_KEY, _RX_PACKET_KEY = (
     f"gr_ros2_{name}" for name in ("tx_len", "rx_len", "rx_frame", "rx_packet")
 )
 _SPINNING_THREAD = "header_pay"
-"""How the name of the demultiplexer's thread begins: the kernel keeps 15 characters, GNU Radio's block number too."""
+"""First letters of the name of the demultiplexer's thread: the kernel keeps 15 characters, GNU Radio's block number
+included."""
 SPINNING_NICE = 10
 """Added to the nice value of such a thread: a tenth of the weight of the others."""
 _THREADS_WAIT_S = 0.2
@@ -42,7 +43,7 @@ _SMALLEST_BUFFER = 32768
 
 @dataclass(frozen=True)
 class StockFrame:
-    """What is sent for a packet.
+    """The frame of a packet.
 
     A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames go without
     it: the packet's own CRC-16 alone protects them, and damaged ones reach the sink, which refuses and counts them.
@@ -50,34 +51,34 @@ class StockFrame:
     :param gap: zero samples behind each packet
     """
 
-    layout: Layout
+    layout: OfdmLayout
     packet_len: int
     gap: int
 
     @property
     def with_crc32(self) -> bool:
-        """Whether there is room for one."""
+        """Whether the header has room for the length with a CRC-32."""
         return self.layout.fits_header(self.packet_len)
 
     @property
     def fill(self) -> int:
-        """Zero bytes behind the packet."""
+        """Zero bytes after the packet."""
         return self.layout.fill(self.packet_len if self.with_crc32 else self.packet_len - CRC_LEN)
 
     @property
     def bits(self) -> int:
-        """Of the payload."""
+        """Bits of the payload."""
         return 8 * (self.packet_len + self.fill + (CRC_LEN if self.with_crc32 else 0))
 
     @property
     def airtime_samples(self) -> int:
-        """Gap included."""
+        """Samples of a frame, gap included."""
         return self.layout.symbols(self.bits) * self.layout.symbol_samples + self.gap
 
     def fit_buffers(self, parts: list[Any]) -> None:
-        """Give each block room for two frames where GNU Radio's own size would not do.
+        """Give each block buffer space for two frames where GNU Radio's default is too small.
 
-        Only there: larger buffers than needed cost small frames a factor of two to three in throughput.
+        Not elsewhere: larger buffers than needed cost small frames a factor of two to three in throughput.
         """
         for part in parts:
             signature = part.output_signature()
@@ -87,13 +88,13 @@ class StockFrame:
             symbols = self.layout.symbols(self.bits)
             items = symbols if size >= self.layout.fft_len else max(self.airtime_samples, self.bits)
             if 2 * items * size > _SMALLEST_BUFFER:
-                # Port by port: on blocks with any number of outputs the setter for all ports does nothing.
+                # Port by port: on blocks with a variable number of outputs the setter for all ports does nothing.
                 for port in range(max(1, signature.max_streams())):
                     part.set_min_output_buffer(port, 2 * items)
 
 
 def idle_spinning_threads() -> None:
-    """Let the receiver's demultiplexers step back behind all other threads: they spin while waiting for their header.
+    """Lower the priority of the receiver's demultiplexer threads: they spin while waiting for their header.
 
     By a nice value, not by SCHED_IDLE. With time to spare SCHED_IDLE is a little better (single packets of 64 B, p99:
     3 ms, here 6, without 7); but where other programs keep every core busy such a thread hardly runs at all, and
@@ -111,12 +112,12 @@ def idle_spinning_threads() -> None:
                     found = True
 
 
-class StockTransmitter(Transmitter):
-    """Message port `pdus` in, complex stream out: each packet at once, with its gap behind it."""
+class StockTransmitter(TransmitterBlock):
+    """Message port `pdus` in, complex stream out: each packet is sent at once, followed by its gap."""
 
     def __init__(self, frame: StockFrame) -> None:
         super().__init__("gr_ros2_ofdm_tx", frame.airtime_samples)
-        keep_messages()
+        lift_message_limit()
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
         modulator = OfdmModulator(frame.layout, _TX_KEY, frame.with_crc32)
         zeros = blocks.vector_source_c([0j] * frame.gap, True, 1, [_length_tag(frame.gap)])
@@ -136,19 +137,19 @@ class StockTransmitter(Transmitter):
         frame.fit_buffers(parts)
 
 
-class StockReceiver(Receiver):
+class StockReceiver(ReceiverBlock):
     """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
 
     def __init__(self, frame: StockFrame) -> None:
         super().__init__("gr_ros2_ofdm_rx")
         self._frame = frame
         self._demodulator = OfdmDemodulator(frame.layout, _RX_KEY, _RX_FRAME_KEY, frame.with_crc32)
-        # Header parser and demultiplexer tell of every header lost in noise.
-        only_warnings(self._demodulator.parts)
+        # Header parser and demultiplexer log every header lost in noise.
+        log_warnings_only(self._demodulator.parts)
         self.connect(self, self._demodulator)
         last, key, parts = self._demodulator, _RX_KEY, list(self._demodulator.parts)
         if frame.fill:
-            # Frames come whole or not at all, so counting bytes is enough.
+            # Frames come complete or not at all, so counting bytes is enough.
             key = _RX_PACKET_KEY
             packet = blocks.keep_m_in_n(1, frame.packet_len, frame.packet_len + frame.fill, 0)
             last = blocks.stream_to_tagged_stream(1, 1, frame.packet_len, key)
@@ -160,7 +161,7 @@ class StockReceiver(Receiver):
         frame.fit_buffers(parts)
 
     def tap_symbols(self) -> Tap:
-        """Let the payload's symbols be seen, equalised and not yet decided. Before the start, once."""
+        """Make the payload's symbols visible, equalised and not yet decided. Call it once, before the start."""
         tap = Tap(SYMBOLS_SHOWN)
         self._frame.fit_buffers(self._demodulator.show_symbols(tap))
         return tap
@@ -181,7 +182,7 @@ class OfdmModulator(gr.hier_block2):  # type: ignore[misc]
     :param with_crc32: at the end of each frame
     """
 
-    def __init__(self, layout: Layout, key: str, with_crc32: bool) -> None:
+    def __init__(self, layout: OfdmLayout, key: str, with_crc32: bool) -> None:
         super().__init__("gr_ros2_ofdm_mod", gr.io_signature(1, 1, 1), gr.io_signature(1, 1, gr.sizeof_gr_complex))
         self.parts: list[Any] = []
         source: Any = self
@@ -221,7 +222,7 @@ class OfdmDemodulator(HierBlock):
     :param with_crc32: at the end of each frame
     """
 
-    def __init__(self, layout: Layout, packet_key: str, frame_key: str, with_crc32: bool) -> None:
+    def __init__(self, layout: OfdmLayout, packet_key: str, frame_key: str, with_crc32: bool) -> None:
         super().__init__("gr_ros2_ofdm_demod", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(1, 1, 1))
         self.parts: list[Any] = []
         self._layout, self._frame_key = layout, frame_key
@@ -261,9 +262,9 @@ class OfdmDemodulator(HierBlock):
         )
 
     def show_symbols(self, sink: Any) -> list[Any]:
-        """Connect a sink to the payload's symbols, equalised and not yet decided; returns the parts that needs.
+        """Connect a sink to the payload's symbols, equalised and not yet decided; returns the blocks that this needs.
 
-        The equaliser of the receiver decides at once, so a second one without that runs beside it.
+        The receiver's equaliser also decides, so a second equaliser without decisions runs in parallel.
         """
         layout = self._layout
         points = constellation(layout.modulation)

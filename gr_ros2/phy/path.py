@@ -1,7 +1,7 @@
-"""A packet's way through gate, transmitter, air, receiver and losses: what a simulated link and a radio have in common.
+"""The path of a packet through gate, transmitter, channel, receiver and losses: common to a simulated link and a radio.
 
-Laws: what is received is impaired and looked at only here; a part that was not built in costs nothing, and what it
-would do cannot be set; packets are counted at every place they pass.
+Invariants: only this module impairs and taps received samples; a part that was not built in costs nothing, and its
+settings cannot be changed; packets are counted at every place they pass.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gr_ros2.phy.channel import Channel, PacketLoss
 from gr_ros2.phy.tap import Samples, Tap
 
 _LOOK = 1024
-"""Samples of one look at the received signal."""
+"""Samples of one snapshot of the received signal."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,12 @@ class LinkCounts:
 
 
 class PacketPath:
-    """Stands before GNU Radio's class of a flowgraph or hier block, which makes ``phy`` and ``channel`` first."""
+    """Mix-in for a flowgraph or hier block; list it before GNU Radio's class. The class sets ``phy`` and ``channel``
+    first."""
 
     phy: Phy
     channel: ChannelConfig
-    """Impairments as they are set now."""
+    """The current impairments."""
     _gate: AirtimeGate | None = None
     _transmitter: PacketTransmitter | None = None
     _faded: Channel | None = None
@@ -71,7 +72,8 @@ class PacketPath:
         )
 
     def samples(self) -> Samples | None:
-        """Newest samples at the receiver's antenna, after the channel; None where there is no tap or nothing came."""
+        """Newest samples at the receiver's antenna, after the channel; None where there is no tap or no samples
+        came."""
         return None if self._tap is None else self._tap.samples()
 
     def symbols(self) -> Samples | None:
@@ -81,11 +83,11 @@ class PacketPath:
     @property
     def snr_db(self) -> float | None:
         """SNR of the newest packets received, dB over the sampled band; None before the first, or where the PHY does
-        not tell."""
+        not measure it."""
         return None if self._receiver is None else self._receiver.snr_db
 
     def set_snr_db(self, snr_db: float | None) -> None:
-        """Noise on what is received, dB, None = none; see :meth:`Channel.set_snr_db`.
+        """Set the SNR of the received signal, dB, None = no noise; see :meth:`Channel.set_snr_db`.
 
         :raises ConfigError: out of range
         :raises PhyError: where no simulated channel was built in
@@ -93,7 +95,7 @@ class PacketPath:
         self._change("snr_db", snr_db, self._faded)
 
     def set_frequency_offset(self, frequency_offset: float) -> None:
-        """Carrier frequency offset of what is received, fraction of the sample rate.
+        """Set the carrier frequency offset of the received signal, fraction of the sample rate.
 
         :raises ConfigError: out of range
         :raises PhyError: where no simulated channel was built in
@@ -101,7 +103,7 @@ class PacketPath:
         self._change("frequency_offset", frequency_offset, self._faded)
 
     def set_packet_loss(self, probability: float) -> None:
-        """Probability that a packet received is dropped.
+        """Set the probability that a received packet is dropped.
 
         :raises ConfigError: out of range
         :raises PhyError: where nothing that loses packets was built in
@@ -111,8 +113,8 @@ class PacketPath:
     def _change(self, setting: str, value: float | None, part: Any) -> None:
         if part is None:
             raise PhyError(
-                f"{setting}: {self._medium} was started without a simulated channel that could change it; set "
-                f"channel.{setting} before the start, where that can be had"
+                f"{setting}: {self._medium} was started without a simulated channel that can change it; set "
+                f"channel.{setting} before the start, where the PHY supports it"
             )
         channel = replaced(self.channel, **{setting: value})
         getattr(part, f"set_{setting}")(value)
@@ -120,30 +122,31 @@ class PacketPath:
 
     @property
     def _medium(self) -> str:
-        """What packets cross, for errors."""
+        """Name of the medium, for errors."""
         return f"phy {self.phy.name}"
 
     def _offered(self) -> int:
-        """Packets that came to the path, where there is no gate to count them."""
+        """Packets that entered the path, where there is no gate to count them."""
         return 0
 
     def _handled(self) -> int:
-        """Packets the end of the path is done with, where it tells."""
+        """Packets that the end of the path has processed, where it counts them."""
         return 0
 
     def _transmit(self, packets: Any) -> Any:
-        """Connect a transmitter behind a block that gives packets."""
+        """Connect a transmitter to a block that gives packets."""
         self._transmitter = self.phy.transmitter()
         return self._follow(packets, self._transmitter)
 
-    def _receive(self, samples: Any, *, faded: bool, shown: bool, aside: bool = True) -> Any:
-        """Connect channel, receiver and taps behind a block that gives samples; returns what the receiver hears."""
+    def _receive(self, samples: Any, *, faded: bool, shown: bool, own_process: bool = True) -> Any:
+        """Connect channel, receiver and taps to a block that gives samples; returns the block that gives the receiver's
+        input."""
         graph: Any = self
         if faded:
             self._faded = Channel(self.channel, self.phy)
             graph.connect(samples, self._faded)
             samples = self._faded
-        self._receiver = self.phy.receiver(aside)
+        self._receiver = self.phy.receiver(own_process)
         graph.connect(samples, self._receiver)
         if shown:
             self._tap = Tap(_LOOK)
@@ -152,7 +155,7 @@ class PacketPath:
         return samples
 
     def _follow(self, packets: Any, block: Any) -> Any:
-        """Connect a block's port `pdus` behind another's; returns the block."""
+        """Connect a block's port `pdus` to that of another block; returns the block."""
         graph: Any = self
         graph.msg_connect(packets, "pdus", block, "pdus")
         return block

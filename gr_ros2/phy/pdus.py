@@ -1,6 +1,6 @@
-"""Bytes to PDUs and back, the fast way.
+"""Fast conversion of bytes to PDUs and back.
 
-Law: a PDU is a PMT pair of a dictionary and a u8vector.
+Invariant: a PDU is a PMT pair of a dictionary and a u8vector.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 import pmt
 
 PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
-"""The message ports of our blocks: packets, and what asks for them."""
+"""The message ports of the blocks: packets, and the credits that request them."""
 
 _NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
@@ -20,7 +20,7 @@ _OFFSET = 8
 
 def u8vector(data: bytes) -> Any:
     """Bytes as a u8vector."""
-    # Nine times as fast as pmt.to_pmt of an array, and for long packets as pmt.init_u8vector.
+    # Nine times as fast as pmt.to_pmt of an array; also, for long packets, as pmt.init_u8vector.
     return pmt.deserialize_str(_HEAD + len(data).to_bytes(4, "big") + b"\x01\x00" + data)
 
 

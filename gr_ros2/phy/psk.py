@@ -1,6 +1,6 @@
 """The `psk` PHY: single carrier, BPSK, QPSK or 8-PSK in root-raised-cosine pulses, a preamble before each packet.
 
-Law: the mean power of a burst is 1 whatever the settings.
+Invariant: the mean power of a burst is 1 whatever the settings.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class PskModem(LinearModem):
 
 
 class PskPhy(LinearPhy):
-    """Single carrier for narrow channels without echoes: an echo of a symbol's length is beyond it, take `ofdm` there.
+    """Single carrier for narrow channels without echoes: use `ofdm` where an echo is as long as a symbol.
 
     Carrier offset up to 5 % of the symbol rate, clocks within 100 ppm; packets of 1..4095 B.
 

@@ -1,7 +1,7 @@
-"""Constellations, and what received points say of the bits that were sent.
+"""Constellations, and the soft bits of received points.
 
-Laws: a soft bit is a log-likelihood ratio, above 0 for a 1, of the nearest point with either ("max-log"); its sign is
-the decision of the nearest point.
+Invariants: a soft bit is a log-likelihood ratio, above 0 for a 1, computed from the nearest point of either value
+("max-log"); its sign is the decision for the nearest point.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Reals = NDArray[np.float64]
 BitOrder = Literal["big", "little"]
 _TINY = 1e-20
 _SMALLEST_NOISE = 1e-6
-"""Of a point's energy: without any noise soft bits stay finite."""
+"""Least noise, relative to a point's energy, so that soft bits stay finite without noise."""
 
 
 class Points:
@@ -37,7 +37,7 @@ class Points:
         places = np.arange(self.bits) if order == "little" else np.arange(self.bits)[::-1]
         self._weights = 1 << places
         self.marks = marks = (np.arange(len(points))[:, None] >> places) & 1 == 1
-        """Points by bits: where a bit is 1."""
+        """Array of points by bits: whether the bit is 1."""
         self._ones = [np.flatnonzero(mark) for mark in marks.T]
         self._zeros = [np.flatnonzero(~mark) for mark in marks.T]
 
@@ -49,12 +49,12 @@ class Points:
         return np.asarray(self.points[padded.reshape(count, self.bits) @ self._weights])
 
     def weigh(self, received: Complex, noise: Reals | float) -> NDArray[np.float32]:
-        """Log-likelihood of every point (columns) for every received one (rows), but for a constant of each row.
+        """Log-likelihood of every point (columns) for every received point (rows), except for a constant of each row.
 
-        :param noise: mean squared magnitude of what was added, in all or to each received point
+        :param noise: mean squared magnitude of the noise, one value or one for each received point
         """
         scale = np.asarray(1 / np.maximum(noise, _SMALLEST_NOISE * self.power), np.float32).reshape(-1, 1)
-        # The squared distance without that of the received point from 0, which is the same for all.
+        # The squared distance without the squared magnitude of the received point, which is the same for all points.
         parts = np.ascontiguousarray(received, np.complex64).view(np.float32).reshape(-1, 2)
         return np.asarray((parts @ self._twice - self._squares) * scale)
 
@@ -65,18 +65,18 @@ class Points:
         return np.asarray(np.stack(bits, axis=1).reshape(-1), np.float32)
 
     def expected(self, likely: NDArray[np.float32]) -> tuple[Complex, NDArray[np.float32]]:
-        """Mean of what was sent, given what was received, and of its squared magnitude."""
+        """Conditional mean of the point sent, given the received point, and of its squared magnitude."""
         share = np.exp(likely - likely.max(1, keepdims=True))
         share /= share.sum(1, keepdims=True)
         return share @ self.points, share @ self._squares
 
     def nearest(self, received: Complex) -> Complex:
-        """The point each received one is decided to be."""
+        """The nearest constellation point of each received point."""
         return np.asarray(self.points[np.argmax(self.weigh(received, 1.0), axis=1)])
 
 
 def spread_about(received: Complex, decided: Complex) -> tuple[float, float]:
-    """Gain and noise of points: what decided ones are multiplied with, and the mean square of what was added."""
+    """Gain and noise of received points: the factor of the decided points, and the mean square of the rest."""
     energy = float(np.vdot(decided, decided).real)
     gain = max(float(np.vdot(decided, received).real) / max(energy, _TINY), _TINY)
     return gain, float(np.mean(np.abs(received - gain * decided) ** 2))

@@ -1,7 +1,7 @@
-"""A look at samples that pass by, for people: constellation and spectrum.
+"""Taps: copies of passing samples, for the display of constellation and spectrum.
 
-Laws: a tap only reads; it exists only in a flowgraph that was built to be looked at, and costs nothing elsewhere; it
-keeps the newest ``size`` samples and nothing else.
+Invariants: a tap only reads; it exists only in an instrumented flowgraph, and costs nothing elsewhere; it keeps only
+the newest ``size`` samples.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from gnuradio import blocks, gr
 Samples = npt.NDArray[np.complex64]
 
 SYMBOLS_SHOWN = 480
-"""Of a constellation, at a look."""
+"""Symbols of a constellation that are shown at a time."""
 
 
 class Tap(gr.hier_block2):  # type: ignore[misc]
-    """Complex stream in; the newest whole block of it on demand.
+    """Complex stream in; gives the newest complete block of it on request.
 
-    :param size: samples per look, at least 1
+    :param size: samples per block, at least 1
     """
 
     def __init__(self, size: int) -> None:
@@ -37,7 +37,7 @@ class Tap(gr.hier_block2):  # type: ignore[misc]
 
 
 class SymbolTap:
-    """The newest symbols of a receiver that decides whole packets.
+    """The newest symbols of a receiver that decodes whole packets.
 
     :param newest: gives the symbols of the last packet, none before the first
     """

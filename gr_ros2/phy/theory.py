@@ -1,8 +1,8 @@
-"""The curves physical layers are measured against: error rates of ideal receivers in white noise.
+"""Reference curves of physical layers: error rates of ideal receivers in white noise.
 
-Laws: SNR arguments are ratios, not dB; perfect synchronisation is assumed everywhere, so a measured curve lies right
-of these by what synchronisation, pilots and framing cost. Source: Proakis and Salehi, Digital Communications, 5th
-edition, sections 4.3 (PSK, QAM) and 4.5 (noncoherent orthogonal signals).
+Invariants: SNR arguments are ratios, not dB; perfect synchronisation is assumed, so a measured curve is shifted by the
+cost of synchronisation, pilots and framing. Source: Proakis and Salehi, Digital Communications, 5th edition, sections
+4.3 (PSK, QAM) and 4.5 (noncoherent orthogonal signals).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ def q(x: float) -> float:
 
 
 def psk_symbol_error(order: int, snr: float) -> float:
-    """PSK, coherent. Exact for 2 and 4 phases, from 8 on to within a hundredth of itself below 0.1.
+    """PSK, coherent. Exact for 2 and 4 phases; for 8 and more the relative error is below 1 % where the result is below
+    0.1.
 
     :param order: phases
     :param snr: Es/N0
@@ -44,12 +45,12 @@ def qam_symbol_error(order: int, snr: float) -> float:
 
 
 def orthogonal_symbol_error(count: int, snr: float) -> float:
-    """Orthogonal signals, the strongest wins, phase unknown (chirps are).
+    """Orthogonal signals with unknown phase, such as chirps; the strongest is decided.
 
     :param count: signals
     :param snr: Es/N0
     """
-    # The winner's squared amplitude is Rice distributed: integrate over it that all others stay below.
+    # The amplitude of the right signal is Rice distributed: integrate the probability that all others are below it.
     r = np.linspace(0.0, sqrt(2 * snr) + 12.0, 4000)
     a = sqrt(2 * snr)
     log_bessel = np.log(np.i0(np.minimum(a * r, 600.0)))
@@ -81,10 +82,10 @@ def at_least(least: int, count: int, probability: float) -> float:
 
 
 def coded_success(points: NDArray[np.complex64], snr: float, data_bits: int, coded_bits: int) -> float:
-    """Probability that the best code of this length and rate delivers, whatever code it is.
+    """Probability that the best possible code of this length and rate delivers.
 
-    The normal approximation of Polyanskiy, Poor and Verdu (IEEE Trans. Inf. Theory 56-5, 2010): what the points of a
-    frame tell together is about normal, and must be more than the data.
+    The normal approximation of Polyanskiy, Poor and Verdu (IEEE Trans. Inf. Theory 56-5, 2010): the information of a
+    frame's points is approximately normal, and must exceed the data.
 
     :param points: of the constellation, equally likely
     :param snr: mean energy of a point over N0
@@ -95,7 +96,7 @@ def coded_success(points: NDArray[np.complex64], snr: float, data_bits: int, cod
 
 
 def coded_orthogonal_success(order: int, error: float, data_bits: int, count: int) -> float:
-    """The same for ``count`` orthogonal signals that are decided one by one.
+    """The same for ``count`` orthogonal signals, each decided independently.
 
     :param order: signals to choose from
     :param error: probability that a decision is wrong
@@ -108,14 +109,15 @@ def coded_orthogonal_success(order: int, error: float, data_bits: int, count: in
 
 
 def _enough(count: float, mean: float, variance: float, data_bits: int) -> float:
-    """Probability that ``count`` symbols tell more than the data, bits, each of this mean and variance."""
+    """Probability that ``count`` symbols carry more information than the data bits; mean and variance are those of one
+    symbol."""
     spread = sqrt(max(count * variance, 1e-12))
     return 1 - q((count * mean - data_bits + 0.5 * log2(count)) / spread)
 
 
 @lru_cache(maxsize=4096)
 def _information(points: bytes, snr_db: float) -> tuple[float, float]:
-    """Mean and variance of what one received point tells of the one sent, bits."""
+    """Mean and variance of the information of one received point, bits."""
     sent = np.frombuffer(points, np.complex64).astype(np.complex128)
     noise = np.mean(np.abs(sent) ** 2) / 10 ** (snr_db / 10)
     nodes, weights = np.polynomial.hermite.hermgauss(24)

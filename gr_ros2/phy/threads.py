@@ -1,7 +1,7 @@
-"""What GNU Radio's scheduler needs to be told: quick threads for Python blocks, and message ports that lose nothing.
+"""Settings for GNU Radio's scheduler: fast switching between Python threads, and message ports that lose nothing.
 
-Laws: a block keeps its thread's state from ``start`` to ``stop``, which GNU Radio calls in the thread that also brings
-its messages; nothing is kept of a thread that has ended.
+Invariants: a block keeps its thread's Python state from ``start`` to ``stop``, which GNU Radio calls in the thread that
+also delivers its messages; no state of an ended thread is kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAX_MESSAGES = "GR_CONF_DEFAULT_MAX_MESSAGES"
 """Environment variable of GNU Radio's setting ``max_messages``, read when a flowgraph starts."""
 
 _LOOK_S = 0.1
-"""A thread that waits without end does not always hear a signal."""
+"""s between two checks: a thread that waits without a time limit may miss a signal."""
 
 _START_ATTEMPTS = 20
 """GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
@@ -35,28 +35,28 @@ _START_ATTEMPTS = 20
 _log = logging.getLogger(__name__)
 
 
-def quicken_threads() -> None:
-    """Let Python threads hand over quickly; for the whole process, since there is only one such setting."""
+def shorten_switch_interval() -> None:
+    """Make Python switch between threads quickly; the setting is one for the whole process."""
     if sys.getswitchinterval() > SWITCH_INTERVAL_S:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
-def keep_messages() -> None:
+def lift_message_limit() -> None:
     """Let message ports without a handler, such as that of ``pdu_to_tagged_stream``, keep every message.
 
     GNU Radio prunes such a port when it holds more than ``max_messages`` (8192), but counts without a lock: with no
-    more than 40 messages ever waiting it dropped about one in four million. A limit that is never reached turns
-    that off. For flowgraphs started afterwards in this process; a setting of the user's own stays.
+    more than 40 messages ever waiting it dropped about one in four million. A limit that is never reached turns that
+    off. This affects flowgraphs started afterwards in this process; a value set by the user stays.
     """
     os.environ.setdefault(_MAX_MESSAGES, "-1")
 
 
-def begin(start: Callable[[], None]) -> None:
-    """Start a flowgraph, again and again where GNU Radio could not map a buffer.
+def start_flowgraph(start: Callable[[], None]) -> None:
+    """Start a flowgraph, and repeat this where GNU Radio could not map a buffer.
 
-    Ctrl-C waits until it has started: who calls can stop it then.
+    Ctrl-C is delayed until it has started, so that the caller can stop it.
 
-    :raises PhyError: when it still cannot after many attempts, or refuses the flowgraph
+    :raises PhyError: when GNU Radio still cannot after many attempts, or refuses the flowgraph
     """
     failed: Exception | None = None
     with uninterrupted():
@@ -75,13 +75,12 @@ def begin(start: Callable[[], None]) -> None:
     ) from failed
 
 
-def finish(flowgraph: Any) -> None:
-    """Wait until a flowgraph has come to its end.
+def wait_for_end(flowgraph: Any) -> None:
+    """Wait until a flowgraph has finished.
 
-    KeyboardInterrupt stops it and comes through. GNU Radio's own ``wait`` stops it too, but returns as if all
-    of it had passed.
+    KeyboardInterrupt stops it and is raised. GNU Radio's own ``wait`` stops it too, but returns as if it had finished.
     """
-    waiting = threading.Thread(target=flowgraph.wait, daemon=True)  # signals reach the main thread alone
+    waiting = threading.Thread(target=flowgraph.wait, daemon=True)  # only the main thread receives signals
     try:
         with uninterrupted():
             waiting.start()
@@ -93,27 +92,27 @@ def finish(flowgraph: Any) -> None:
         raise
 
 
-def run_through(flowgraph: Any) -> None:
-    """Start a flowgraph and wait until it has come to its end; see :func:`begin` and :func:`finish`.
+def run_flowgraph(flowgraph: Any) -> None:
+    """Start a flowgraph and wait until it has finished; see :func:`start_flowgraph` and :func:`wait_for_end`.
 
-    Whatever happens it is stopped: one that is let go while it runs waits for its threads with Python's lock held.
+    It is stopped in any case: a flowgraph that is deleted while it runs waits for its threads with Python's lock held.
     """
     try:
-        begin(flowgraph.start)
-        finish(flowgraph)
+        start_flowgraph(flowgraph.start)
+        wait_for_end(flowgraph)
     except BaseException:
         flowgraph.stop()
         flowgraph.wait()
         raise
 
 
-def only_warnings(blocks: Iterable[Any]) -> None:
-    """Let these blocks log warnings only, not each buffer set on them."""
+def log_warnings_only(blocks: Iterable[Any]) -> None:
+    """Make these blocks log only warnings, not each buffer size."""
     for block in blocks:
         block.set_log_level("warn")
 
 
-class BlockThread:
+class ThreadState:
     """Keeps the Python state of the thread in which GNU Radio calls a block.
 
     Otherwise GNU Radio makes a state and ends it again with every message, and Python 3.11 and later map and unmap a
@@ -125,40 +124,40 @@ class BlockThread:
         self._state = 0
 
     def keep(self) -> None:
-        """To be called in the block's ``start``; harmless when called twice."""
+        """Call this in the block's ``start``; a second call does nothing."""
         if self._ident != threading.get_ident():
             self._ident = threading.get_ident()
             self._state = ctypes.pythonapi.PyGILState_Ensure()
 
     def release(self) -> None:
-        """To be called in the block's ``stop``; does nothing in any other thread than that of ``keep``."""
+        """Call this in the block's ``stop``; it does nothing in any other thread than that of ``keep``."""
         if self._ident == threading.get_ident():
             self._ident = None
             ctypes.pythonapi.PyGILState_Release(self._state)
 
 
-class KeepsThread:
-    """Start and stop of a Python block that has nothing else to do there; stands before GNU Radio's class."""
+class KeepsThreadState:
+    """Mix-in with start and stop for a Python block that needs nothing else there; list it before GNU Radio's class."""
 
     @cached_property
-    def _block_thread(self) -> BlockThread:
-        return BlockThread()
+    def _thread_state(self) -> ThreadState:
+        return ThreadState()
 
     def start(self) -> bool:
-        self._block_thread.keep()
+        self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
 
-class Held(KeepsThread):
-    """A Python block inside a hier block; stands before GNU Radio's class.
+class KeptAlive(KeepsThreadState):
+    """Mix-in for a Python block inside a hier block; list it before GNU Radio's class.
 
-    GNU Radio calls Python blocks without holding a reference, so a flowgraph whose maker dropped the hier block around
-    them would crash. They are held here until they have stopped, and a while longer, since a flowgraph may start again;
-    not for ever, since a block holds the buffers in front of it.
+    GNU Radio calls Python blocks without holding a reference, so a flowgraph would crash after its creator dropped the
+    hier block around them. This class keeps references until the blocks have stopped, and to the last few longer, since
+    a flowgraph may start again; not to all, since a block keeps its input buffers.
     """
 
     _alive: ClassVar[set[Any]] = set()

@@ -1,8 +1,7 @@
-"""Credits for a flowgraph that runs as fast as it can: a few packets are under way at any time, no more.
+"""Credits for a flowgraph that runs as fast as it can: only a few packets are in progress at any time.
 
-Laws: credits given are at most ``window`` ahead of the packets that are through; they come several at a time, since
-each message between blocks costs about as much as a packet does; a full window is looked at now and then, because
-progress can only be polled.
+Invariants: credits given are at most ``window`` ahead of the packets that have passed; several credits are given at a
+time, since each message between blocks costs about as much as a packet; progress is polled while the window is full.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.pdus import CREDIT
-from gr_ros2.phy.threads import quicken_threads
+from gr_ros2.phy.threads import shorten_switch_interval
 
 WINDOW = 32
-"""Packets under way: enough to keep the flowgraph busy between two looks at its progress."""
+"""Packets in progress: enough to keep the flowgraph busy between two polls of its progress."""
 
 _SHARE = 4
 """A grant is at least this part of the window."""
@@ -29,8 +28,8 @@ _JOIN_S = 1.0
 class CreditWindow(gr.basic_block):  # type: ignore[misc]
     """Message port `credit` out: an integer, how many more packets may come.
 
-    :param progress: tells how many packets are through
-    :param window: packets under way, 1 or more
+    :param progress: returns how many packets have passed
+    :param window: packets in progress, 1 or more
     :raises ConfigError: for a window below 1
     """
 
@@ -45,7 +44,7 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
         self.message_port_register_out(CREDIT)
 
     def start(self) -> bool:
-        quicken_threads()
+        shorten_switch_interval()
         self._stopped.clear()
         self._thread = threading.Thread(target=self._run, name="gr-ros2-window", daemon=True)
         self._thread.start()

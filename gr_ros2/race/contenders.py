@@ -1,7 +1,7 @@
 """Who races, and with which settings.
 
-Law: the peers have what their manuals offer for slow links and what measured best here; docs/explanation/race.md says
-why each.
+Invariant: the peers have what their manuals offer for slow links and what measured best here; docs/explanation/race.md
+says why each.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What one contender did under one condition, in numbers, and who did best.
 
-Laws: a message is delivered when its bytes come out as they went in (alignment gaps and the padding of DDS aside),
-once; a number that does not apply is None; winners are computed from the numbers as they are shown, and all who show
-the same win together.
+Invariants: a message is delivered when its bytes come out as they went in (alignment gaps and the padding of DDS
+aside), once; a number that does not apply is None; winners are computed from the numbers as they are shown, and all who
+show the same win together.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.errors import ConfigError
-from gr_ros2.race.air import AirLog, AirReport
-from gr_ros2.race.settings import Recording
+from gr_ros2.race.links import LinkLog, LinkReport
+from gr_ros2.race.settings import RaceRecording
 from gr_ros2.record.metrics import age, latency
 from gr_ros2.registry import Registry
 
@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Cell:
+class RaceCell:
     """One contender under one condition. Times in s, sizes in bytes; both directions of the air count.
 
     :param load: share of the air that the recording needs as it is, one frame per message
@@ -93,7 +93,7 @@ COLUMNS = {
     "discovery_bytes": Column("discovery bytes", "least", _whole),
     "first_message": Column("first message [s]", "least", "{:.2f}".format),
 }
-"""By the field of :class:`Cell`."""
+"""By the field of :class:`RaceCell`."""
 
 
 class Identity:
@@ -102,7 +102,7 @@ class Identity:
     :raises ConfigError: where two of its messages are the same
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RaceRecording) -> None:
         self._codec = LinkCodec(Registry.from_rows([(recording.topic, recording.type_name)]))
         self._numbers = {self._plain(payload): number for number, payload in enumerate(recording.payloads)}
         if len(self._numbers) < len(recording.payloads):
@@ -127,20 +127,20 @@ class Observed:
     :param began: when the first end began to join
     :param t_sent: when each message was due, in the recording's order
     :param heard: when something arrived, and what
-    :param busy: see :class:`Cell`
+    :param busy: see :class:`RaceCell`
     """
 
     began: float
     matched: bool
     t_sent: Sequence[float]
     heard: Sequence[tuple[float, bytes]]
-    air: AirReport
+    air: LinkReport
     busy: float
 
 
 def measure(
     seen: Observed, identity: Identity, *, contender: str, load: float, loss: float, sample_rate: float
-) -> Cell:
+) -> RaceCell:
     """All numbers of a cell."""
     t_sent = np.array(seen.t_sent)
     t_delivered = np.full(len(t_sent), np.nan)
@@ -162,7 +162,7 @@ def measure(
     before, _ = _traffic(logs, -np.inf, first)
     size, airtime = _traffic(logs, first, np.inf)
     back, _ = _traffic(logs[1:], first, np.inf)
-    return Cell(
+    return RaceCell(
         contender=contender,
         load=load,
         loss=loss,
@@ -186,13 +186,13 @@ def measure(
     )
 
 
-def shown(cell: Cell, column: str) -> str:
+def shown(cell: RaceCell, column: str) -> str:
     """A number as the tables have it; a dash where there is none."""
     value = getattr(cell, column)
     return "–" if value is None else COLUMNS[column].shown(value)
 
 
-def winners(cells: Sequence[Cell]) -> dict[str, list[str]]:
+def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
     """Column -> the contenders that did best in it; of cells under the same condition."""
     best: dict[str, list[str]] = {}
     for name, column in COLUMNS.items():
@@ -205,15 +205,15 @@ def winners(cells: Sequence[Cell]) -> dict[str, list[str]]:
     return best
 
 
-def by_condition(cells: Sequence[Cell]) -> Mapping[tuple[float, float], list[Cell]]:
+def by_condition(cells: Sequence[RaceCell]) -> Mapping[tuple[float, float], list[RaceCell]]:
     """The cells by (load, loss)."""
-    groups: dict[tuple[float, float], list[Cell]] = {}
+    groups: dict[tuple[float, float], list[RaceCell]] = {}
     for cell in cells:
         groups.setdefault((cell.load, cell.loss), []).append(cell)
     return groups
 
 
-def _traffic(logs: Sequence[AirLog], begin: float, end: float) -> tuple[float, float]:
+def _traffic(logs: Sequence[LinkLog], begin: float, end: float) -> tuple[float, float]:
     """Bytes and s of the air between two times."""
     size = airtime = 0.0
     for log in logs:

@@ -1,7 +1,7 @@
 """Network namespaces without names: each exists as long as somebody holds it, so nothing can be left behind.
 
-Laws: only a thread that enters a namespace is in it, and the threads and processes it starts then; the rest of the
-process stays where it was; the kernel removes a namespace with all its interfaces when its last holder is gone,
+Invariants: only a thread that enters a namespace is in it, and the threads and processes it starts then; the rest of
+the process stays where it was; the kernel removes a namespace with all its interfaces when its last holder is gone,
 however that came about.
 """
 

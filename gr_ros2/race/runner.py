@@ -1,7 +1,7 @@
 """Runs the race: one contender under one condition after the other, each from nothing.
 
-Laws: nothing of a cell outlives it, whatever happens: its processes end, and its namespaces and interfaces with them;
-what was measured before Ctrl-C or a failure is kept.
+Invariants: nothing of a cell outlives it, whatever happens: its processes end, and its namespaces and interfaces with
+them; what was measured before Ctrl-C or a failure is kept.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gr_ros2.errors import RunError
-from gr_ros2.race.air import AirReport, IpAir, Radio, RosAir
 from gr_ros2.race.contenders import Contender, chosen
-from gr_ros2.race.ends import Listener, Talker, Topic
-from gr_ros2.race.measure import Cell, Identity, Observed, measure
+from gr_ros2.race.endpoints import RacePublisher, RaceSubscriber, RaceTopic
+from gr_ros2.race.links import IpLink, LinkReport, RaceRadio, RosLink
+from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.settings import (
     PHY_NAME,
     Condition,
+    RaceRecording,
     RaceSettings,
-    Recording,
     check,
     conditions,
     phy_options,
@@ -47,8 +47,8 @@ class Race:
     """
 
     settings: RaceSettings
-    recording: Recording
-    cells: list[Cell] = field(default_factory=list)
+    recording: RaceRecording
+    cells: list[RaceCell] = field(default_factory=list)
     interrupted: bool = False
     error: RunError | None = None
 
@@ -93,23 +93,30 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
         return race
 
 
-def _run_cell(settings: RaceSettings, recording: Recording, condition: Condition, contender: Contender) -> Observed:
-    radio = Radio(PHY_NAME, phy_options(settings), condition.sample_rate, condition.loss, settings.seed)
+def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
+    radio = RaceRadio(PHY_NAME, phy_options(settings), condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)
-        topic = Topic(recording.topic, recording.type_name, recording.topic)
+        topic = RaceTopic(recording.topic, recording.type_name, recording.topic)
         if contender.stack == "gr-ros2":
             packet_len = settings.packet_len if contender.settings["compression"] else recording.single_packet_len
             arguments = (radio, paths, (topic.name, topic.type_name), packet_len, contender)
-            air = stack.enter_context(Worker("radio", "", RosAir, *arguments))
-            topic = Topic(topic.name, topic.type_name, air.call("output_topic"))
+            air = stack.enter_context(Worker("radio", "", RosLink, *arguments))
+            topic = RaceTopic(topic.name, topic.type_name, air.call("output_topic"))
         else:
-            air = stack.enter_context(Worker("radio", "", IpAir, radio, paths))
-        listener = stack.enter_context(Worker("listener", paths[1], Listener, contender, topic))
+            air = stack.enter_context(Worker("radio", "", IpLink, radio, paths))
+        listener = stack.enter_context(Worker("listener", paths[1], RaceSubscriber, contender, topic))
         talker = stack.enter_context(
             Worker(
-                "talker", paths[0], Talker, contender, topic, recording.path, len(recording.due), settings.duration_s
+                "talker",
+                paths[0],
+                RacePublisher,
+                contender,
+                topic,
+                recording.path,
+                len(recording.due),
+                settings.duration_s,
             )
         )
         # The listener joins first, so that a talker that calls it finds it.
@@ -120,7 +127,7 @@ def _run_cell(settings: RaceSettings, recording: Recording, condition: Condition
         t_first = talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S)
         t_sent = [t_first + due for due in recording.due]
         _drain(settings.drain_s, listener, len(t_sent))
-        report: AirReport = air.call("report")
+        report: LinkReport = air.call("report")
         busy = os.getloadavg()[0] / (os.cpu_count() or 1)
         return Observed(began, matched, t_sent, listener.call("heard"), report, busy)
 

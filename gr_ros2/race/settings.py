@@ -1,7 +1,7 @@
 """What is raced over: the recording, the radio, and how the sample rate follows from the load.
 
-Laws: a load is the share of the air that the recording would need if each message were one frame, as it is, with the
-overhead of a version 0 packet; every contender has the same recording at the same sample rate.
+Invariants: a load is the share of the air that the recording would need if each message were one frame, as it is, with
+the overhead of a version 0 packet; every contender has the same recording at the same sample rate.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class RaceSettings:
 
 
 @plain_dataclass(frozen=True)
-class Recording:
+class RaceRecording:
     """What every contender carries: one topic of a bag.
 
     :param path: of the bag
@@ -128,11 +128,11 @@ def check(settings: RaceSettings) -> None:
 
 
 def phy_options(settings: RaceSettings) -> dict[str, Any]:
-    """Of the PHY, beside packet length and sample rate: GNU Radio's own blocks, which take frames of any length."""
+    """Of the PHY, beside packet length and sample rate: GNU RaceRadio's own blocks, which take frames of any length."""
     return {"gap": settings.gap, "detection_threshold": "stock"}
 
 
-def conditions(settings: RaceSettings, recording: Recording) -> list[Condition]:
+def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Condition]:
     """Every load with every loss, the lightest first."""
     phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0, **phy_options(settings))
     needed = recording.hz * phy.airtime_samples()
@@ -158,7 +158,7 @@ def record_sim(folder: Path, settings: RaceSettings) -> Path:
     return path
 
 
-def read_recording(settings: RaceSettings, folder: Path) -> Recording:
+def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
     """The recording of the race; that of the simulator is made first.
 
     :param folder: for the bag of the simulator
@@ -185,7 +185,7 @@ def read_recording(settings: RaceSettings, folder: Path) -> Recording:
     if len(payloads) < 2 or stamps[-1] == stamps[0]:
         raise ConfigError(f"{path}: {topic} has {len(payloads)} messages in {settings.duration_s:g} s; 2 are needed")
     due = tuple((stamp - stamps[0]) * 1e-9 for stamp in stamps)
-    recording = Recording(path, topic, found[topic], tuple(payloads), due)
+    recording = RaceRecording(path, topic, found[topic], tuple(payloads), due)
     if recording.largest > _LARGEST_IN_IP:
         raise ConfigError(
             f"{path}: {topic} has messages of {recording.largest} B; the race takes up to {_LARGEST_IN_IP} B, which "

@@ -1,8 +1,8 @@
 """An IP interface of a network namespace whose packets this process carries: a TUN device.
 
-Laws: what the radio cannot take yet waits in the kernel, in a queue bounded in bytes in front of the device, as with a
-real interface, so that senders feel the link being full; what that queue drops is counted; the device is gone when
-it is closed.
+Invariants: what the radio cannot take yet waits in the kernel, in a queue bounded in bytes in front of the device, as
+with a real interface, so that senders feel the link being full; what that queue drops is counted; the device is gone
+when it is closed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Processes of the race: an object in a process of its own, in a network namespace of its own, called from here.
 
-Laws: a worker lives no longer than the ``with`` of its owner, nor than its owner, whatever ends that; Ctrl-C is for the
-owner only, who then ends the workers at once; what fails in a worker fails in its owner, in the same words.
+Invariants: a worker lives no longer than the ``with`` of its owner, nor than its owner, whatever ends that; Ctrl-C is
+for the owner only, who then ends the workers at once; what fails in a worker fails in its owner, in the same words.
 """
 
 from __future__ import annotations

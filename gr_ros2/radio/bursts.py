@@ -1,8 +1,9 @@
 """Bursts as transmitting devices want them: padded, at the right level, their length told by a tag; and a deaf receiver
 meanwhile, where the device needs it.
 
-Laws: every burst has the same length, so where one begins and ends is arithmetic on sample numbers, never a tag from
-upstream; a burst leaves as soon as its last sample is in; what follows the last sample are zeros, never the next burst.
+Invariants: every burst has the same length, so where one begins and ends is arithmetic on sample numbers, never a tag
+from upstream; a burst leaves as soon as its last sample is in; what follows the last sample are zeros, never the next
+burst.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import pmt
 from gnuradio import gr
 from numpy.typing import NDArray
 
-from gr_ros2.phy.threads import KeepsThread
+from gr_ros2.phy.threads import KeepsThreadState
 
 LENGTH_TAG = "burst_len"
 """On a burst's first sample: how many it has. With ``tx_sob`` and ``tx_eob`` instead ``uhd.usrp_sink`` would begin one
@@ -52,7 +53,7 @@ class BurstLayout:
         return -(-(self.lead + self.samples + self.tail) // self.multiple) * self.multiple
 
 
-class BurstShaper(KeepsThread, gr.basic_block):  # type: ignore[misc]
+class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
     """A transmitter's samples in, whole bursts out, tagged with their length.
 
     A sample beyond full scale, which a converter would turn into its opposite, is brought back to it and counted.
@@ -123,7 +124,7 @@ class BurstShaper(KeepsThread, gr.basic_block):  # type: ignore[misc]
         return bursts * total
 
 
-class Blanker(KeepsThread, gr.sync_block):  # type: ignore[misc]
+class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Samples in and out; zeros for those that came while we sent, and for ``after`` s beyond.
 
     A sample's time is when it gets here, so ``after`` has to cover what it takes from the antenna to this place.

@@ -1,25 +1,34 @@
 """What `gr-ros2 link` is told: one robot's end of a link as one YAML file.
 
-Law: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level; whatever
-a front end needs stands under `front_end`, and its sample rate is the PHY's.
+Invariant: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level;
+whatever a front end needs stands under `front_end`, and its sample rate is the PHY's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import ChannelConfig, DiagnosticsConfig, PacketLen, PhyConfig, SinkConfig, SourceConfig, build
+from gr_ros2.config import (
+    ChannelConfig,
+    DiagnosticsConfig,
+    PacketLen,
+    PhyConfig,
+    SinkConfig,
+    SourceConfig,
+    WireVersion,
+    build,
+)
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.registry import Registry, check_outputs
-from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings_file import ENDS, SHARED_KEYS, read_settings, with_shared
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
@@ -27,8 +36,15 @@ class LinkConfig:
     """One robot's end: its ROS graph -> RosSource -> PHY -> front end, and back the same way.
 
     :param name: what errors and the status line call it
-    :param registry: CSV path, relative to the YAML file, or the name of a built-in one; the same at every robot
+    :param registry: CSV path, relative to the YAML file, or the name of a built-in one: the topics that are sent; with
+        version 0 the same at every robot, with version 1 each announces its own, and '' sends none
     :param packet_len: bytes on the wire, 14..4095; the same at every robot
+    :param version: of the wire format: 1 repairs, announces topics and can be sealed, 0 is the paper's; the same at
+        every robot
+    :param key: file of the fleet's keys (gr-ros2 key new), relative to the YAML file; '' sends packets that anybody can
+        read and forge
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts (version 1); '' takes one in the user's state folder
     :param ros_source: the sending block; its robot_id must be another at every robot
     :param ros_sink: the receiving block; its robot_id -1 means this robot's, except with a front end that loops back
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
@@ -40,9 +56,13 @@ class LinkConfig:
     :param localhost_only: DDS stays on the loopback interface; None takes what the environment of ROS says
     """
 
-    registry: Annotated[str, Field(min_length=1)]
+    registry: str = ""
     name: Annotated[str, Field(min_length=1)] = "link"
     packet_len: PacketLen = 220
+    version: WireVersion = 1
+    key: str = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: str = ""
     ros_source: SourceConfig = Field(default_factory=SourceConfig)
     ros_sink: SinkConfig = Field(default_factory=SinkConfig)
     phy: PhyConfig = Field(default_factory=PhyConfig)
@@ -54,6 +74,8 @@ class LinkConfig:
 
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:
+        if not self.registry and not self.version:
+            raise ValueError("registry is missing, and version 0 needs the same one at every robot")
         if "name" not in self.front_end:
             raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
         for key, name, table in (
@@ -85,6 +107,8 @@ class LinkConfig:
         :raises RegistryError: file, line, what is wrong
         :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
+        if not self.registry:
+            return Registry.empty()
         registry = Registry.from_csv(self.registry)
         check_outputs(registry, self.ros_sink)
         return registry
@@ -96,8 +120,12 @@ def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
     :param where: what to call the mapping in errors, for instance its file name
     :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; names it
     """
+    values = {"version": 1, **values}
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
-    return build(LinkConfig, {**values, **with_shared(values, shared, f"{where}: " if where else "")}, where)
+    values |= with_shared(values, shared, f"{where}: " if where else "")
+    if values["version"] == 1:
+        values |= {end: {"compression": True, **values[end]} for end in ENDS if isinstance(values.get(end), Mapping)}
+    return build(LinkConfig, values, where)
 
 
 def load_link(path: str | Path, overrides: Sequence[str] = ()) -> LinkConfig:

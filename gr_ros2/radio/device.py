@@ -1,8 +1,8 @@
 """What all radios have in common: frequencies, gains, antennas, and a transmitter that works in bursts.
 
-Laws: a device gets its samples at the time they go on the air, whole bursts only, none beyond full scale; a device
-that is not at the sample rate, frequency and gain asked for is refused before it sends: packets at another rate are
-noise, and another frequency may be somebody else's; whatever the vendor's library throws, and a device that falls
+Invariants: a device gets its samples at the time they go on the air, whole bursts only, none beyond full scale; a
+device that is not at the sample rate, frequency and gain asked for is refused before it sends: packets at another rate
+are noise, and another frequency may be somebody else's; whatever the vendor's library throws, and a device that falls
 silent or deaf, becomes one line that names front end, args and remedy.
 """
 
@@ -21,8 +21,8 @@ from gr_ros2.config import Count, Seconds
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
-from gr_ros2.radio.events import GapCounter
 from gr_ros2.radio.front_end import STRICT, FrontEnd, FrontEndOptions, Hertz
+from gr_ros2.radio.stream_events import GapCounter
 
 TOLERANCE = 1e-4
 """How far from the sample rate and frequency asked for a device may be; the PHYs are made for clocks within 100 ppm."""

@@ -1,7 +1,7 @@
 """Says on the ROS graph how a link is doing: ``/diagnostics`` for people's tools, and all its counters as JSON.
 
-Laws: one thread, which lives on whatever fails in it and counts that, and which alone publishes and leaves the graph;
-nothing is published once ``stop`` has returned; all judgement is in ``gr.health``.
+Invariants: one thread, which lives on whatever fails in it and counts that, and which alone publishes and leaves the
+graph; nothing is published once ``stop`` has returned; all judgement is in ``gr.health``.
 """
 
 from __future__ import annotations

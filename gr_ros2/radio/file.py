@@ -1,8 +1,8 @@
 """The `file` front end: what would be sent goes into a SigMF recording, what was recorded is received again.
 
-Laws: a replay comes at its sample rate by the clock, whole packets' worth of zeros behind it, so that its last packet
-comes out too; a sample that is not a finite number comes as 0 and is counted, since no receiver's filters and loops
-would recover from it; a transmission is recorded without the silence between packets, each burst annotated.
+Invariants: a replay comes at its sample rate by the clock, whole packets' worth of zeros behind it, so that its last
+packet comes out too; a sample that is not a finite number comes as 0 and is counted, since no receiver's filters and
+loops would recover from it; a transmission is recorded without the silence between packets, each burst annotated.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
-from gr_ros2.phy.threads import KeepsThread
+from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
-from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
+from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 
 _STEP_S = 0.005
 _LONGEST_WAIT_S = 0.1
@@ -70,7 +70,7 @@ class FileFrontEnd(FrontEnd):
                 )
             self._replay = _Replay(samples, phy, self.options)
         if self.options.write:
-            about = Recording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
+            about = SigmfRecording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
             self._recorder = SigmfRecorder(Path(self.options.write), about, phy.airtime_samples(), lossless=True)
 
     @property
@@ -99,7 +99,7 @@ class FileFrontEnd(FrontEnd):
             self._recorder.close()
 
 
-class _Replay(KeepsThread, gr.sync_block):  # type: ignore[misc]
+class _Replay(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Samples of a recording out, by the clock."""
 
     def __init__(self, samples: NDArray[np.complex64], phy: Phy, options: FileOptions) -> None:

@@ -1,7 +1,7 @@
 """What a link asks of a front end: a place to put samples, a place samples come from, and how long a packet takes.
 
-Laws: a front end is opened when it is made, so that a wrong device or address is an error at once and not later in a
-thread; `close` gives everything back and may be called twice; whatever it loses it counts in `counters`.
+Invariants: a front end is opened when it is made, so that a wrong device or address is an error at once and not later
+in a thread; `close` gives everything back and may be called twice; whatever it loses it counts in `counters`.
 """
 
 from __future__ import annotations

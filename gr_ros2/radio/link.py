@@ -1,8 +1,8 @@
 """One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
 
-Laws: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a robot
-does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`, also
-when opening failed half-way.
+Invariants: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a
+robot does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`,
+also when opening failed half-way.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from gr_ros2.config import SinkConfig
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
@@ -77,32 +77,46 @@ class RobotLink(Flowgraph):
         )
         self._stack.callback(self.radio.close)
         graphs = self._graphs(middleware)
-        self.source = RosSource(
-            self.registry,
-            middleware=graphs[0],
-            observer=observer,
-            clock=self._clock,
-            **own_settings(config.ros_source),
-        )
-        self._stack.callback(self.source.close)
-        self.sink = RosSink(
-            self.registry,
-            middleware=graphs[1],
-            observer=observer,
-            clock=self._clock,
-            **own_settings(self._sink_config()),
-        )
-        self._stack.callback(self.sink.close)
+        if self.front_end.loops_back:
+            self._two_blocks(graphs, observer)
+        else:
+            self._one_block(graphs, observer)
         self.source.use_credit()
-        self.msg_connect(self.source, "pdus", self.radio, "pdus")
-        self.msg_connect(self.radio, "credit", self.source, "credit")
-        self.msg_connect(self.radio, "pdus", self.sink, "pdus")
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
             self._diagnostics = Diagnostics(
                 config.diagnostics, graphs[1], self.node_name, self.stats, clock=self._clock
             )
             self._stack.callback(self._diagnostics.stop)
+
+    def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
+        """Both directions around one end, so that what is heard changes what is sent."""
+        both = RosLink(
+            self.registry,
+            self.config.ros_source,
+            self._sink_config(),
+            middleware=graphs,
+            half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            observer=observer,
+            clock=self._clock,
+        )
+        self._stack.callback(both.close)
+        self.source, self.sink = both.source, both.sink
+        self.msg_connect(both, "pdus", self.radio, "pdus")
+        self.msg_connect(self.radio, "credit", both, "credit")
+        self.msg_connect(self.radio, "pdus", both, "pdus")
+
+    def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
+        """A robot that hears itself is two: one that sends and one that receives."""
+        common: dict[str, Any] = {"observer": observer, "clock": self._clock}
+        source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
+        self.source = RosSource(self.registry, middleware=graphs[0], **common, **source)
+        self._stack.callback(self.source.close)
+        self.sink = RosSink(self.registry, middleware=graphs[1], **common, **sink)
+        self._stack.callback(self.sink.close)
+        self.msg_connect(self.source, "pdus", self.radio, "pdus")
+        self.msg_connect(self.radio, "credit", self.source, "credit")
+        self.msg_connect(self.radio, "pdus", self.sink, "pdus")
 
     @property
     def node_name(self) -> str:
@@ -128,7 +142,7 @@ class RobotLink(Flowgraph):
     def _sink_config(self) -> SinkConfig:
         """The sink's settings; on a medium that others share it knows its own packets."""
         sink = self.config.ros_sink
-        if sink.robot_id == -1 and not self.front_end.loops_back:
+        if sink.robot_id == -1:
             return replace(sink, robot_id=self.config.ros_source.src_id())
         return sink
 
@@ -139,6 +153,11 @@ class RobotLink(Flowgraph):
         """
         super().start(max_noutput_items)
         self._started = self._clock()
+        if self.config.version and not self.config.key:
+            _log.warning(
+                "link %s has no key, so anybody can read, forge and replay its packets; gr-ros2 key new FILE makes one",
+                self.config.name,
+            )
         self.phy.prefer_latency()
         if self._diagnostics is not None:
             self._diagnostics.start()

@@ -1,7 +1,7 @@
 """A link described in one line of a command: a robot's number, a radio, and where that radio finds the others.
 
-Law: what comes out is what a YAML file of a link has, and goes through the same loader; nothing is set that the file
-could not set, and what is left out takes the file's defaults.
+Invariant: what comes out is what a YAML file of a link has, and goes through the same loader; nothing is set that the
+file could not set, and what is left out takes the file's defaults.
 """
 
 from __future__ import annotations

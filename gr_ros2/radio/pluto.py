@@ -1,9 +1,10 @@
 """The `pluto` front end: ADALM-Pluto through IIO.
 
 Its transmitter takes whole buffers, so a buffer is exactly one burst and leaves at once; between bursts the converter
-has nothing to send, and each burst ends in zeros. Laws: GNU Radio's blocks go on where the device refuses a setting,
-so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that went well,
-else in the log of debugging, and our line says what went wrong; the connection stays open until the process ends.
+has nothing to send, and each burst ends in zeros. Invariants: GNU Radio's blocks go on where the device refuses a
+setting, so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that
+went well, else in the log of debugging, and our line says what went wrong; the connection stays open until the process
+ends.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     @contextmanager
     def one_line(self) -> Iterator[None]:
-        with _stderr_aside(), super().one_line():
+        with _stderr_own_process(), super().one_line():
             yield
 
     def _check_settings(self, direction: Direction) -> None:
@@ -140,7 +141,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
 
 @contextmanager
-def _stderr_aside() -> Iterator[None]:
+def _stderr_own_process() -> Iterator[None]:
     """Keeps what any thread writes to stderr meanwhile: it comes out afterwards, or is logged after an error."""
     with tempfile.TemporaryFile() as kept, os.fdopen(os.dup(_STDERR), "wb") as real:
         os.dup2(kept.fileno(), _STDERR)

@@ -1,7 +1,7 @@
 """PHY and front end as one GNU Radio block: packets to the air and back.
 
-Laws: packets leave at the pace of the air, and each credit asks for one just before it is due; neither direction waits
-for the other; what is received can be impaired and looked at only where no real channel does it already.
+Invariants: packets leave at the pace of the air, and each credit asks for one just before it is due; neither direction
+waits for the other; what is received can be impaired and looked at only where no real channel does it already.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
-from gr_ros2.radio.sigmf import Recording, SigmfRecorder
+from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
 
 
 class Radio(PacketPath, HierBlock):
@@ -80,7 +80,7 @@ class Radio(PacketPath, HierBlock):
         self._follow(last, self)
 
     def _connect_samples(self, record: str, instrumented: bool) -> None:
-        """Transmitter to front end, front end to receiver, where there is either."""
+        """Connect the transmitter to the front end, and the front end to the receiver, where they exist."""
         front_end = self.front_end
         front_end.wire(self)
         if front_end.sink is not None:
@@ -90,10 +90,12 @@ class Radio(PacketPath, HierBlock):
         # The channel stops tags too.
         faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
         # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
-        heard = self._receive(front_end.source, faded=faded, shown=instrumented, aside=not front_end.ends)
+        heard = self._receive(front_end.source, faded=faded, shown=instrumented, own_process=not front_end.ends)
         if record:
             frequency = front_end.receive_frequency
-            about = Recording(self.phy.sample_rate, frequency, f"received by {front_end.name}, phy {self.phy.name}")
+            about = SigmfRecording(
+                self.phy.sample_rate, frequency, f"received by {front_end.name}, phy {self.phy.name}"
+            )
             self._recorder = SigmfRecorder(Path(record), about)
             self.connect(heard, self._recorder)
 

@@ -1,8 +1,8 @@
 """SigMF recordings: samples in `NAME.sigmf-data`, what they are in `NAME.sigmf-meta` (sigmf.org, version 1.0.0).
 
-Laws: samples are cf32_le, one channel; a recording that was cut off by a kill is still one, with the metadata it began
-with; a recording is never written over another; writing waits in a thread of its own, and an error ends the recording
-alone.
+Invariants: samples are cf32_le, one channel; a recording that was cut off by a kill is still one, with the metadata it
+began with; a recording is never written over another; writing waits in a thread of its own, and an error ends the
+recording alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gr_ros2 import __version__
 from gr_ros2.backlog import Backlog
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.guard import Guard, one_line
-from gr_ros2.phy.threads import KeepsThread
+from gr_ros2.phy.threads import KeepsThreadState
 
 VERSION = "1.0.0"
 META, DATA = ".sigmf-meta", ".sigmf-data"
@@ -38,7 +38,7 @@ _PATIENCE_S = 5.0
 
 
 @dataclass
-class Recording:
+class SigmfRecording:
     """What a recording says of its samples.
 
     :param sample_rate: samples/s
@@ -93,7 +93,7 @@ def base_path(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in (META, DATA) else path
 
 
-def read_recording(path: Path) -> tuple[Recording, NDArray[np.complex64]]:
+def read_recording(path: Path) -> tuple[SigmfRecording, NDArray[np.complex64]]:
     """A recording and its samples, which stay in the file until they are looked at.
 
     :raises ConfigError: when it is not there, is no SigMF, or is of a datatype other than cf32_le; names it
@@ -115,10 +115,10 @@ def read_recording(path: Path) -> tuple[Recording, NDArray[np.complex64]]:
     # An empty file cannot be mapped; a torn last sample is left out.
     count = size // SAMPLE.itemsize
     samples = np.memmap(data, SAMPLE, "r", shape=(count,)) if count else np.empty(0, SAMPLE)
-    return Recording(sample_rate, frequency, str(about.get("core:description", ""))), samples
+    return SigmfRecording(sample_rate, frequency, str(about.get("core:description", ""))), samples
 
 
-class SigmfRecorder(KeepsThread, gr.sync_block):  # type: ignore[misc]
+class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Samples in, a recording out.
 
     A disk that is full, or slower than the samples, costs the recording samples and the flowgraph nothing: ``failed``
@@ -131,7 +131,7 @@ class SigmfRecorder(KeepsThread, gr.sync_block):  # type: ignore[misc]
     :raises RadioError: when it cannot be written
     """
 
-    def __init__(self, path: Path, about: Recording, burst: int = 0, *, lossless: bool = False) -> None:
+    def __init__(self, path: Path, about: SigmfRecording, burst: int = 0, *, lossless: bool = False) -> None:
         super().__init__("gr_ros2_sigmf_recorder", [np.complex64], None)
         self._meta, self._data = (Path(f"{base_path(path)}{suffix}") for suffix in (META, DATA))
         self._about = about

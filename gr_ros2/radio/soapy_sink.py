@@ -1,9 +1,9 @@
 """A SoapySDR device's transmitter as a GNU Radio block, through the C interface of SoapySDR's own library.
 
 `soapy.sink` of GNU Radio 3.10 does not initialise its count of what remains of a burst: now and then it drops the first
-packets, or hands the driver a negative length and the process dies. Laws: one call brings a whole burst and ends it;
-what a device does not take in time is dropped and counted, so that a device that hangs does not hang the link; what it
-tells of its bursts is asked for with each of them, never waited for.
+packets, or hands the driver a negative length and the process dies. Invariants: one call brings a whole burst and ends
+it; what a device does not take in time is dropped and counted, so that a device that hangs does not hang the link; what
+it tells of its bursts is asked for with each of them, never waited for.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from gnuradio import gr
 from numpy.typing import NDArray
 
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import ThreadState
 
 _TX, _CHANNEL = 0, 0
 _END_BURST = 1 << 1
@@ -126,7 +126,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         self._counted = counted
         self._tells = True
         self._asking = threading.Lock()
-        self._block_thread = BlockThread()
+        self._thread_state = ThreadState()
         self.set_output_multiple(burst)
         self.trouble = ""
         """Why the device does not begin to send: GNU Radio takes no notice of it."""
@@ -181,7 +181,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         self._stream = _call("setupStream", self._device, _TX, b"CF32", byref(c_size_t(_CHANNEL)), 1, None)
 
     def start(self) -> bool:
-        self._block_thread.keep()
+        self._thread_state.keep()
         try:
             _call("activateStream", self._device, self._stream, 0, 0, 0)
         except RuntimeError as error:
@@ -190,7 +190,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     def stop(self) -> bool:
         _soapy.SoapySDRDevice_deactivateStream(self._device, self._stream, 0, 0)
-        self._block_thread.release()
+        self._thread_state.release()
         return True
 
     def close(self) -> None:

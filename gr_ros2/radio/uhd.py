@@ -15,8 +15,8 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import LENGTH_TAG
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
-from gr_ros2.radio.events import UsrpEvents
 from gr_ros2.radio.front_end import STRICT
+from gr_ros2.radio.stream_events import UsrpEvents
 
 _CHANNEL = 0
 

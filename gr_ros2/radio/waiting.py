@@ -1,6 +1,6 @@
 """What a link waits for: topics of its own that nobody publishes, beside those that are published.
 
-Law: a line is told when it has changed, and not again; looking changes nothing on the graph.
+Invariant: a line is told when it has changed, and not again; looking changes nothing on the graph.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """The `zmq` front end: bursts of samples over ZeroMQ, between processes or machines without radios.
 
 Every robot publishes what it sends at one address and subscribes to those of the others; each packet is one message: a
-header, then its samples. Laws: bursts only, so silence costs nothing, and a burst leaves whole or not at all; nobody
-waits for a peer: what is sent while it is away, or while the cable is unplugged, is lost as on the air; either end may
-be killed and started again, the other carries on; nothing of a message is believed before its header is checked, and no
-sample that is not a finite number goes on to a receiver, whose filters and loops would never recover from it.
+header, then its samples. Invariants: bursts only, so silence costs nothing, and a burst leaves whole or not at all;
+nobody waits for a peer: what is sent while it is away, or while the cable is unplugged, is lost as on the air; either
+end may be killed and started again, the other carries on; nothing of a message is believed before its header is
+checked, and no sample that is not a finite number goes on to a receiver, whose filters and loops would never recover
+from it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
-from gr_ros2.phy.threads import KeepsThread
+from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
@@ -167,7 +168,7 @@ def _open(action: Callable[[str], object], key: str, address: str) -> None:
         ) from error
 
 
-class _BurstPublisher(KeepsThread, gr.sync_block):  # type: ignore[misc]
+class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Samples in, each packet's as one message."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
@@ -190,7 +191,7 @@ class _BurstPublisher(KeepsThread, gr.sync_block):  # type: ignore[misc]
         return bursts * self._burst
 
 
-class _BurstSubscriber(KeepsThread, gr.sync_block):  # type: ignore[misc]
+class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Messages in, their samples out."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:

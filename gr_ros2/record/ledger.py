@@ -1,6 +1,6 @@
 """The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
 
-Laws: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
+Invariants: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
 a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); a
 repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; memory holds payload
 digests only of messages whose fate is open, and about 33 bytes of each message besides.
@@ -32,7 +32,7 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row, arrived
+from gr_ros2.link.ledger_rows import LedgerRow, arrived
 from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
@@ -79,7 +79,7 @@ class TopicLedger:
 
 
 @dataclass(slots=True, eq=False)
-class _Open(Tracked):
+class _OpenMessage(Tracked):
     """A message whose fate is open.
 
     :ivar position: its place in the topic's arrays
@@ -94,11 +94,11 @@ class _Open(Tracked):
 
 
 @dataclass(slots=True)
-class _Source:
+class _SourceBook:
     """One sender: its open messages, and its packets in the air."""
 
     src_id: int
-    messages: Tracker[_Open] = field(default_factory=Tracker)
+    messages: Tracker[_OpenMessage] = field(default_factory=Tracker)
     closed_serials: int = 0
     seen: set[int] = field(default_factory=set)
     packets_sent: int = 0
@@ -114,7 +114,7 @@ class Ledger:
     def __init__(self) -> None:
         self._lock = Lock()
         self._topics: dict[tuple[int, int], TopicLedger] = {}
-        self._sources: dict[int, _Source] = {}
+        self._sources: dict[int, _SourceBook] = {}
         self._unmatched: list[tuple[int, int, bytes, float]] = []
         self._faults: list[str] = []
         self._finished = False
@@ -128,7 +128,7 @@ class Ledger:
         with self._lock:
             if self._finished:
                 return
-            source = self._sources.setdefault(src_id, _Source(src_id))
+            source = self._sources.setdefault(src_id, _SourceBook(src_id))
             if isinstance(event, SentPacket):
                 self._sent(source, event)
             elif isinstance(event, Accepted):
@@ -136,7 +136,7 @@ class Ledger:
             elif isinstance(event, Missed):
                 topic = self._topic(src_id, event.topic_id)
                 topic.sent += event.count
-                topic.rows[Row.LOST_ON_GRAPH.value] += event.count
+                topic.rows[LedgerRow.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, event)
 
@@ -230,7 +230,7 @@ class Ledger:
 
     # -- sender -------------------------------------------------------------------------------------------------
 
-    def _new_message(self, source: _Source, event: Accepted | Refused, t: float, size: int) -> TopicLedger:
+    def _new_message(self, source: _SourceBook, event: Accepted | Refused, t: float, size: int) -> TopicLedger:
         serial = event.serial
         if serial < source.closed_serials or serial in source.seen:
             self._faults.append(f"source {source.src_id}: serial {serial} was reported twice")
@@ -247,13 +247,13 @@ class Ledger:
         topic.row.append(_OPEN)
         return topic
 
-    def _accepted(self, source: _Source, event: Accepted) -> None:
+    def _accepted(self, source: _SourceBook, event: Accepted) -> None:
         topic = self._new_message(source, event, event.now, len(event.payload))
-        message = _Open.of(event)
+        message = _OpenMessage.of(event)
         message.position = len(topic.serial) - 1
         source.messages.add(message)
 
-    def _refused(self, source: _Source, event: Refused) -> None:
+    def _refused(self, source: _SourceBook, event: Refused) -> None:
         message = source.messages.get(event.serial)
         if message is None:  # refused before it was queued
             topic = self._new_message(source, event, nan, 0)
@@ -261,7 +261,7 @@ class Ledger:
         else:
             self._close(source, message, event.reason)
 
-    def _sent(self, source: _Source, event: SentPacket) -> None:
+    def _sent(self, source: _SourceBook, event: SentPacket) -> None:
         ordinal = source.packets_sent
         source.packets_sent += 1
         source.air[event.kind] += 1
@@ -275,7 +275,7 @@ class Ledger:
         source.in_air.append((ordinal, digest))
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
-    def _retire(self, source: _Source, newer: _Open) -> None:
+    def _retire(self, source: _SourceBook, newer: _OpenMessage) -> None:
         """Settle what had this message's key before and cannot arrive any more: keys have come round since."""
         assert newer.key is not None
         horizon = source.last_received - REORDER_WINDOW
@@ -290,14 +290,18 @@ class Ledger:
         if source is not None:
             message = source.messages.find(event)
             if message is not None:
-                return self._deliver(source, message, now, Row.REPAIRED if event.repaired else Row.DELIVERED)
+                return self._deliver(
+                    source, message, now, LedgerRow.REPAIRED if event.repaired else LedgerRow.DELIVERED
+                )
             if source.messages.repeats(event) and source.messages.repeated(event) is None:
                 self._topic(event.src_id, event.topic_id).repeats_delivered += 1
                 return None
         self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
         return None
 
-    def _deliver(self, source: _Source, message: _Open, now: float, row: Row = Row.DELIVERED) -> float:
+    def _deliver(
+        self, source: _SourceBook, message: _OpenMessage, now: float, row: LedgerRow = LedgerRow.DELIVERED
+    ) -> float:
         self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
         self._close(source, message, row)
         return message.t_sent
@@ -320,7 +324,7 @@ class Ledger:
             self._topics[key] = TopicLedger(src_id, topic_id)
         return self._topics[key]
 
-    def _close(self, source: _Source, message: _Open, row: str) -> None:
+    def _close(self, source: _SourceBook, message: _OpenMessage, row: str) -> None:
         self._topic(source.src_id, message.topic_id).book(message.position, row)
         source.messages.close(message)
 
@@ -339,7 +343,7 @@ class Ledger:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            submitted = topic.sent - topic.rows[Row.LOST_ON_GRAPH.value]
+            submitted = topic.sent - topic.rows[LedgerRow.LOST_ON_GRAPH.value]
             if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
                 rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
                 self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
@@ -349,7 +353,7 @@ class Ledger:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
 
-def _arrived(source: _Source, digest: bytes) -> int:
+def _arrived(source: _SourceBook, digest: bytes) -> int:
     """A packet of this source came in: the first one with these bytes that was sent after the newest received.
 
     :return: its number
@@ -374,16 +378,16 @@ def _arrived(source: _Source, digest: bytes) -> int:
     return ordinal
 
 
-def _final_row(source: _Source, message: _Open, drained: bool) -> str:
+def _final_row(source: _SourceBook, message: _OpenMessage, drained: bool) -> str:
     """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
     the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
     behind the last packet that arrived; given up where its sender repairs what is lost."""
     if message.reason:
         return message.reason
     if not message.all_sent:
-        return Row.IN_FLIGHT
+        return LedgerRow.IN_FLIGHT
     if message.received >= message.total:
-        return Row.NOT_TAKEN
+        return LedgerRow.NOT_TAKEN
     if not drained and message.last_packet >= source.last_received:
-        return Row.IN_FLIGHT
-    return Row.GIVEN_UP if source.air["repair"] else Row.LOST_FRAGMENTS
+        return LedgerRow.IN_FLIGHT
+    return LedgerRow.GIVEN_UP if source.air["repair"] else LedgerRow.LOST_FRAGMENTS

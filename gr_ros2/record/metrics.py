@@ -1,6 +1,6 @@
 """What an experiment reports about one topic, from the joined times of its messages.
 
-Laws: a number that does not apply is None, never a guess; negative latencies (clock skew) are kept and counted;
+Invariants: a number that does not apply is None, never a guess; negative latencies (clock skew) are kept and counted;
 all times are seconds on one clock.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.link.outcome import arrived
+from gr_ros2.link.ledger_rows import arrived
 from gr_ros2.record.ledger import TopicLedger
 
 Floats = npt.NDArray[np.float64]
@@ -99,11 +99,11 @@ def latency_cdf(latencies: Floats) -> tuple[float, ...]:
 
 
 def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
-    """Mean and peak of the age of information, exactly, over its :func:`teeth`.
+    """Mean and peak of the age of information, exactly, over its :func:`age_sawtooth`.
 
     :return: None where nothing was delivered, or only at the very end of the watch
     """
-    start, until, newest = teeth(t_sent, t_delivered, t_end)
+    start, until, newest = age_sawtooth(t_sent, t_delivered, t_end)
     if not len(start):
         return None
     low, high = start - newest, until - newest  # age at both ends of each tooth
@@ -111,7 +111,7 @@ def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
     return Age(float(((low + high) / 2 * lengths).sum() / lengths.sum()), float(high.max()))
 
 
-def teeth(t_sent: Floats, t_delivered: Floats, t_end: float) -> tuple[Floats, Floats, Floats]:
+def age_sawtooth(t_sent: Floats, t_delivered: Floats, t_end: float) -> tuple[Floats, Floats, Floats]:
     """The age of information is a sawtooth: it rises with slope 1 and falls to ``t_delivered - t_sent`` whenever a
     message newer than all before is delivered.
 

@@ -1,6 +1,6 @@
 """Positions out of serialized messages: which types carry one, and where.
 
-Law: only types of ROS 2 Humble whose position is one point in metres count (no latitude and longitude); a payload
+Invariant: only types of ROS 2 Humble whose position is one point in metres count (no latitude and longitude); a payload
 that does not deserialize, or whose position is no finite number or beyond ``FARTHEST_M``, has no position and is
 counted by who asked.
 """

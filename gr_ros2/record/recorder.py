@@ -1,6 +1,6 @@
 """Watches one run and turns what it saw into results: the loss ledger, the paths and the numbers of every topic.
 
-Law: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
+Invariant: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
 lock and the reading of one position; what it keeps of a message or packet are numbers in arrays.
 """
 
@@ -14,10 +14,10 @@ from typing import Any
 from gr_ros2.link.events import Accepted, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.record.ledger import Ledger, TopicLedger
 from gr_ros2.record.metrics import TopicMetrics, topic_metrics
-from gr_ros2.record.path import path_error, rms_error
+from gr_ros2.record.path_error import path_error, rms_error
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
-from gr_ros2.record.trace import PacketLog, Trace, Track, make_trace
+from gr_ros2.record.trace import Floats, PacketLog, Trace, Track, make_trace
 from gr_ros2.registry import Registry, Topic
 
 
@@ -122,6 +122,10 @@ class Recorder:
             if total is not None and self._delivered_bytes
             else None,
         }
+
+    def received_at(self, src_id: int) -> Floats:
+        """s on the run's clock, when each packet of a source reached the sink; NaN for those that did not."""
+        return self._packets[src_id].received_at()
 
     def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
         """Every message, packet and position. To be asked after :meth:`finish`.

@@ -1,7 +1,7 @@
 """One experiment several times: the folders of its runs, and how far its headline numbers vary.
 
-Laws: repetition k, from 0, lies in the folder `rep-k`; the numbers are those of the runs' own results; intervals are
-Student's for the mean, at 95 %, and None where fewer than two runs have the number.
+Invariants: repetition k, from 0, lies in the folder `rep-k`; the numbers are those of the runs' own results; intervals
+are Student's for the mean, at 95 %, and None where fewer than two runs have the number.
 """
 
 from __future__ import annotations

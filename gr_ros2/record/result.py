@@ -1,6 +1,6 @@
 """`result.json`: what an experiment found, as values and as a file.
 
-Laws: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
+Invariants: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
 reading gives back what was written, and refuses anything else with one line that says why. Keys this version does
 not know are ignored when reading, so that results of later versions can still be tabulated.
 """
@@ -90,6 +90,27 @@ class TopicResult:
 
 
 @dataclass(frozen=True, config=_READ)
+class LatenessResult:
+    """How late the computer was, in a run that keeps up with a clock; see :mod:`gr_ros2.record.lateness`.
+
+    :param worst_s: s by part: ``threads``, ``gate``, ``modem``
+    :param moments: times that something was late by 50 ms or more
+    :param share: of the run's time that these moments cover
+    :param lost: messages submitted that did not arrive and are not in flight
+    :param lost_after: of those, how many were submitted in such a moment or within a second after it
+    :param sent, sent_after: the same of all messages submitted
+    """
+
+    worst_s: dict[str, _Number]
+    moments: _Count
+    share: _Number
+    lost: _Count
+    lost_after: _Count
+    sent: _Count
+    sent_after: _Count
+
+
+@dataclass(frozen=True, config=_READ)
 class ReceiverResult:
     """What a further receiver of the same sender got.
 
@@ -112,6 +133,7 @@ class Result:
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
+    :param lateness: None where the run's clock waits for the computer
     :param incomplete: what was written or shown beside this result and is not whole, such as a capture on a full disk:
         one line each, with why and how much is missing. The numbers here are whole all the same.
     :param receivers: further receivers of the same sender
@@ -127,6 +149,7 @@ class Result:
     wall_s: _Number | None = None
     interrupted: bool = False
     counters: dict[str, Any] = field(default_factory=dict)
+    lateness: LatenessResult | None = None
     incomplete: tuple[str, ...] = ()
     receivers: tuple[ReceiverResult, ...] = ()
 

@@ -1,6 +1,6 @@
 """How far a mean or a share may be off, from the runs that were made.
 
-Laws: all intervals are for 95 %; a number that does not apply is None.
+Invariants: all intervals are for 95 %; a number that does not apply is None.
 """
 
 from __future__ import annotations

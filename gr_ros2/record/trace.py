@@ -4,7 +4,7 @@
     packets.parquet                  one line per entry of every packet sent, in the order of sending
     paths.parquet                    one line per position sent or received, where a topic has positions
 
-Laws: times are s since submission began, on the run's clock; what did not happen is null (a message that was not
+Invariants: times are s since submission began, on the run's clock; what did not happen is null (a message that was not
 delivered has no t_delivered); a file appears whole or not at all; reading refuses anything else with one line that
 names the file. While a run lasts a message costs about 33 bytes and an entry 16, in arrays.
 """
@@ -123,6 +123,10 @@ class PacketLog:
     def received(self, number: int, now: float) -> None:
         """The packet of this number, from 0, reached the sink."""
         self._t_received[number] = now
+
+    def received_at(self) -> Floats:
+        """s on the run's clock, when each packet reached the sink; NaN for those that did not."""
+        return _copied(self._t_received, len(self._t_received))
 
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
         """The columns of table `packets`; the topics by name."""

@@ -1,6 +1,6 @@
 """Runs side by side: one table with a column per run, and figures with a curve per run.
 
-Law: only numbers of the runs' own files; where a run has no such topic or number stands a dash.
+Invariant: only numbers of the runs' own files; where a run has no such topic or number stands a dash.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
 from gr_ros2.report.figures import latency_figure, ledger_figure, row_order
@@ -57,7 +57,7 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
                 *(_DASH if topic is None else str(topic.ledger.get(row, 0)) for topic in found),
             )
             for row in rows
-            if row != Row.DELIVERED
+            if row != LedgerRow.DELIVERED
         ]
         sections.append(lines)
     results = [run.result for run in runs]

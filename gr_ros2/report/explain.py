@@ -1,6 +1,6 @@
 """Why a run came out as it did, in sentences computed from its ledger and its trace.
 
-Law: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
+Invariant: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
 apply is left out.
 """
 
@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.lateness import LATE_S
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.figures import row_order
@@ -31,6 +32,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *_packets(result, packets),
         *_in_flight(trace, packets),
         *_trend(trace),
+        *_lateness(result),
     ]
 
 
@@ -44,7 +46,7 @@ def _outcome(result: Result) -> Iterator[str]:
         return
     parts = [
         f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {ROWS[row].words if row in ROWS else row.replace('_', ' ')}"
-        for row in dict.fromkeys([Row.DELIVERED, *row_order([ledger])])
+        for row in dict.fromkeys([LedgerRow.DELIVERED, *row_order([ledger])])
     ]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
@@ -54,7 +56,9 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("pace") == "flow" or not len(packets.packet):
         return
-    needed = sum((m.row != Row.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
+    needed = sum(
+        (m.row != LedgerRow.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages()
+    )
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
     channels = result.phy.get("channels", 1)
     share = needed * airtime / result.duration_s / channels
@@ -81,7 +85,12 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     )
     if result.phy.get("airtime_s") and result.config.get("pace") != "flow" and arrived:
         span = max(result.duration_s, float(np.nanmax(t_received)))
-        used = arrived * result.phy["airtime_s"] / span / result.phy.get("channels", 1)
+        used = (
+            arrived
+            * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"])
+            / span
+            / result.phy.get("channels", 1)
+        )
         text += f"; those that arrived took {_percent(used)} of the air"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
@@ -101,7 +110,7 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
     waiting = under_way = gone = 0
     counts = Counter(zip(packets.src_id.tolist(), packets.serial.tolist(), strict=True))
     for messages in trace.messages():
-        for serial in messages.serial[messages.row == Row.IN_FLIGHT].tolist():
+        for serial in messages.serial[messages.row == LedgerRow.IN_FLIGHT].tolist():
             key = (messages.src_id, serial)
             sent = counts.get(key, 0)
             if not sent:
@@ -136,6 +145,25 @@ def _trend(trace: Trace) -> Iterator[str]:
         yield text + "the wait became shorter."
     else:
         yield text + "it stayed the same."
+
+
+def _lateness(result: Result) -> Iterator[str]:
+    """Whether the computer kept up with the run's clock."""
+    late = result.lateness
+    if late is None or not late.moments:
+        return
+    part, worst = max(late.worst_s.items(), key=lambda item: item[1])
+    others = ", ".join(f"{name} {_seconds(value)}" for name, value in late.worst_s.items() if name != part)
+    text = (
+        f"The computer was up to {_seconds(worst)} late ({part}{'; ' + others if others else ''}), {late.moments:,} "
+        f"times by {milliseconds(LATE_S)} ms or more, {_percent(min(late.share, 1.0))} of the run"
+    )
+    if late.lost:
+        text += (
+            f"; {_percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
+            f"{_percent(late.sent_after / late.sent)} of all messages"
+        )
+    yield text + "."
 
 
 def _entries_per_message(packets: Packets, topic: str) -> float:

@@ -1,7 +1,7 @@
 """The pictures of an experiment: the paper's figure 7 (paths) and figure 6 (latency), the loss ledger; as PNG and SVG.
 
-Laws: figures are objects of their own; nothing of matplotlib's global state is changed, so they can be drawn in any
-thread, with or without a display; a ledger row has the same colour in every picture.
+Invariants: figures are objects of their own; nothing of matplotlib's global state is changed, so they can be drawn in
+any thread, with or without a display; a ledger row has the same colour in every picture.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
@@ -142,7 +142,9 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
 def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
     """The ledger rows that occurred: delivered and repaired first, in_flight last, the others by name between them."""
     found = {row for ledger in ledgers for row, count in ledger.items() if count}
-    return sorted(found, key=lambda row: (row != Row.DELIVERED, row != Row.REPAIRED, row == Row.IN_FLIGHT, row))
+    return sorted(
+        found, key=lambda row: (row != LedgerRow.DELIVERED, row != LedgerRow.REPAIRED, row == LedgerRow.IN_FLIGHT, row)
+    )
 
 
 def row_colour(row: str) -> str:

@@ -1,7 +1,7 @@
 """The report of one or several runs: one HTML file that needs no network, its figures as PNG and SVG, and a table of
 all numbers as CSV and Parquet.
 
-Law: everything comes out of the runs' own files (`result.json` and the tables of :mod:`gr_ros2.record.trace`), so
+Invariant: everything comes out of the runs' own files (`result.json` and the tables of :mod:`gr_ros2.record.trace`), so
 that it can be made again at any time; files that contradict each other are refused.
 """
 
@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from gr_ros2 import __version__
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, read_result, topic_numbers
 from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv, write_text, write_whole
@@ -302,7 +302,7 @@ def _check(run: Run) -> None:
         messages = counts.get((topic.topic, topic.src_id))
         sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
         # Of what did not reach the link nothing but its number is known.
-        submitted = topic.sent - topic.ledger.get(Row.LOST_ON_GRAPH, 0)
+        submitted = topic.sent - topic.ledger.get(LedgerRow.LOST_ON_GRAPH, 0)
         if (sent, delivered) != (submitted, topic.delivered):
             raise ConfigError(
                 f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "

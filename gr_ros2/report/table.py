@@ -1,6 +1,6 @@
 """Results as tables: the paper's table 6, delivery and latency, and the loss ledger. Returned, never printed.
 
-Law: a number that does not apply shows as a dash.
+Invariant: a number that does not apply shows as a dash.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import Result, TopicResult
 
 _DASH = "–"
@@ -80,7 +80,7 @@ def ledger_grid(result: Result) -> Grid:
     """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
     topics = list(_at_every_receiver(result))
     found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
-    first = [Row.DELIVERED, *(row for row in (Row.REPAIRED,) if row in found)]
+    first = [LedgerRow.DELIVERED, *(row for row in (LedgerRow.REPAIRED,) if row in found)]
     rows = list(dict.fromkeys([*first, *sorted(found)]))
     lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
     return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))

@@ -1,7 +1,7 @@
 """The pictures of an experiment over time: delivery, age, airtime, and the first packets one by one.
 
-Laws: times are s since submission began; where there is nothing to draw the picture says so, it is never empty; an
-interval in which nothing was sent has no PDR.
+Invariants: times are s since submission began; where there is nothing to draw the picture says so, it is never empty;
+an interval in which nothing was sent has no PDR.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from gr_ros2.record.metrics import teeth
+from gr_ros2.record.metrics import age_sawtooth
 from gr_ros2.record.trace import Floats, Ints, Messages, Packets
 from gr_ros2.report.figures import COLOURS
 
@@ -99,7 +99,7 @@ def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str,
         peaks = []
         for name, messages in lines.items():
             done = messages.delivered
-            start, until, newest = teeth(messages.t_sent[done], messages.t_delivered[done], t_end[name])
+            start, until, newest = age_sawtooth(messages.t_sent[done], messages.t_delivered[done], t_end[name])
             t = np.column_stack([start, until]).ravel()
             age = np.column_stack([start - newest, until - newest]).ravel()
             axes.plot(t, age, color=COLOURS[names.index(name) % len(COLOURS)], linewidth=0.9, label=name)

@@ -1,8 +1,8 @@
 """`ros2 run gr_ros2 link`: one robot's end of a link as a node whose parameters are the link's settings.
 
-Laws: the configuration file names what the link is, parameters given at the start replace single settings of it, and
-both are checked as one; what the running blocks can change may be set while they run, everything else is read-only; an
-error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`; what the
+Invariants: the configuration file names what the link is, parameters given at the start replace single settings of it,
+and both are checked as one; what the running blocks can change may be set while they run, everything else is read-only;
+an error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`; what the
 library logs goes where the node's own lines go, console and /rosout.
 """
 

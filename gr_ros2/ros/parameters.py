@@ -1,7 +1,7 @@
 """Every setting of a link as one flat list of named values, as ROS parameters have them.
 
-Laws: names, meanings and ranges are those of the configuration classes, never written a second time; a value that ROS
-has no type for (complex numbers, mappings) appears as text; nothing here knows rclpy.
+Invariants: names, meanings and ranges are those of the configuration classes, never written a second time; a value that
+ROS has no type for (complex numbers, mappings) appears as text; nothing here knows rclpy.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The bag of what a simulated run delivered.
 
-Laws: a message is written when it is delivered, with its arrival as the time it was received and its submission as the
-time it was sent (MCAP's log_time and publish_time), both on the run's clock since the origin; payloads, and with them
-header stamps, are untouched.
+Invariants: a message is written when it is delivered, with its arrival as the time it was received and its submission
+as the time it was sent (MCAP's log_time and publish_time), both on the run's clock since the origin; payloads, and with
+them header stamps, are untouched.
 """
 
 from __future__ import annotations

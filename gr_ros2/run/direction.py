@@ -1,6 +1,6 @@
 """One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph.
 
-Laws: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
+Invariants: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
 stack it was entered on.
 """
 
@@ -44,7 +44,7 @@ class Direction:
     """Both blocks and the link between them, ready to start.
 
     :param scenario: a one-way scenario, see :meth:`Scenario.directions`
-    :param ears: hears the events of both blocks
+    :param observer: hears the events of both blocks
     :param stack: closes what is opened here
     :param instrumented: see :class:`LoopbackLink`
     :ivar topics: topic id of every topic the source subscribes, by absolute name
@@ -56,7 +56,7 @@ class Direction:
         registry: Registry,
         phy: Phy,
         *,
-        ears: LinkObserver,
+        observer: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:
@@ -72,7 +72,7 @@ class Direction:
         self.source = RosSource(
             registry,
             middleware=self.input,
-            observer=ears,
+            observer=observer,
             seed=scenario.seed,
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
@@ -80,7 +80,7 @@ class Direction:
         self.sink = RosSink(
             registry,
             middleware=self.output,
-            observer=ears,
+            observer=observer,
             **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)

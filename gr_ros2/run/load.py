@@ -1,6 +1,6 @@
 """How much a scenario offers to its link, and the sample rate that carries it.
 
-Law: the offered load counts every message as if it travelled alone, so it is never below what the link will see.
+Invariant: the offered load counts every message as if it travelled alone, so it is never below what the link will see.
 """
 
 from __future__ import annotations

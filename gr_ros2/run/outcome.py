@@ -1,6 +1,6 @@
 """What a run gives back and tells on its way, however its time passes.
 
-Law: nothing here depends on how a run is made.
+Invariant: nothing here depends on how a run is made.
 """
 
 from __future__ import annotations

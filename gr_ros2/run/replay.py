@@ -1,8 +1,8 @@
 """A recording through a link and a channel into a recording: what it would have looked like at the other end.
 
-Laws: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types, type
-definitions, the QoS of every publisher and payloads (with them header stamps) are those of the original; a topic that
-a link cannot carry is left out and said; the file appears whole or not at all.
+Invariants: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types,
+type definitions, the QoS of every publisher and payloads (with them header stamps) are those of the original; a topic
+that a link cannot carry is left out and said; the file appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
 from gr_ros2.run.outcome import Outcome, Progress
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.simulated import run_simulated
+from gr_ros2.run.simulated_runner import run_simulated
 
 _STORAGES: dict[str, Literal["mcap", "sqlite3"]] = {".mcap": "mcap", ".db3": "sqlite3"}
 """Of a bare file, by its suffix; anything else is a bag folder."""

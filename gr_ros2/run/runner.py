@@ -1,7 +1,7 @@
 """Runs one scenario: one direction or two, watched by a Recorder.
 
-Laws: everything started is stopped in reverse order whatever happens; a run that is interrupted still closes its books
-and writes its result.
+Invariants: everything started is stopped in reverse order whatever happens; a run that is interrupted still closes its
+books and writes its result.
 """
 
 from __future__ import annotations
@@ -17,20 +17,23 @@ from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.guard import Guard, one_line
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
-from gr_ros2.record.result import RESULT_FILE, Result, write_result
-from gr_ros2.record.trace import make_folder, write_trace, write_whole
+from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
+from gr_ros2.record.trace import Trace, make_folder, write_trace, write_whole
 from gr_ros2.run.direction import Direction, open_graph
 from gr_ros2.run.load import make_phys, recording, source_names
+from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
-from gr_ros2.run.simulated import run_simulated
-from gr_ros2.run.watch import LiveRun, Onlookers, Watcher
+from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -43,7 +46,7 @@ _MATCH_S = 20.0
 _POLL_S = 0.05
 
 
-class Listener:
+class DeliveryRecorder:
     """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
 
     :param graphs: name and type of the topics to hear, by graph
@@ -99,30 +102,30 @@ def run_scenario(
     scenario: Scenario,
     out: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-    watchers: Sequence[Watcher] = (),
+    observers: Sequence[RunObserver] = (),
 ) -> Outcome:
     """Run a scenario to its end, or until KeyboardInterrupt.
 
     :param out: folder for ``result.json``, the tables of the trace, the registry and the bag of delivered messages,
         made if missing; None writes nothing
     :param on_progress: called about 20 times a second
-    :param watchers: onlookers; where one has ``instruments``, the link is built so that its channel can be changed and
+    :param observers: where one has ``instruments``, the link is built so that its channel can be changed and
         its signal seen
     :raises ConfigError: when the scenario cannot be set up
     :raises RunError: when it fails under way
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
-    onlookers = Onlookers(watchers, apart=scenario.time == "real")
+    run_observers = RunObservers(observers, threaded=scenario.time == "real")
     outcome: Outcome | None = None
     try:
         if scenario.time == "real":
             with ExitStack() as stack:
-                outcome = _Run(scenario, out, stack, onlookers).execute(on_progress)
+                outcome = _Run(scenario, out, stack, run_observers).execute(on_progress)
         else:
-            outcome = run_simulated(scenario, out, on_progress, onlookers)
+            outcome = run_simulated(scenario, out, on_progress, run_observers)
     finally:
-        onlookers.run_ended(None if outcome is None else outcome.result)
+        run_observers.run_ended(None if outcome is None else outcome.result)
     if out is not None:
         write_trace(outcome.trace, out)
         write_whole(out / REGISTRY_FILE, scenario.registry, copyfile)
@@ -134,13 +137,13 @@ def run_repetitions(
     scenario: Scenario,
     out: Path,
     on_start: Callable[[], Callable[[Progress], None] | None] = lambda: None,
-    watchers: Sequence[Watcher] = (),
+    observers: Sequence[RunObserver] = (),
 ) -> list[Result]:
     """Run every repetition of a scenario, until KeyboardInterrupt at the latest, each into a folder of its own.
 
     :param out: folder for ``rep-0``, ``rep-1``, ... and ``repetitions.json``, made if missing
     :param on_start: called before each run for its ``on_progress``
-    :param watchers: see :func:`run_scenario`
+    :param observers: see :func:`run_scenario`
     :return: the results of the runs that came to their end
     :raises ConfigError: when the scenario cannot be set up, or a run is there already
     :raises RunError: when a run fails under way
@@ -148,7 +151,7 @@ def run_repetitions(
     results: list[Result] = []
     for k, one in enumerate(repetitions(scenario)):
         try:
-            result = run_scenario(one, repetition_folder(out, k), on_start(), watchers).result
+            result = run_scenario(one, repetition_folder(out, k), on_start(), observers).result
         except KeyboardInterrupt:  # between two runs: the same as during one
             break
         if result.interrupted:
@@ -159,7 +162,7 @@ def run_repetitions(
 
 
 class _Run:
-    def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, onlookers: Onlookers) -> None:
+    def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.scenario = scenario
         self.registry = scenario.load_registry()
         ways = scenario.directions()
@@ -168,22 +171,31 @@ class _Run:
         namespaces = {way.ros_source.src_id(): way.ros_source.namespace for way in ways}
         topics = {way.ros_source.src_id(): source_names(way, self.registry).values() for way in ways}
         self.recorder = Recorder(self.registry, namespaces, topics)
-        self.onlookers = onlookers
+        self.run_observers = run_observers
         self.progress_guard = Guard("progress")
+        self.pulse = Pulse()
+        stack.callback(self.pulse.close)
         self.interrupted = False
-        self.listener: Listener | None = None
+        self.listener: DeliveryRecorder | None = None
         self.sim: SimPublisher | None = None
         try:
-            ears = Observers[LinkObserver]()
-            self.recording = ears.add(self.recorder, needed=True)
-            ears.add(onlookers)
+            link_observers = Observers[LinkObserver]()
+            self.recording = link_observers.add(self.recorder, needed=True)
+            link_observers.add(run_observers)
             self.directions = [
-                Direction(way, self.registry, phy, ears=ears, stack=stack, instrumented=onlookers.instruments)
+                Direction(
+                    way,
+                    self.registry,
+                    phy,
+                    observer=link_observers,
+                    stack=stack,
+                    instrumented=run_observers.instruments,
+                )
                 for way, phy in zip(ways, phys, strict=True)
             ]
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
-            onlookers.run_started(self._live())
+            run_observers.run_started(self._live())
             if scenario.bag_path is None:
                 self.sim = SimPublisher(Fleet(scenario.sim), self._robots(stack), scenario.duration_s)
                 stack.callback(self.sim.close)
@@ -212,12 +224,12 @@ class _Run:
                 robots[way.src_id] = stack.enter_context(open_graph(self.scenario, end, f"robot_{way.src_id}"))
         return robots
 
-    def _listen(self, out: Path, stack: ExitStack) -> Listener:
+    def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
         graphs = {
             stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
             for way in self.directions
         }
-        listener = Listener(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
+        listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
 
@@ -229,6 +241,7 @@ class _Run:
                 way.link.start()
             self._wait_matched()
             begin = end = time.monotonic()
+            self.pulse.start()
             for way in self.directions:
                 way.link.run_began(begin)
             (self.sim or self.directions[0].input).start()
@@ -245,14 +258,20 @@ class _Run:
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
         drained = not self.interrupted and self._empty()
+        self.pulse.close()
+        stopped = time.monotonic()
         for way in self.directions:
             way.link.stop()
-        self.onlookers.settle()
+        self.run_observers.settle()
         self.recording.check()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
         topics = self.recorder.finish(played, end, drained)
+        names = {
+            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
+        }
+        trace = self.recorder.trace(begin, end, names)
         result = Result(
             scenario=scenario.name,
             seed=scenario.seed,
@@ -264,12 +283,22 @@ class _Run:
             wall_s=time.monotonic() - wall,
             interrupted=self.interrupted,
             counters=self._counters(),
+            lateness=self._lateness(begin, stopped, trace),
             incomplete=tuple(self._incomplete()),
         )
-        names = {
-            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
-        }
-        return Outcome(result, self.recorder.trace(begin, end, names))
+        return Outcome(result, trace)
+
+    def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
+        """How late the computer was; None where the link waits for it."""
+        if self.scenario.pace == "flow":
+            return None
+        parts: dict[str, list[Lateness]] = {"threads": [self.pulse.lateness], "gate": [], "modem": []}
+        for way in self.directions:
+            gate = way.link.gate_lateness()
+            if gate is not None:
+                parts["gate"].append(gate)
+                parts["modem"].append(modem_lateness(way.link.passed_at(), self.recorder.received_at(way.src_id)))
+        return lateness_result(parts, begin, end, trace)
 
     def _wait_matched(self) -> None:
         """Wait until every end of both graphs has found the other, so that no message goes unheard."""
@@ -322,11 +351,11 @@ class _Run:
             self.progress_guard(on_progress, now)
 
     def _incomplete(self) -> list[str]:
-        """What onlookers and the bag of delivered messages missed; the bag is closed for that."""
+        """What observers and the bag of delivered messages missed; the bag is closed for that."""
         if self.listener is None:
-            return self.onlookers.told()
+            return self.run_observers.told()
         self.listener.close()
-        return [*self.onlookers.told(), *self.listener.told()]
+        return [*self.run_observers.told(), *self.listener.told()]
 
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)

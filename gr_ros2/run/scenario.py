@@ -1,7 +1,7 @@
 """Scenarios: one experiment as one YAML file, with single settings replaced on the command line.
 
-Laws: what both ends of the link must agree on (`registry`, `packet_len`) stands once, at the top level, and all ends
-follow it; `source` names where messages come from, `ros_source` and `ros_sink` configure the two blocks; a two-way
+Invariants: what both ends of the link must agree on (`registry`, `packet_len`) stands once, at the top level, and all
+ends follow it; `source` names where messages come from, `ros_source` and `ros_sink` configure the two blocks; a two-way
 scenario is two one-way ones between the same two graphs; `dump` gives a mapping from which `scenario_from` makes the
 same scenario again.
 """

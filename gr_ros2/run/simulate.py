@@ -1,11 +1,11 @@
 """A scenario without threads and waiting: both ends of its link on a clock that jumps from event to event.
 
-An event loop (:class:`EventLoop`) over the ends and the directions between them (:class:`Way`): an end is asked for
-packets when it may have one, a packet is on the air for its airtime, and what lands is given to the other end, which it
-may move to send. What the computer takes (middleware, Python, signal processing) is one constant, ``overhead_s``, 0
-unless given. Laws: the same scenario gives the same numbers; the packets of a direction go one after the other, each
-for its airtime, so no message completes before all its packets have been on the air; everything is told in the order
-of time.
+An event loop (:class:`EventLoop`) over the ends and the directions between them (:class:`LinkDirection`): an end is
+asked for packets when it may have one, a packet is on the air for its airtime, and what lands is given to the other
+end, which it may move to send. What the computer takes (middleware, Python, signal processing) is one constant,
+``overhead_s``, 0 unless given. Invariants: the same scenario gives the same numbers; the packets of a direction go one
+after the other, each for its airtime, so no message completes before all its packets have been on the air; everything
+is told in the order of time.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import Start, make_endpoint
 from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
@@ -54,16 +54,17 @@ class Offered:
 
 
 @dataclass(frozen=True, slots=True)
-class Landed:
+class AirtimeEnded:
     """A packet whose airtime is over, and whose fate is decided later."""
 
     data: bytes
 
 
-Happening = tuple[float, "Way | Branch", SenderEvent | ReceiverEvent | Landed]
+TimedEvent = tuple[float, "LinkDirection | Branch", SenderEvent | ReceiverEvent | AirtimeEnded]
 """When, s after the start; in which direction, or at which further receiver; and what."""
 Airtime = Callable[[int | None], float]
-Air = Callable[[bytes, float], Iterable[bytes]]
+"""s that a packet of so many bytes is on the air; of None: the longest."""
+Medium = Callable[[bytes, float], Iterable[bytes]]
 """What becomes of a packet whose airtime is over now: what comes out of the receiver."""
 
 
@@ -151,16 +152,16 @@ def simulate(
     recorder = Recorder(registry, {src_id: scenario.ros_source.namespace}, topics)
     losses = PduLosses(scenario.channel)
     ends = make_ends([scenario], registry, codec, any_length=phy.any_length)
-    way = Way(scenario, (ends[0], ends[1]), phy.airtime, messages or offered(scenario, registry))
+    way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime, messages or offered(scenario, registry))
     way.air = lambda data, now: [data] if losses.passes(now) else ()
     ways = [way]
     if scenario.reports is not None:
         heard = PduLosses(scenario.reports.channel)
         ways += report_ways(scenario, ends[:2], phy.airtime, [lambda data, now: [data] if heard.passes(now) else ()])
-    for happening in EventLoop(ways).run():
-        tell(recorder, happening, overhead_s)
-        if on_packet is not None and isinstance(happening[2], SentPacket):
-            on_packet(happening[2])
+    for timed_event in EventLoop(ways).run():
+        tell(recorder, timed_event, overhead_s)
+        if on_packet is not None and isinstance(timed_event[2], SentPacket):
+            on_packet(timed_event[2])
     return Simulated(
         duration_s=way.duration_s,
         airtime_s=phy.airtime(),
@@ -171,9 +172,9 @@ def simulate(
     )
 
 
-def tell(observer: LinkObserver, happening: Happening, overhead_s: float = 0.0) -> None:
+def tell(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:
     """Let an observer hear of what happened."""
-    now, way, event = happening
+    now, way, event = timed_event
     if isinstance(event, SenderEvent):
         observer.sender_event(way.src_id, event)
     elif isinstance(event, ReceiverEvent):
@@ -235,19 +236,19 @@ class Branch:
     :param number: among those that hear the same sender, from 1
     """
 
-    def __init__(self, way: Way, receiver: End, air: Air, number: int) -> None:
+    def __init__(self, way: LinkDirection, receiver: End, air: Medium, number: int) -> None:
         self.src_id = way.src_id
         self.receiver = receiver
         self.air = air
         self.number = number
 
-    def arrive(self, data: bytes, now: float) -> Iterator[Happening]:
+    def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
         """A packet comes out of its receiver."""
         for event in self.receiver.endpoint.receive(data, now):
             yield now, self, event
 
 
-class Way:
+class LinkDirection:
     """One direction of a link: what is offered to the end that sends, its turn on the air, and the end that hears it.
 
     :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without samples
@@ -276,8 +277,8 @@ class Way:
         """Who else hears it; only where ``air`` is set."""
         self.over = False
         """Whether it is over, as far as this end can tell: one that answers may yet have something to say."""
-        self.air: Air | None = None
-        """What becomes of packets; None leaves that to who hears of them (:class:`Landed`)."""
+        self.air: Medium | None = None
+        """What becomes of packets; None leaves that to who hears of them (:class:`AirtimeEnded`)."""
         self.due = 0.0
         """s, when something may happen next; infinite when it is over."""
         self.end = 0.0
@@ -301,7 +302,7 @@ class Way:
         """Whether nothing waits at the sending end or for the air."""
         return self.sender.endpoint.idle and not (self._clock and self._clock.backlog)
 
-    def step(self, now: float) -> Iterator[Happening]:
+    def step(self, now: float) -> Iterator[TimedEvent]:
         """Everything that happens by ``now``."""
         self.end = now
         yield from self._let_through(now)
@@ -310,19 +311,19 @@ class Way:
         yield from self._told(now)
         self.due = self._next(now)
 
-    def arrive(self, data: bytes, now: float) -> Iterator[Happening]:
+    def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
         """A packet comes out of the receiver."""
         for event in self.receiver.endpoint.receive(data, now):
             yield now, self, event
 
     def wake(self, now: float) -> None:
         """The sending end has been called: it may have something earlier than it said."""
-        at = self.sender.endpoint.next_timeout()
+        at = self.sender.endpoint.next_departure()
         if at is not None and (self.due < inf or self.sender.endpoint.answers):
             self.due = min(self.due, max(now, at))
             self.over = False
 
-    def _let_through(self, now: float) -> Iterator[Happening]:
+    def _let_through(self, now: float) -> Iterator[TimedEvent]:
         if self._clock is not None:
             for data in self._clock.due(now):
                 self._delayed.append((now + self._delay_s, data))
@@ -332,9 +333,9 @@ class Way:
             if self._paced:
                 self.sender.endpoint.credit(credits)
 
-    def _land(self, data: bytes, now: float) -> Iterator[Happening]:
+    def _land(self, data: bytes, now: float) -> Iterator[TimedEvent]:
         if self.air is None:
-            yield now, self, Landed(data)
+            yield now, self, AirtimeEnded(data)
         else:
             for arrived in self.air(data, now):
                 yield from self.arrive(arrived, now)
@@ -349,7 +350,7 @@ class Way:
                 self.duration_s = now
             self._coming = next(self._messages, None)
 
-    def _send(self, now: float) -> Iterator[Happening]:
+    def _send(self, now: float) -> Iterator[TimedEvent]:
         while (data := self.sender.endpoint.next_packet(now)) is not None:
             if self._clock is not None:
                 self._clock.offer(data, now, self._airtime(len(data)))
@@ -357,7 +358,7 @@ class Way:
                 yield from self._told(now)
                 yield from self._land(data, now)
 
-    def _told(self, now: float) -> Iterator[Happening]:
+    def _told(self, now: float) -> Iterator[TimedEvent]:
         for event in self.sender.told:
             yield now, self, event
         self.sender.told.clear()
@@ -372,7 +373,7 @@ class Way:
             return inf
         clock = self._clock.next_timeout(now) if self._clock is not None else None
         delayed = self._delayed[0][0] if self._delayed else None
-        times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_timeout())
+        times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_departure())
         soonest = min((at for at in times if at is not None), default=inf)
         if soonest == inf and now < self.duration_s:
             soonest = self.duration_s  # nothing more to come before the end of the run
@@ -381,7 +382,9 @@ class Way:
         return inf if self.over and not answers else soonest
 
 
-def report_ways(scenario: Scenario, ends: Sequence[End], airtime: Airtime, airs: Sequence[Air]) -> list[Way]:
+def report_ways(
+    scenario: Scenario, ends: Sequence[End], airtime: Airtime, airs: Sequence[Medium]
+) -> list[LinkDirection]:
     """The ways by which receivers report to the one that they hear.
 
     :param ends: it, and the receivers
@@ -390,7 +393,7 @@ def report_ways(scenario: Scenario, ends: Sequence[End], airtime: Airtime, airs:
     delay_s = 0.0 if scenario.reports is None else scenario.reports.delay_s
     ways = []
     for end, air in zip(ends[1:], airs, strict=True):
-        way = Way(scenario, (end, ends[0]), airtime, iter(()), src_id=end.src_id, delay_s=delay_s)
+        way = LinkDirection(scenario, (end, ends[0]), airtime, iter(()), src_id=end.src_id, delay_s=delay_s)
         way.air = air
         ways.append(way)
     return ways
@@ -402,11 +405,11 @@ class EventLoop:
     :param ways: each with the ends that it joins
     """
 
-    def __init__(self, ways: Sequence[Way]) -> None:
+    def __init__(self, ways: Sequence[LinkDirection]) -> None:
         self._ways = ways
         self.now = -inf
 
-    def run(self) -> Iterator[Happening]:
+    def run(self) -> Iterator[TimedEvent]:
         """Everything that happens, in the order of time, until nothing is left or the time to drain is over. Once."""
         while not all(way.over for way in self._ways) and (due := min(way.due for way in self._ways)) < inf:
             self.now = min([due, *self._timers()])
@@ -421,11 +424,11 @@ class EventLoop:
             at = ear.receiver.endpoint.next_timeout()
             yield inf if at is None or at <= self.now else at
 
-    def _expire(self) -> Iterator[Happening]:
+    def _expire(self) -> Iterator[TimedEvent]:
         for ear in self._ears():
             yield from self._heard((self.now, ear, event) for event in self._overdue(ear.receiver.endpoint))
 
-    def _ears(self) -> Iterator[Way | Branch]:
+    def _ears(self) -> Iterator[LinkDirection | Branch]:
         for way in self._ways:
             if way.air is not None:
                 yield way
@@ -435,11 +438,11 @@ class EventLoop:
         at = endpoint.next_timeout()
         return endpoint.handle_timeout(self.now) if at is not None and at <= self.now else []
 
-    def _heard(self, happenings: Iterable[Happening]) -> Iterator[Happening]:
+    def _heard(self, timed_events: Iterable[TimedEvent]) -> Iterator[TimedEvent]:
         """Let an end that has heard something send."""
-        for happening in happenings:
-            yield happening
-            _, way, event = happening
+        for timed_event in timed_events:
+            yield timed_event
+            _, way, event = timed_event
             if way.receiver.endpoint.answers and isinstance(event, ReceiverEvent):
                 for back in self._ways:
                     if back.sender is way.receiver:

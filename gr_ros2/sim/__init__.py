@@ -5,7 +5,7 @@ steps of 20 ms, on the machine that runs this at 15 ms per simulated second, mes
 simulated second without any message, left its robots stuck or in contact with obstacles in five of six seeds
 (4 to 15 m driven in 60 s), tries GUI back-ends even when headless, and brings scipy, shapely, imageio and loguru.
 
-Law: sans-IO but for ``publisher``; time is simulated and every random number comes from a seeded generator.
+Invariant: sans-IO but for ``publisher``; time is simulated and every random number comes from a seeded generator.
 """
 
 from __future__ import annotations

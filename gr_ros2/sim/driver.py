@@ -1,6 +1,6 @@
 """Drives one robot from place to place: pure pursuit along the roadmap, behind a guard that cannot be overruled.
 
-Law: a robot takes a command only if, after it, braking at once would bring it to rest without touching anything.
+Invariant: a robot takes a command only if, after it, braking at once would bring it to rest without touching anything.
 The points it would then pass are its ``reserved`` path; robots decide one after the other and stay clear of what
 the others have reserved. Braking along the reserved path is therefore always left as a safe choice, so no robot
 ever touches a wall, an obstacle or another robot, whatever the route.

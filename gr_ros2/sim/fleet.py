@@ -1,6 +1,6 @@
 """The robots together: their true motion, and the messages of all of them in time order.
 
-Laws: no clock, no thread, no global generator: time is simulated, t = 0 at the start; the same settings give the
+Invariants: no clock, no thread, no global generator: time is simulated, t = 0 at the start; the same settings give the
 same bytes, and a second call of ``messages`` gives them again; a topic at ``rate`` sends exactly rate * duration
 messages where that is a whole number, each robot's topic at a phase of its own, as sensors do.
 """

@@ -1,6 +1,6 @@
 """How a differential-drive robot moves within one control period.
 
-Law: speed and turn rate change linearly within a period of ``TICK`` seconds, by no more than ``ACCELERATION`` and
+Invariant: speed and turn rate change linearly within a period of ``TICK`` seconds, by no more than ``ACCELERATION`` and
 ``TURN_ACCELERATION`` allow; a pose between two ticks is the integral of exactly that, so paths have no corners.
 """
 

@@ -1,6 +1,6 @@
 """Plays simulated robots on ROS graphs in real time.
 
-Laws: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
+Invariants: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
 moves no later one; ``stop`` takes effect before the next message; an error of the graph ends the play and is
 raised by ``stop``, never lost.
 """
@@ -16,6 +16,7 @@ from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.base import Middleware, Publisher, Qos
 from gr_ros2.registry import Registry
 from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.transforms import TransformPublisher
 
 _DEPTH = 100
 _JOIN_S = 1.0
@@ -62,6 +63,13 @@ class SimPublisher:
             if robot_id in graphs
             for topic in Registry.from_rows(fleet.topics())
         }
+        self._transforms: dict[str, TransformPublisher] = {}
+        if fleet.settings.transforms:
+            self._transforms = {
+                f"/robot_{robot_id}/odom": TransformPublisher(graphs[robot_id], fleet.settings.frame_prefix(robot_id))
+                for robot_id in fleet.robot_ids
+                if robot_id in graphs
+            }
 
     @property
     def publishers(self) -> Mapping[str, Publisher]:
@@ -103,6 +111,8 @@ class SimPublisher:
         finally:
             for publisher in self._publishers.values():
                 publisher.close()
+            for transforms in self._transforms.values():
+                transforms.close()
 
     def _run(self) -> None:
         try:
@@ -113,6 +123,8 @@ class SimPublisher:
     def _play(self) -> None:
         start_time = None if self._start_time is None else self._start_time()
         begin = self._clock()
+        for transforms in self._transforms.values():
+            transforms.start(round((self._fleet.settings.start_time_s if start_time is None else start_time) * 1e9))
         for message in self._fleet.messages(self._duration_s, start_time):
             publisher = self._publishers.get(message.topic)
             if publisher is None:
@@ -125,3 +137,5 @@ class SimPublisher:
             publisher.publish(message.payload)
             self.worst_lag_s = max(self.worst_lag_s, -ahead)
             self.published[message.topic] += 1
+            if message.topic in self._transforms:
+                self._transforms[message.topic].follow(message.payload)

@@ -1,6 +1,6 @@
 """Ways through the room: places, straight lines between them that a robot can drive, and the shortest routes.
 
-Law: every place keeps ``clearance`` from walls and obstacles, and so does every line between neighbours.
+Invariant: every place keeps ``clearance`` from walls and obstacles, and so does every line between neighbours.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What one robot's sensors say: true motion and a generator in, serialized ROS 2 messages out.
 
-Laws: payloads are CDR, little endian, with the 4-byte encapsulation header; every topic draws from its own
+Invariants: payloads are CDR, little endian, with the 4-byte encapsulation header; every topic draws from its own
 generator, so the bytes of one do not depend on the rate of another; stamps are nanoseconds handed in.
 Frame names are those of REP 105; with them an Odometry is 724 B and an Imu 324 B, as in common recordings.
 """
@@ -46,7 +46,7 @@ class Sensors:
 
     def __init__(self, settings: SimSettings, world: World, robot_id: int, start: State, start_ns: int) -> None:
         self._settings, self._world, self._start_ns = settings, world, start_ns
-        self._prefix = f"robot_{robot_id}/" if settings.prefix_frames else ""
+        self._prefix = settings.frame_prefix(robot_id)
         # One generator per topic; 2 keeps them apart from world and routes, which are 0 and 1.
         self._rng = {name: np.random.default_rng([settings.seed, 2, robot_id, i]) for i, name in enumerate(TYPES)}
         self._believed = (start.x, start.y, start.heading)

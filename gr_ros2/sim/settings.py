@@ -1,6 +1,6 @@
 """Settings of the simulator.
 
-Law: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
+Invariant: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ class SimSettings:
     :param imu_orientation_noise: rad, about each axis
     :param start_time_s: s, what the stamps begin at
     :param prefix_frames: frame ids carry the robot's name (robot_1/odom), for robots that share one graph
+    :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -60,6 +61,11 @@ class SimSettings:
     imu_orientation_noise: Noise = 0.01
     start_time_s: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
     prefix_frames: bool = False
+    transforms: bool = False
+
+    def frame_prefix(self, robot_id: int) -> str:
+        """What the names of a robot's frames begin with, '' where they carry no name."""
+        return f"robot_{robot_id}/" if self.prefix_frames else ""
 
     @model_validator(mode="after")
     def _room(self) -> SimSettings:

@@ -1,6 +1,6 @@
 """The room the robots drive in: four walls, boxes at any angle, round pillars.
 
-Laws: lengths in m, angles in rad, the room's lower left corner is the origin of the map frame; between any two
+Invariants: lengths in m, angles in rad, the room's lower left corner is the origin of the map frame; between any two
 obstacles, and between an obstacle and a wall, there is a gap of ``GAP`` or more, so every free place can be
 reached; nothing here changes after construction.
 """

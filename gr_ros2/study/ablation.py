@@ -1,8 +1,8 @@
 """What each part of a link is worth: a scenario as it is, and again with one part switched off at a time.
 
-Laws: a variant differs from the scenario in the settings of one part and in nothing else, so the same messages meet the
-same radio; a part that is off in the scenario has no variant; the settings are those that `--set` takes, so any variant
-can be run by hand.
+Invariants: a variant differs from the scenario in the settings of one part and in nothing else, so the same messages
+meet the same radio; a part that is off in the scenario has no variant; the settings are those that `--set` takes, so
+any variant can be run by hand.
 """
 
 from __future__ import annotations

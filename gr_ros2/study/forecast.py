@@ -1,7 +1,8 @@
 """Does this traffic fit this radio? A forecast from a simulation of the link, and what would make it better.
 
-Laws: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its entries
-by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is based on.
+Invariants: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its
+entries by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is
+based on.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.freshness import TURN
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names

@@ -1,7 +1,7 @@
 """The wire format: packets to bytes and back, one module per version. No IO, no state.
 
-Nothing outside of here knows where a byte stands or how wide a field is: what depends on it is asked of a
-:class:`Format`. ``v0`` is the paper's (section 5), ``v1`` the one that repairs, seals and announces.
+No module outside this package knows a byte offset or the width of a field; it asks a :class:`Format`. ``v0`` is the
+paper's (section 5), ``v1`` the one that repairs, seals and announces.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def format_of(version: int) -> Format:
 def decode(data: bytes, packet_len: int, accept: Collection[int] = FORMATS.keys()) -> Packet:
     """The packet in these bytes, read by the version that its first four bits say.
 
-    What says another version is refused as the lowest accepted one refuses it: damaged by its CRC (a damaged version
-    is damage like any other), intact by its version.
+    Bytes with a version nibble that is not accepted are refused in the way of the lowest accepted version: by the CRC
+    if they are damaged (a damaged version nibble is damage like any other), otherwise by the version.
 
     :param packet_len: of the link
     :param accept: versions to take, at least one

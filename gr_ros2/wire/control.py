@@ -1,6 +1,6 @@
 """Entries of version 1 that carry no message: hellos, requests and reports.
 
-Law: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
+Invariant: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEARD_LEN = 2 + _heard.size
 
 
 class Hello(NamedTuple):
-    """Who is there.
+    """Announces a robot.
 
     :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
     :param turns: how often the 16-bit packet number has come round, 0..2^32-1

@@ -1,7 +1,7 @@
-"""What every version of the wire format can do, and what is the same in all of them.
+"""The interface of every version of the wire format, and what is the same in all of them.
 
-Laws: a format object has no state; sizes are bytes, and those that a scheduler asks for are exact or promise too
-little, never too much.
+Invariants: a format object has no state; sizes are in bytes; a size that a scheduler asks for is exact or too small,
+never too large.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Entry(Protocol):
 
     @property
     def name(self) -> int:
-        """What names the message on the wire, among those of its source and topic."""
+        """Number of the message on the wire, among those of its source and topic."""
 
     @property
     def label(self) -> str:
@@ -41,7 +41,7 @@ class Entry(Protocol):
 
 
 class Packet(Protocol):
-    """A packet as a value: what those who only look at packets need of any version.
+    """A packet as a value: the fields that tools can read in every version.
 
     ``seq`` is the packet's number as the wire has it, ``Format.number_bits`` wide.
     """
@@ -67,7 +67,7 @@ class Packet(Protocol):
 
 
 class Span(NamedTuple):
-    """A stretch of a packet's bytes.
+    """A range of a packet's bytes.
 
     :param kind: head, ids, entry, control, repair, pad or crc (or the tag in its place)
     :param size: bytes, an entry's own header included
@@ -84,15 +84,15 @@ class Format(Protocol):
 
     @property
     def version(self) -> int:
-        """As the first four bits of a packet say it."""
+        """Value of the first four bits of a packet."""
 
     @property
     def number_bits(self) -> int:
-        """Width of packet numbers."""
+        """Width of packet numbers, bits."""
 
     @property
     def id_bits(self) -> int:
-        """Width of what names a message among those of its source and topic."""
+        """Width of the number of a message among those of its source and topic, bits."""
 
     @property
     def max_topics(self) -> int:
@@ -100,11 +100,11 @@ class Format(Protocol):
 
     @property
     def max_entries(self) -> int:
-        """Of one packet."""
+        """Most entries of one packet."""
 
     @property
     def max_fragments(self) -> int:
-        """Of one message."""
+        """Most fragments of one message."""
 
     @property
     def min_packet_len(self) -> int:

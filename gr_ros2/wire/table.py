@@ -1,7 +1,7 @@
 """The table of topics that a robot announces: a message of version 1 on topic ``TABLE_TOPIC``.
 
-Laws: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(rows)) == rows``; equal tables have
-equal bytes, so that their CRC-32 says whether a receiver has the newest.
+Invariants: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(rows)) == rows``; equal tables
+have equal bytes, so that their CRC-32 says whether a receiver has the newest.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Version 0 of the wire format, byte for byte (the paper, section 5 and table 3): packets, arithmetic, codec.
 
-Laws: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for every
-packet that ``encode`` takes; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
+Invariants: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for
+every packet that ``encode`` takes; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class FormatV0:
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
     def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """What stands where in a packet, in the order of its bytes."""
+        """The fields of a packet, in the order of its bytes."""
         entries = packet.entries
         pad = packet_len - self.packed_len([len(entry.payload) for entry in entries])
         return [

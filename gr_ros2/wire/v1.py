@@ -4,8 +4,9 @@ A packet is a header, a body and a trailer. A *source* packet carries entries an
 packet stands at the number of a source packet, told apart from others there by its row: a *repair* combines the bodies
 of source packets, a *control* packet carries hellos, reports and requests.
 
-Laws: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back as the
-same values; a body says nothing of the number of its packet, so that it can be combined with others and recovered.
+Invariants: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back
+as the same values; a body says nothing of the number of its packet, so that it can be combined with others and
+recovered.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ _session = Struct(">II")
 
 
 class Header(NamedTuple):
-    """What stands before the body.
+    """The header: the bytes before the body.
 
     :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is no source packet
     :param sealed: the trailer is an 8-byte tag, not a CRC-32
@@ -148,10 +149,10 @@ class Standing(NamedTuple):
 
 
 def session_crc(boot: int, turns: int) -> int:
-    """The CRC-32 of what a packet does not carry but belongs to; ``crc`` goes on from it.
+    """The CRC-32 over the session, which a packet does not carry; ``crc`` continues from it.
 
     :param boot: boot number of the sender
-    :param turns: how often its packet number has come round
+    :param turns: how often its packet number has wrapped around
     """
     return crc32(_session.pack(boot, turns))
 
@@ -248,7 +249,7 @@ def read_standing(data: bytes, start: int, end: int) -> Standing:
 
 
 def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
-    """How much of a message goes into what is free of a body.
+    """How much of a message fits into the free bytes of a body.
 
     :param room: bytes free
     :param remaining: bytes of the message not yet sent

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.compression import bounds
-from gr_ros2.compression.codec import FIELDS, FIELDS_AND_MORE, ZSTD
+from gr_ros2.compression.ans import push_natural, to_bytes
 from gr_ros2.compression.fields import _REMEMBERED
-from gr_ros2.compression.frames import Zstd, read_varint
-from gr_ros2.compression.number import push_natural, to_bytes
+from gr_ros2.compression.link_codec import FIELDS, FIELDS_AND_MORE, ZSTD
 from gr_ros2.compression.prepared import Prepared
 from gr_ros2.compression.schema import Types
 from gr_ros2.compression.train import learn
+from gr_ros2.compression.zstd_frames import Zstd, read_varint
 from gr_ros2.errors import DamagedError
 from tests.compression.support import codec_for
 
@@ -67,7 +67,7 @@ def test_a_large_message_needs_many_bytes(type_name: str) -> None:
     assert coded[0] & 15 == (FIELDS_AND_MORE if type_name.startswith("std") else ZSTD)
     assert bounds.least(len(payload)) <= len(coded) < 300
     assert codec.decode(0, coded) == payload
-    with pytest.raises(DamagedError, match="says it has 1000016 bytes, at most"):
+    with pytest.raises(DamagedError, match="claims 1000016 bytes, at most"):
         codec.decode(0, b"\x01" + Zstd().compress(payload))
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.compression import bulk
-from gr_ros2.compression.frames import Zstd, read_varint, varint
+from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
 from gr_ros2.errors import DamagedError
 
 special = st.sampled_from([math.inf, -math.inf, math.nan, -0.0])
@@ -21,23 +21,23 @@ ranges = st.lists(st.floats(0, 100) | special, min_size=1, max_size=99)
 @given(st.sampled_from([1, 2, 4, 8]), st.booleans(), st.binary(max_size=400))
 def test_any_array(size: int, real: bool, data: bytes) -> None:
     data = data[: len(data) - len(data) % size]
-    way, parameter, turned = bulk.turn(data, size, real, len)
+    way, parameter, turned = bulk.transform(data, size, real, len)
     assert len(turned) == len(data)
-    assert bulk.turn_back(way, parameter, turned, size) == data
+    assert bulk.inverse_transform(way, parameter, turned, size) == data
 
 
 @given(ranges, st.integers(0, 4))
 def test_ranges_in_whole_steps_become_decimals(values: list[float], decimals: int) -> None:
     data = struct.pack(f"<{len(values)}f", *(round(v, decimals) if math.isfinite(v) else v for v in values))
-    way, parameter, turned = bulk.turn(data, 4, True, len)
+    way, parameter, turned = bulk.transform(data, 4, True, len)
     assert way == bulk.DECIMALS
-    assert bulk.turn_back(way, parameter, turned, 4) == data
+    assert bulk.inverse_transform(way, parameter, turned, 4) == data
 
 
 @given(st.sampled_from([1, 2, 4, 8]), st.integers(0, 9), st.integers(0, 9), st.binary(max_size=100))
 def test_arbitrary_ways_end_in_bytes_or_a_value_error(size: int, way: int, parameter: int, data: bytes) -> None:
     with contextlib.suppress(ValueError):
-        assert len(bulk.turn_back(way, parameter, data, size)) == len(data)
+        assert len(bulk.inverse_transform(way, parameter, data, size)) == len(data)
 
 
 @given(st.binary(max_size=3000) | st.binary(max_size=40).map(lambda b: b * 50), st.binary(max_size=64))

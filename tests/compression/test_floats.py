@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.compression.floats import (
     CLASSES,
-    Constants,
+    KnownNumbers,
     bits_of,
     class_table,
     pop_double,
@@ -21,7 +21,7 @@ from gr_ros2.compression.floats import (
     push_single,
 )
 
-CONSTANTS = Constants([bits_of(value) for value in (1.0, -0.0, 0.001, math.nan)])
+CONSTANTS = KnownNumbers([bits_of(value) for value in (1.0, -0.0, 0.001, math.nan)])
 letters = st.sampled_from(sorted(CLASSES))
 doubles = st.integers(0, (1 << 64) - 1) | st.floats().map(bits_of)
 short = st.builds(lambda n, k: bits_of(n / 10**k), st.integers(-(10**9), 10**9), st.integers(0, 7))

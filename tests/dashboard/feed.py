@@ -36,8 +36,8 @@ class Feed:
     :param lost: whether the packet with this number is lost
     """
 
-    def __init__(self, *ears: Hears, lost: Callable[[int], bool] = lambda _number: False, **settings: Any) -> None:
-        self.ears = ears
+    def __init__(self, *observers: Hears, lost: Callable[[int], bool] = lambda _number: False, **settings: Any) -> None:
+        self.observers = observers
         self.packets = 0
         self._lost = lost
         self.sender = Sender(
@@ -73,9 +73,9 @@ class Feed:
 
     def _tell(self, events: list[ReceiverEvent], now: float) -> None:
         for event in events:
-            for ear in self.ears:
-                ear.receiver_event(event, now)
+            for observer in self.observers:
+                observer.receiver_event(event, now)
 
     def _sender_event(self, event: SenderEvent) -> None:
-        for ear in self.ears:
-            ear.sender_event(SRC, event)
+        for observer in self.observers:
+            observer.sender_event(SRC, event)

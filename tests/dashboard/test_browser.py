@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 pytest.importorskip("selenium", reason="needs selenium")
 
 from selenium import webdriver

@@ -11,11 +11,11 @@ from urllib.request import urlopen
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 
 from bokeh.document import Document
 
-from gr_ros2.dashboard.page import Page
+from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.errors import ConfigError
@@ -81,7 +81,7 @@ def test_it_goes_and_leaves_no_thread() -> None:
 def test_a_page_grows_no_larger_with_time() -> None:
     document = Document()
     dashboard = Dashboard()
-    page = Page(document, dashboard, "test")
+    page = LivePage(document, dashboard, "test")
     state = DashboardState(REGISTRY, NAMES, 64, name="test")
     feed = Feed(state, lost=lambda number: number % 7 == 0, packet_len=64)
     sizes: list[int] = []
@@ -101,7 +101,7 @@ def test_a_page_grows_no_larger_with_time() -> None:
 def test_a_viewer_that_cannot_keep_up_gets_fewer_pictures() -> None:
     document = Document()
     dashboard = Dashboard()
-    page = Page(document, dashboard, "test")
+    page = LivePage(document, dashboard, "test")
     page.offer(dashboard.snapshot, dashboard.radio)
     assert not document.session_callbacks  # nobody is there yet
     page.ready()

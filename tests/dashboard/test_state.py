@@ -23,10 +23,10 @@ def make(recorder: Recorder | None = None, packet_len: int = 64) -> DashboardSta
     return DashboardState(REGISTRY, NAMES, packet_len, name="test", duration_s=10.0, ledger=ledger)
 
 
-def lossy_run(seed: int, *ears: Hears, share: float = 0.05) -> Feed:
+def lossy_run(seed: int, *observers: Hears, share: float = 0.05) -> Feed:
     """10 s of positions at 10 Hz and of other messages at 5 Hz, through packet loss."""
     lost = random.Random(seed)
-    feed = Feed(*ears, lost=lambda _number: lost.random() < share, packet_len=64)
+    feed = Feed(*observers, lost=lambda _number: lost.random() < share, packet_len=64)
     for step in range(100):
         now = 50 + step / 10
         feed.submit(0, at(step, 2 * step), now)

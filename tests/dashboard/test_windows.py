@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.dashboard.windows import AgeMeter, Belief, Rate, Trail
+from gr_ros2.dashboard.windows import AgeMeter, PathComparison, PathWindow, Rate
 from gr_ros2.record.metrics import age
 
 
@@ -51,7 +51,7 @@ def test_no_age_before_the_first_delivery() -> None:
 
 
 def test_a_trail_is_thinned_bounded_and_ends_where_it_is() -> None:
-    trail = Trail(points=10, apart_s=1.0)
+    trail = PathWindow(points=10, apart_s=1.0)
     assert [len(axis) for axis in trail.xy()] == [0, 0]
     for step in range(1000):
         trail.add(step / 10, (step, -step))
@@ -61,7 +61,7 @@ def test_a_trail_is_thinned_bounded_and_ends_where_it_is() -> None:
 
 
 def test_a_belief_needs_both_sides() -> None:
-    belief = Belief(points=10, apart_s=0.0)
+    belief = PathComparison(points=10, apart_s=0.0)
     belief.moved(0.0, (0, 0))
     assert belief.error() is None
     belief.heard(1.0, (0, 0))

@@ -40,7 +40,7 @@ SWEEP: dict[str, Any] = {
     "list": [{"phy.name": "ofdm", "phy.options": {}}, {"phy.name": "gfsk", "phy.options": {}}],
 }
 
-OTHERS = {"cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
+OTHERS = {"rviz2", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",

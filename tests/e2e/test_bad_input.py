@@ -56,7 +56,10 @@ def files(folder: Path) -> dict[str, str]:
             "run paper-direct --set registry={f}/twice.csv",
             "twice.csv:2: duplicate topic 'odom'; it stands first in line 1",
         ),
-        ("run paper-direct --set registry={f}/seventeen.csv", "seventeen.csv:17: topic 17"),
+        (
+            "run paper-direct --set registry={f}/seventeen.csv",
+            "topic 17, 't16': version 0 carries 16 topics; leave some out, or set version: 1",
+        ),
         ("run paper-direct --set registry={f}/type.csv", "type.csv:1: topic 'odom': malformed type 'Odometry'"),
         ("run paper-direct --set registry={f}/nowhere.csv", "nowhere.csv': no such file"),
         ("run paper-direct --set source=bag:{f}/nowhere", "nowhere"),

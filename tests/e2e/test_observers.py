@@ -21,14 +21,14 @@ from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.errors import ConfigError, CrcError, RunError
 from gr_ros2.link.events import ReceiverEvent, Rejected, SenderEvent
-from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
+from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result, read_result
-from gr_ros2.run import watch
+from gr_ros2.run import observers as run_observers
+from gr_ros2.run.observers import LiveRun
 from gr_ros2.run.outcome import DELIVERED_BAG
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.watch import LiveRun
 from tests.e2e.support import COMMAND, check_complete
 from tests.radio.robots import ROOT, Robot, link_command
 from tests.waiting import wait_for
@@ -87,10 +87,10 @@ def filled_when(file: Callable[[], Path | None], size: int) -> Iterator[None]:
         watching.join()
 
 
-class Onlooker:
+class RecordingObserver:
     """Does nothing, which a test changes."""
 
-    name = "onlooker"
+    name = "observer"
     instruments = False
 
     def __init__(self, on_packet: Callable[[], object] = lambda: None) -> None:
@@ -113,25 +113,25 @@ class Onlooker:
 
 
 def fail() -> None:
-    raise ValueError("onlooker")
+    raise ValueError("observer")
 
 
 @pytest.mark.parametrize("passing", ["real", "packets", "samples"])
 def test_one_that_raises_changes_no_figure(passing: str, caplog: pytest.LogCaptureFixture) -> None:
-    bad, good = Onlooker(fail), Onlooker()
-    result = run_scenario(scenario(1.0, f"time={passing}"), watchers=[bad, good]).result
+    bad, good = RecordingObserver(fail), RecordingObserver()
+    result = run_scenario(scenario(1.0, f"time={passing}"), observers=[bad, good]).result
     check_complete(result)
     (line,) = result.incomplete
-    assert line.startswith("onlooker: ended (ValueError: onlooker); ")
+    assert line.startswith("observer: ended (ValueError: observer); ")
     assert int(line.split("; ")[1].split()[0]) > good.heard > result.packets["sent"]
     assert bad.heard == 0
     assert bad.result is good.result is result
-    assert [record.message for record in caplog.records if "onlooker" in record.message] == [
-        "onlooker: ended (ValueError: onlooker); the link goes on without it"
+    assert [record.message for record in caplog.records if "observer" in record.message] == [
+        "observer: ended (ValueError: observer); the link goes on without it"
     ]
 
 
-class Fails(Onlooker):
+class Fails(RecordingObserver):
     """Fails at the beginning and at the end of a run."""
 
     def run_started(self, run: LiveRun) -> None:  # noqa: ARG002
@@ -143,13 +143,13 @@ class Fails(Onlooker):
 
 @pytest.mark.parametrize("passing", ["real", "packets"])
 def test_one_that_raises_when_a_run_begins_and_ends(passing: str) -> None:
-    result = run_scenario(scenario(0.5, f"time={passing}"), watchers=[Fails()]).result
+    result = run_scenario(scenario(0.5, f"time={passing}"), observers=[Fails()]).result
     check_complete(result)
-    assert result.incomplete[0].startswith("onlooker: ended (ValueError: onlooker); ")
+    assert result.incomplete[0].startswith("observer: ended (ValueError: observer); ")
 
 
 def test_a_late_one_that_raises_is_left_out_alone() -> None:
-    audience, late = watch.Audience(), Fails()
+    audience, late = run_observers.LateObservers(), Fails()
     invited: list[bool] = []
 
     def invite() -> None:
@@ -157,36 +157,36 @@ def test_a_late_one_that_raises_is_left_out_alone() -> None:
             invited.append(True)
             audience.invite(late)
 
-    result = run_scenario(scenario(0.5), watchers=[Onlooker(invite), audience]).result
+    result = run_scenario(scenario(0.5), observers=[RecordingObserver(invite), audience]).result
     check_complete(result)
     (line,) = result.incomplete
-    assert line.startswith("onlooker: ended (ValueError: onlooker); ")
+    assert line.startswith("observer: ended (ValueError: observer); ")
 
 
 def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watch, "_PATIENCE_S", 0.2)
+    monkeypatch.setattr(run_observers, "_PATIENCE_S", 0.2)
     gate = threading.Event()
-    bad, good = Onlooker(gate.wait), Onlooker()
+    bad, good = RecordingObserver(gate.wait), RecordingObserver()
     try:
-        result = run_scenario(scenario(1.0), watchers=[bad, good]).result
+        result = run_scenario(scenario(1.0), observers=[bad, good]).result
     finally:
         gate.set()
     check_complete(result)
     assert result.topics[0].latency_s.p50 is not None
     assert result.topics[0].latency_s.p50 < 1
     (line,) = result.incomplete
-    assert line.startswith("onlooker: ended (it has not come back for 0.2 s); ")
+    assert line.startswith("observer: ended (it has not come back for 0.2 s); ")
     assert int(line.split("; ")[1].split()[0]) >= good.heard
 
 
 def test_one_that_is_slow_is_left_behind_within_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watch, "_HELD_BYTES", 200_000)
-    slow, good = Onlooker(lambda: time.sleep(0.01)), Onlooker()
-    monkeypatch.setattr(watch, "_PATIENCE_S", 60.0)
-    result = run_scenario(scenario(1.0), watchers=[slow, good]).result
+    monkeypatch.setattr(run_observers, "_HELD_BYTES", 200_000)
+    slow, good = RecordingObserver(lambda: time.sleep(0.01)), RecordingObserver()
+    monkeypatch.setattr(run_observers, "_PATIENCE_S", 60.0)
+    result = run_scenario(scenario(1.0), observers=[slow, good]).result
     check_complete(result)
     (line,) = result.incomplete
-    assert line.startswith("onlooker: slower than the link; ")
+    assert line.startswith("observer: slower than the link; ")
     assert 0 < slow.heard < good.heard
 
 
@@ -266,20 +266,20 @@ def test_a_capture_that_cannot_begin_is_one_line() -> None:
 @needs_root
 def test_a_bag_on_a_full_disk_costs_the_bag_and_no_figure(tmp_path: Path) -> None:
     with disk(tmp_path / "disk", "size=512k") as out:
-        ballast = out / "ballast"
+        filler = out / "filler"
 
-        class Frees(Onlooker):
+        class Frees(RecordingObserver):
             """Makes room for the result, once the bag is over."""
 
             def run_started(self, run: LiveRun) -> None:  # noqa: ARG002
-                with ballast.open("wb", buffering=0) as file, suppress(OSError):
+                with filler.open("wb", buffering=0) as file, suppress(OSError):
                     while file.write(bytes(4096)):
                         pass
 
             def run_ended(self, result: Result | None) -> None:  # noqa: ARG002
-                ballast.unlink()
+                filler.unlink()
 
-        result = run_scenario(scenario(1.0), out, watchers=[Frees()]).result
+        result = run_scenario(scenario(1.0), out, observers=[Frees()]).result
         check_complete(result)
         assert read_result(out).incomplete == result.incomplete
         assert result.counters["listener"] == {"/rx_robot_1/odom": result.topics[0].delivered}
@@ -289,7 +289,7 @@ def test_a_bag_on_a_full_disk_costs_the_bag_and_no_figure(tmp_path: Path) -> Non
 
 
 def test_a_recording_on_a_full_disk_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    heard = SigmfRecorder(tmp_path / "rec", Recording(1e6, 433e6))
+    heard = SigmfRecorder(tmp_path / "rec", SigmfRecording(1e6, 433e6))
     ramp = np.arange(1000, dtype=np.complex64)
     heard.work([ramp], [])
     wait_for(lambda: (tmp_path / "rec.sigmf-data").stat().st_size == 8000, "the first samples")
@@ -310,7 +310,7 @@ def test_a_recording_on_a_slow_disk_says_where_samples_are_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gr_ros2.radio.sigmf._HELD_BYTES", 10_000)
-    recorder = SigmfRecorder(tmp_path / "rec", Recording(1e6))
+    recorder = SigmfRecorder(tmp_path / "rec", SigmfRecording(1e6))
     gate = threading.Event()
     recorder._backlog.offer(0, gate.wait)  # the disk
     for number in range(3):
@@ -328,7 +328,7 @@ def test_a_recording_on_a_slow_disk_says_where_samples_are_missing(
 
 @needs_root
 def test_a_link_that_records_on_a_full_disk_ends_well_and_says_so(tmp_path: Path) -> None:
-    SigmfRecorder(tmp_path / "heard", Recording(1e6)).close()
+    SigmfRecorder(tmp_path / "heard", SigmfRecording(1e6)).close()
     np.zeros(100_000, "<c8").tofile(tmp_path / "heard.sigmf-data")
     front_end = {"name": "file", "read": str(tmp_path / "heard"), "repeat": True}
     with disk(tmp_path / "disk", "size=256k") as small:
@@ -347,13 +347,13 @@ def test_a_link_that_records_on_a_full_disk_ends_well_and_says_so(tmp_path: Path
 
 
 def test_an_observer_that_fails_does_not_end_a_link(caplog: pytest.LogCaptureFixture) -> None:
-    with Robot(1, {"name": "sim"}, hears=(1,), observer=Onlooker(fail)) as robot:
+    with Robot(1, {"name": "sim"}, hears=(1,), observer=RecordingObserver(fail)) as robot:
         said = robot.say(*range(5))
         wait_for(lambda: robot.heard == said, "what was said")
         assert robot.link.source.stats()["pump_failed"] == robot.link.sink.stats()["handler_failed"] == 0
         (line,) = robot.link.stats()["incomplete"]
-    assert line.startswith("onlooker: ended (ValueError: onlooker); ")
-    assert [record.levelno for record in caplog.records if "onlooker" in record.message] == [logging.ERROR]
+    assert line.startswith("observer: ended (ValueError: observer); ")
+    assert [record.levelno for record in caplog.records if "observer" in record.message] == [logging.ERROR]
 
 
 # -- the program around it ---------------------------------------------------------------------------------------

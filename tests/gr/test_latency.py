@@ -1,4 +1,4 @@
-"""Latency from stamps: both byte orders, types without one, a bounded window."""
+"""LatencySummary from stamps: both byte orders, types without one, a bounded window."""
 
 from __future__ import annotations
 

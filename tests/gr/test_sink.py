@@ -21,7 +21,7 @@ from gnuradio import gr
 from gr_ros2.config import SourceConfig
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
-from gr_ros2.gr.latency import Latency, LatencyWindow
+from gr_ros2.gr.latency import LatencySummary, LatencyWindow
 from gr_ros2.link import Delivered, Lost, Received, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -317,7 +317,7 @@ def test_nothing_waits_while_latencies_are_sorted(rig: Rig, monkeypatch: pytest.
     free: list[bool] = []
     summary = LatencyWindow.summary
 
-    def watched(window: LatencyWindow, *newest: int) -> Latency:
+    def watched(window: LatencyWindow, *newest: int) -> LatencySummary:
         free.append(sink._lock.acquire(timeout=5))
         sink._lock.release()
         return summary(window, *newest)

@@ -67,6 +67,16 @@ def test_at_most_two_packets_are_here_or_promised_however_short_they_are() -> No
     assert clock.grants(0.001) == 1
 
 
+def test_when_the_first_packet_is_due() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.5)
+    assert clock.first_due is None
+    clock.offer("a", 10.0)
+    clock.offer("b", 10.1)
+    assert clock.first_due == 10.5
+    assert clock.due(10.7) == ["a"]
+    assert clock.first_due == 11.0
+
+
 def test_nothing_to_wait_for_on_idle_air() -> None:
     clock: AirtimeClock[str] = AirtimeClock(0.1)
     clock.grants(0.0)

@@ -30,7 +30,7 @@ def run(ends: list[Endpoint], until: float) -> list[list[bytes]]:
             while (data := one.next_packet(now)) is not None:
                 got[1 - place] += [e.payload for e in other.receive(data, now) if isinstance(e, Delivered)]
             assert not any(isinstance(event, Delivered) for event in events)
-        later = [at for e in ends if (at := e.next_timeout()) is not None]
+        later = [at for e in ends for at in (e.next_timeout(), e.next_departure()) if at is not None]
         assert all(at > now for at in later), "what is due has been done"
         now = min(later, default=inf)
     return got
@@ -46,7 +46,7 @@ def test_two_ends_send_to_each_other() -> None:
     assert not ends[0].idle
     got = run(ends, 10.0)
     assert [sorted(payloads) for payloads in got] == [sorted(messages[1]), sorted(messages[0])]
-    assert all(one.idle and one.next_timeout() is None for one in ends)
+    assert all(one.idle and one.next_timeout() is one.next_departure() is None for one in ends)
     assert ends[0].sent.packets == ends[1].received.packets == sum(isinstance(event, SentPacket) for event in told)
 
 
@@ -65,15 +65,15 @@ def test_an_end_that_only_sends_and_one_that_only_hears() -> None:
         sink.submit(0, b"x", 0.0)
 
 
-def test_the_next_timeout_is_that_of_the_half_that_comes_first() -> None:
+def test_each_half_says_when_it_has_something_to_do() -> None:
     one, other = end(1), end(2)
     other.submit(0, bytes(160), 0.0)
     first, _ = other.next_packet(0.0), other.next_packet(0.0)
-    assert other.next_timeout() == pytest.approx(0.01), "the next packet"
+    assert other.next_departure() == pytest.approx(0.01), "the next packet"
     one.receive(first or b"", 0.0)
     assert one.next_timeout() == pytest.approx(0.5), "the incomplete message"
     one.submit(0, b"x", 0.1)
-    assert one.next_timeout() == pytest.approx(-inf)
+    assert one.next_departure() == pytest.approx(-inf)
     assert one.next_packet(0.1) is not None
     assert [type(event) for event in one.handle_timeout(0.5)] == [Lost]
     assert one.next_timeout() is None

@@ -476,15 +476,15 @@ def test_static_peers_are_found_on_another_machine(first: tuple[str, str], secon
 def test_a_participant_on_loopback_announces_itself_often(join: Callable[..., DdsMiddleware]) -> None:
     """Nodes on another interface find it only then; by itself Cyclone DDS would do so every 8 s."""
     node = join()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ears:
-        ears.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        ears.bind(("239.255.0.1", 7400 + 250 * node.domain_id))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as multicast:
+        multicast.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        multicast.bind(("239.255.0.1", 7400 + 250 * node.domain_id))
         membership = socket.inet_aton("239.255.0.1") + socket.inet_aton("127.0.0.1")
-        ears.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-        ears.settimeout(PATIENCE_S)
+        multicast.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        multicast.settimeout(PATIENCE_S)
         heard: list[float] = []
         while len(heard) < 9:
-            if node._guid[:12] in ears.recv(65536)[:20]:
+            if node._guid[:12] in multicast.recv(65536)[:20]:
                 heard.append(time.monotonic())
         assert heard[-1] - heard[0] < 8 * 8 / 4, "eight announcements in a quarter of what they would take"
 

@@ -203,7 +203,7 @@ def test_empty_message_of_a_peer_costs_nothing_but_itself(start: Start, host: rc
         return bool(received)
 
     wait_for(arrived, "for the message after it")
-    with pytest.raises(MiddlewareError, match="0 bytes are no serialized message"):
+    with pytest.raises(MiddlewareError, match="0 bytes are not a serialized message"):
         one.advertise("/chatter", STRING, RELIABLE).publish(b"")
 
 

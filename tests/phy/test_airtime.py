@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -12,6 +13,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
+from gr_ros2.phy.pdus import pdu_of
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -61,6 +63,25 @@ def test_without_airtime_packets_pass_at_once_and_credits_go_on(top: gr.top_bloc
         probe.post(bytes([number]))
     wait_for(lambda: probe.handled == 5, "every packet")
     wait_for(lambda: probe.credits >= 4, "credits for more")
+
+
+def test_a_packet_that_passes_late_is_measured(top: gr.top_block) -> None:
+    gate = AirtimeGate(0.01, times=True)
+    gate._clock.offer(pdu_of(b"x"), time.monotonic() - 1.0)  # was due 0.99 s ago
+    probe = wire(top, gate)
+    wait_for(lambda: probe.handled == 1, "the packet")
+    ((due, happened),) = gate.lateness.moments
+    assert happened - due == gate.lateness.worst >= 0.99
+    assert list(gate.passed_at) == [happened]
+
+
+def test_when_packets_passed_is_not_kept_unless_asked_for(top: gr.top_block) -> None:
+    gate = AirtimeGate(0.0)
+    probe = wire(top, gate)
+    probe.post(b"x")
+    wait_for(lambda: probe.handled == 1, "the packet")
+    assert gate.passed == 1
+    assert len(gate.passed_at) == 0
 
 
 def test_it_stops_with_packets_on_the_air() -> None:

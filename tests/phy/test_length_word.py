@@ -14,7 +14,7 @@ import numpy as np
 from gr_ros2.phy import PHY
 from gr_ros2.phy.length_word import LENGTHS, LengthWord, header_bits, header_crc
 from gr_ros2.phy.lora import telling
-from gr_ros2.phy.ofdm_layout import Layout
+from gr_ros2.phy.ofdm_layout import OfdmLayout
 from gr_ros2.phy.theory import half_point
 from tests.phy.test_burst import noise, received_by
 
@@ -36,7 +36,7 @@ def test_headers_of_frames_that_are_filled_up_differ_in_4_bits() -> None:
     from gr_ros2.phy.burst import Frames
     from gr_ros2.phy.ofdm_modem import OfdmModem
 
-    modem = OfdmModem(Frames(4095, multiple=3, order="little"), Layout(64, 16, "64qam", False), None)
+    modem = OfdmModem(Frames(4095, multiple=3, order="little"), OfdmLayout(64, 16, "64qam", False), None)
     assert modem._word is not None
     assert distances(modem._word.bits).min() >= 4
 

@@ -21,9 +21,9 @@ from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.lora import LoraPhy
 from gr_ros2.phy.lora_sdr import SdrFrame, whitening
-from gr_ros2.phy.measure import Recording, deliver, record
+from gr_ros2.phy.measure import SampleRecording, deliver, record
 from gr_ros2.phy.pdus import pdu_of
-from gr_ros2.phy.threads import begin
+from gr_ros2.phy.threads import start_flowgraph
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -132,7 +132,7 @@ def test_the_samples_are_those_of_the_modules_own_transmitter(options: dict[str,
     top, source, sink = gr.top_block(), Probe(), blocks.vector_sink_c()
     top.msg_connect(source, "pdus", theirs, "in")
     top.connect(theirs, sink)
-    begin(top.start)
+    start_flowgraph(top.start)
     for packet in recording.packets:
         nibbles = np.frombuffer(one.wrap(packet), np.uint8)[5:-4]
         payload = (nibbles[::2] | nibbles[1::2] << 4) ^ whitening(68)
@@ -156,7 +156,7 @@ def test_no_packet_is_lost_wherever_it_falls_between_samples(oversampling: int) 
         moved = np.fft.ifft(np.fft.fft(samples) * turn).astype(np.complex64)
         for snr_db in (None, 20):
             channel = ChannelConfig(snr_db=snr_db, seed=1)
-            assert deliver(phy, Recording(recording.packets, moved), channel) == recording.packets
+            assert deliver(phy, SampleRecording(recording.packets, moved), channel) == recording.packets
 
 
 def _spread(phy: LoraPhy, samples: Any, draw: np.random.Generator) -> Any:
@@ -220,7 +220,7 @@ def test_a_frame_of_another_length_is_counted_and_the_next_one_passes() -> None:
     top, receiver, log = gr.top_block(), phy.receiver(), blocks.message_debug()
     top.connect(blocks.vector_source_c(np.concatenate((mixed, np.zeros(2048, np.complex64)))), receiver)
     top.msg_connect(receiver, "pdus", log, "store")
-    begin(top.start)
+    start_flowgraph(top.start)
     top.wait()
     got = [bytes(pmt.u8vector_elements(pmt.cdr(log.get_message(place)))) for place in range(log.num_messages())]
     receiver.release()
@@ -267,7 +267,7 @@ def test_a_flowgraph_outlives_the_names_of_its_parts() -> None:
     top.connect(transmitter, receiver)
     top.msg_connect(receiver, "pdus", log, "store")
     del transmitter, receiver, phy
-    begin(top.start)
+    start_flowgraph(top.start)
     source.message_port_pub(pmt.intern("pdus"), pdu_of(bytes(14)))
     wait_for(lambda: log.num_messages() == 1, "the packet")
     top.stop()

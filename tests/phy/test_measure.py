@@ -18,11 +18,11 @@ from gnuradio import gr
 from gr_ros2.config import ChannelConfig
 from gr_ros2.phy import measure
 from gr_ros2.phy.gfsk import GfskPhy
-from gr_ros2.phy.threads import Held
-from gr_ros2.run.losstable import table_for
+from gr_ros2.phy.threads import KeptAlive
+from gr_ros2.run.loss_table import table_for
 
 
-class Pressing(Held, gr.sync_block):  # type: ignore[misc]
+class Pressing(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """A channel through which nothing passes, and during which Ctrl-C is pressed."""
 
     def __init__(self, *_: Any) -> None:

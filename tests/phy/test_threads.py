@@ -11,14 +11,14 @@ import pytest
 from gnuradio import gr, pdu
 
 from gr_ros2.phy.ofdm import OfdmPhy
-from gr_ros2.phy.threads import keep_messages
+from gr_ros2.phy.threads import lift_message_limit
 from tests.waiting import wait_for
 
 OVER_GNU_RADIOS_LIMIT = 8192 + 2500  # of which 1024 find room behind the port
 LIMIT_S = 60.0
 
 
-class HeldSink(gr.sync_block):  # type: ignore[misc]
+class KeptAliveSink(gr.sync_block):  # type: ignore[misc]
     """Takes nothing until it is let go."""
 
     def __init__(self) -> None:
@@ -34,10 +34,10 @@ class HeldSink(gr.sync_block):  # type: ignore[misc]
 
 def test_a_port_without_a_handler_keeps_all_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GR_CONF_DEFAULT_MAX_MESSAGES", raising=False)
-    keep_messages()
+    lift_message_limit()
     length = 64
     flowgraph = gr.top_block()
-    to_stream, sink = pdu.pdu_to_tagged_stream(gr.types.byte_t, "length"), HeldSink()
+    to_stream, sink = pdu.pdu_to_tagged_stream(gr.types.byte_t, "length"), KeptAliveSink()
     flowgraph.connect(to_stream, sink)
     flowgraph.start()
     try:
@@ -61,5 +61,5 @@ def test_a_transmitter_with_such_a_port_asks_for_it(monkeypatch: pytest.MonkeyPa
 
 def test_a_setting_of_the_users_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GR_CONF_DEFAULT_MAX_MESSAGES", "77")
-    keep_messages()
+    lift_message_limit()
     assert gr.prefs().get_long("DEFAULT", "max_messages", 100) == 77

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.errors import RunError
-from gr_ros2.race.measure import Cell
+from gr_ros2.race.measure import RaceCell
 from gr_ros2.race.namespaces import check_means
 
 
@@ -21,7 +21,7 @@ _REASON = _missing()
 needs_namespaces = pytest.mark.skipif(bool(_REASON), reason=_REASON)
 
 
-def cell(contender: str, **changes: object) -> Cell:
+def cell(contender: str, **changes: object) -> RaceCell:
     """A cell in which everything went well."""
     values = {
         "load": 2.0,
@@ -44,4 +44,4 @@ def cell(contender: str, **changes: object) -> Cell:
         "drops": {},
         "busy": 0.3,
     }
-    return Cell(contender=contender, **{**values, **changes})  # type: ignore[arg-type]
+    return RaceCell(contender=contender, **{**values, **changes})  # type: ignore[arg-type]

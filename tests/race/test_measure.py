@@ -6,34 +6,34 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.race.air import AirLog, AirReport
+from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.measure import COLUMNS, Identity, Observed, by_condition, measure, shown, winners
-from gr_ros2.race.settings import Recording
+from gr_ros2.race.settings import RaceRecording
 from tests.race.support import cell
 from tests.race.test_settings import text
 
 KIND = "std_msgs/msg/String"
 
 
-def recording(*payloads: bytes, kind: str = KIND) -> Recording:
-    return Recording(Path("bag"), "/talk", kind, payloads, tuple(0.1 * number for number in range(len(payloads))))
+def recording(*payloads: bytes, kind: str = KIND) -> RaceRecording:
+    return RaceRecording(Path("bag"), "/talk", kind, payloads, tuple(0.1 * number for number in range(len(payloads))))
 
 
 def feedback(number: int, gap: bytes) -> bytes:
     return b"\0\1\0\0\1" + bytes([number]) + gap + struct.pack("<f", 0.5)
 
 
-def log(*frames: tuple[float, int, float]) -> AirLog:
-    made = AirLog()
+def log(*frames: tuple[float, int, float]) -> LinkLog:
+    made = LinkLog()
     for frame in frames:
         made.note(*frame)
     return made
 
 
-def observed(heard: list[tuple[float, bytes]], there: AirLog | None = None, back: AirLog | None = None) -> Observed:
+def observed(heard: list[tuple[float, bytes]], there: LinkLog | None = None, back: LinkLog | None = None) -> Observed:
     t_sent = [10.0, 11.0, 12.0, 13.0]
     return Observed(
-        9.0, True, t_sent, heard, AirReport(there or log(), back or log(), {"on_air": 2, "queue_full": 0}), 0.3
+        9.0, True, t_sent, heard, LinkReport(there or log(), back or log(), {"on_air": 2, "queue_full": 0}), 0.3
     )
 
 

@@ -1,7 +1,7 @@
 """A Pluto without hardware: what libiio's server says on the network, with what is sent coming back as received.
 
-Laws: settings are texts that are kept as written and read back, except where told otherwise; samples received come at
-the sample rate, noise where nothing was sent.
+Invariants: settings are texts that are kept as written and read back, except where told otherwise; samples received
+come at the sample rate, noise where nothing was sent.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
     defaults = {
         "registry": str(TOPICS),
         "packet_len": 64,
+        "version": 0,
         "phy": {"name": "psk", "sample_rate": RATE},
         "front_end": front_end,
         "ros_source": {

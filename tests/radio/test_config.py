@@ -57,7 +57,7 @@ def test_settings_are_replaced_one_by_one(tmp_path: Path) -> None:
     [
         ({"frequency": 1e6}, "unknown key frequency"),
         ({"packet_len": 5}, "packet_len = 5"),
-        ({"registry": ""}, "registry"),
+        ({"registry": "", "version": 0}, "registry is missing"),
         ({"packet_len": 13}, "packet_len = 13: [^;]*$"),
         ({"phy": 5}, r"phy = 5: must be keys and values \(which physical layer"),
         ({"ros_source": {}}, "robot_id = -1"),
@@ -81,7 +81,8 @@ def test_a_missing_file_is_named() -> None:
         load_link("nowhere.yaml")
 
 
-def test_a_link_needs_a_registry() -> None:
+def test_with_version_0_a_link_needs_a_registry() -> None:
     with pytest.raises(ConfigError, match="registry is missing"):
-        link_from({"ros_source": {"robot_id": 1}})
+        link_from({**{key: value for key, value in SMALL.items() if key != "registry"}, "version": 0})
+    assert not link_from({key: value for key, value in SMALL.items() if key != "registry"}).load_registry()
     assert LinkConfig(**{**SMALL, "registry": "x"}).name == "link"

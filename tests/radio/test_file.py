@@ -13,7 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.radio.link import RobotLink
-from gr_ros2.radio.sigmf import Recording, SigmfRecorder, read_recording
+from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
 
@@ -82,7 +82,7 @@ def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
 
 
 def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
-    recorder = SigmfRecorder(tmp_path / "cut", Recording(RATE, 433e6), 4)
+    recorder = SigmfRecorder(tmp_path / "cut", SigmfRecording(RATE, 433e6), 4)
     recorder.work([np.arange(8, dtype=np.complex64)], [])
     recorder.stop()
     with Path(tmp_path / "cut.sigmf-data").open("ab") as data:
@@ -107,13 +107,13 @@ def test_samples_that_are_no_numbers_are_zeros_and_counted(tmp_path: Path) -> No
 
 
 def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
-    SigmfRecorder(tmp_path / "empty", Recording(RATE)).close()
+    SigmfRecorder(tmp_path / "empty", SigmfRecording(RATE)).close()
     with Robot(2, {"name": "file", "read": str(tmp_path / "empty")}) as robot:
         wait_for(lambda: robot.link.finished, "the end")
 
 
 def test_what_cannot_be_written_is_counted(tmp_path: Path) -> None:
-    recorder = SigmfRecorder(tmp_path / "full", Recording(RATE))
+    recorder = SigmfRecorder(tmp_path / "full", SigmfRecording(RATE))
     recorder.close()
     recorder.work([np.zeros(5, np.complex64)], [])
     assert recorder.failed == 5

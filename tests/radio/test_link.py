@@ -58,7 +58,7 @@ def test_packets_leave_at_the_pace_of_the_air() -> None:
     assert stats["uptime_s"] > stats["packets"]["out"] * airtime
 
 
-class Ears:
+class Observed:
     """Notes all it is told."""
 
     def __init__(self) -> None:
@@ -80,14 +80,14 @@ class Ears:
 
 
 def test_an_observer_is_told_everything() -> None:
-    ears = Ears()
-    with Robot(1, SIM, hears=(1,), observer=ears) as robot:
+    observed = Observed()
+    with Robot(1, SIM, hears=(1,), observer=observed) as robot:
         said = robot.say(5, 6)
-        wait_for(lambda: len(ears.received) == 2, "two messages")
-    assert [event.payload for event in ears.sent if isinstance(event, Accepted)] == said
-    assert [event.data for event in ears.sent if isinstance(event, SentPacket)] == ears.packets
-    assert [event.payload for event in ears.received if isinstance(event, Delivered)] == said
-    assert ears.times == sorted(ears.times)
+        wait_for(lambda: len(observed.received) == 2, "two messages")
+    assert [event.payload for event in observed.sent if isinstance(event, Accepted)] == said
+    assert [event.data for event in observed.sent if isinstance(event, SentPacket)] == observed.packets
+    assert [event.payload for event in observed.received if isinstance(event, Delivered)] == said
+    assert observed.times == sorted(observed.times)
 
 
 def test_both_blocks_take_a_middleware_that_is_handed_over() -> None:

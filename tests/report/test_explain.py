@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.record.result import LatenessResult
 from gr_ros2.report.explain import explanation
 from tests.record.results import RESULT
 from tests.record.runs import empty_trace, make_run
@@ -40,7 +41,7 @@ def test_what_the_sources_graph_lost_is_told(tmp_path: Path) -> None:
 
 def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5})
+    slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5, "airtime_mean_s": 0.5})
     assert f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times what the link has" in explanation(slow, run.trace)[1]
 
 
@@ -57,6 +58,28 @@ def test_as_fast_as_the_flowgraph_runs_the_clock_says_nothing_of_the_air(tmp_pat
     assert "packets/s" not in " ".join(explanation(run.result, run.trace))
 
 
+LATE = LatenessResult({"threads": 0.24, "gate": 0.06, "modem": 0.012}, 3, 0.045, 16, 5, 200, 20)
+
+
+def test_a_computer_that_was_late_is_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    late = replace(run.result, lateness=LATE)
+    assert explanation(late, run.trace)[-1] == (
+        "The computer was up to 240 ms late (threads; gate 60.0 ms, modem 12.0 ms), 3 times by 50.0 ms or more, 4% of "
+        "the run; 31% of the losses follow such moments, as do 10% of all messages."
+    )
+    without = replace(late, lateness=replace(LATE, lost=0, lost_after=0, worst_s={"threads": 0.24}))
+    assert explanation(without, run.trace)[-1] == (
+        "The computer was up to 240 ms late (threads), 3 times by 50.0 ms or more, 4% of the run."
+    )
+
+
+def test_nothing_is_said_of_a_computer_that_kept_up(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    in_time = replace(run.result, lateness=replace(LATE, moments=0, share=0.0))
+    assert explanation(in_time, run.trace) == explanation(run.result, run.trace)
+
+
 def test_nothing_sent() -> None:
     assert explanation(replace(RESULT, topics=()), empty_trace()) == ["No message was sent."]
 
@@ -65,4 +88,4 @@ def test_every_row_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     everything = replace(run.result.topics[0], ledger=dict.fromkeys(ROWS, 1), sent=len(ROWS))
     outcome, *_ = explanation(replace(run.result, topics=(everything,)), run.trace)
-    assert all(row.words in outcome for row in Row)
+    assert all(row.words in outcome for row in LedgerRow)

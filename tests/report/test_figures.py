@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.report.figures import (
     SENT_EVERY,
     latency_figure,
@@ -81,5 +81,5 @@ def test_a_row_keeps_its_place_and_colour() -> None:
     assert row_order([{"in_flight": 1, "b": 1, "none": 0}, {"delivered": 1, "a": 1}]) == [
         *("delivered", "a", "b", "in_flight"),
     ]
-    assert len({row_colour(row) for row in Row}) == len(Row)
+    assert len({row_colour(row) for row in LedgerRow}) == len(LedgerRow)
     assert row_colour("never heard of") == row_colour("never heard of")

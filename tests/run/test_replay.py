@@ -16,7 +16,7 @@ from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.middleware.bag_files import bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagRecorder
 from gr_ros2.middleware.base import Qos
-from gr_ros2.run import losstable
+from gr_ros2.run import loss_table
 from gr_ros2.run.replay import Replayed, replay
 from gr_ros2.run.scenario import Scenario, load_scenario
 from tests.e2e.support import check_books
@@ -143,7 +143,7 @@ def test_a_drive_opens_with_other_readers_and_keeps_its_stamps(
     drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(losstable, "PACKETS", 50)
+    monkeypatch.setattr(loss_table, "PACKETS", 50)
     settings = load_scenario("demo", ["time=packets"], duration_s=10.0, source=f"bag:{drive.path}")
     done = replay(drive.path, tmp_path / "out.mcap", settings, drive.names)
     check_books(done.outcome.result)

@@ -218,8 +218,8 @@ MIXED: dict[str, tuple[list[Foreign], str]] = {
     ),
     "two names": ([Foreign("x"), Foreign("/x")], "names x and /x"),
     "a name ROS does not know": ([Foreign("/ro-bot/x")], "'/ro-bot/x' is no name of a ROS topic"),
-    "a service": ([SERVICE], "example_interfaces/srv/AddTwoInts_Event is of a service or an action"),
-    "an action": ([FEEDBACK], "is of a service or an action"),
+    "a service": ([SERVICE], "example_interfaces/srv/AddTwoInts_Event belongs to a service or an action"),
+    "an action": ([FEEDBACK], "belongs to a service or an action"),
     "another serialization": ([Foreign("/x", serialization="json")], "serialized as 'json'"),
     "no type": ([Foreign("/x", "Thing")], "'Thing' is no type of a ROS message"),
 }

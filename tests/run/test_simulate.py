@@ -16,7 +16,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import End, EventLoop, Offered, Simulated, Way, make_ends, simulate
+from gr_ros2.run.simulate import End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
 
 
 class Sized:
@@ -205,8 +205,10 @@ def test_an_end_may_answer_what_it_hears() -> None:
     codecs = message_codec(back.ros_source, registry), message_codec(there.ros_sink, registry)
     other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
     ways = [
-        Way(there, (one, other), lambda _: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])),
-        Way(back, (other, one), lambda _: 0.01, iter(())),
+        LinkDirection(
+            there, (one, other), lambda _: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
+        ),
+        LinkDirection(back, (other, one), lambda _: 0.01, iter(())),
     ]
     for way in ways:
         way.air = lambda data, now: [data]  # noqa: ARG005

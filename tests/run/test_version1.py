@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.outcome import ARRIVED
+from gr_ros2.link.ledger_rows import ARRIVED
 from gr_ros2.record.result import Result, TopicResult, read_result, write_result
 from gr_ros2.report.table import ledger_grid, summary_grid
 from gr_ros2.run.runner import run_scenario

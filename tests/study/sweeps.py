@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from gr_ros2.study.sweep.definition import Plan, load_sweep
+from gr_ros2.study.sweep.definition import SweepPlan, load_sweep
 
 DIRECT: Mapping[str, Any] = {
     "scenario": "paper-direct",
@@ -28,5 +28,5 @@ def write_sweep_file(folder: Path, **changes: Any) -> Path:
     return path
 
 
-def plan(folder: Path, **changes: Any) -> Plan:
+def plan(folder: Path, **changes: Any) -> SweepPlan:
     return load_sweep(write_sweep_file(folder, **changes))

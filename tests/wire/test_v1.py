@@ -204,7 +204,7 @@ def test_an_addressed_packet_is_two_bytes_longer() -> None:
     packet = Packet(Header(0, False, 1, 5, dst_id=7, hop=2), (Part(0, message),))
     assert decode(encode(packet, 64, BOOT), 64, BOOT) == packet
     with pytest.raises(WireError):
-        encode(packet._replace(entries=(Part(0, bytes(51)),)), 64, BOOT)
+        encode(packet._replace(body=(Part(0, bytes(51)),)), 64, BOOT)
 
 
 rows = st.builds(

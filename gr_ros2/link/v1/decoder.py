@@ -4,10 +4,10 @@ What is held beside the bodies is a system of linear equations over GF(256) in t
 equation is known by its oldest packet, its *pivot*, whose coefficient is 1. A repair spans at most 127 numbers, so does
 every equation made of repairs, and the work per packet stays bounded however long the window is.
 
-Laws: a body given out is the one that was sent, or the packet's own check failed to notice damage; a body that follows
-from equations but cannot be parsed is not believed, and all equations go with it, since one wrong one would spread; the
-numbers never come round here (the caller counts how often they have); memory is bounded by ``span`` bodies and as many
-equations as numbers are missing among them.
+Invariants: a body given out is the one that was sent, or the packet's own check failed to notice damage; a body that
+follows from equations but cannot be parsed is not believed, and all equations go with it, since one wrong one would
+spread; the numbers never come round here (the caller counts how often they have); memory is bounded by ``span`` bodies
+and as many equations as numbers are missing among them.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 *What leaves.* When a packet is asked for: a hello that cannot wait, then new messages, then what there is to say about
 others' packets, then repair (``link.repair``). Reports ride along where a packet of messages has room for one.
 
-Laws: every submitted message is accepted once and then leaves whole or is refused with a named reason; ``receive``
-never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is sent once, a
-row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
+Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason;
+``receive`` never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is
+sent once, a row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 
 from gr_ros2.config import QueuePolicy
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import (
     AirKind,
     Delivered,
@@ -33,7 +32,8 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
@@ -220,13 +220,16 @@ class Endpoint:
         """Memory in use for incomplete messages."""
         return sum(neighbour.inbox.held for neighbour in self.neighbours)
 
+    def keep_incomplete(self, timeout_s: float) -> None:
+        """Nothing: an incomplete message is kept while it may be repaired."""
+
     def unpublished(self, event: Delivered) -> Lost:
         """Book a message that was given out but did not come onto the ROS graph. It may come again when it is kept."""
         neighbour = self.neighbours.get(event.src_id)
         if neighbour is not None:
             neighbour.inbox.marks.pop(event.topic_id, None)
-        self.received.lost[event.src_id, event.topic_id, Row.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, Row.PUBLISH_FAILED, event.key)
+        self.received.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
@@ -309,30 +312,35 @@ class Endpoint:
         return events
 
     def next_timeout(self) -> float | None:
-        """When ``next_packet`` or ``handle_timeout`` may have something to do without a further call."""
-        now = self._now
+        """When ``handle_timeout`` has something to do, if nothing is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
-        if self._credits != 0 and self._speaks:
-            leaving = [self._talk.due]
-            waiting = self.outbox.next_timeout(now)
-            if waiting is not None:
-                leaving.append(waiting)
-            if self.settings.hears:
-                leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
-            if self._repeat_at < inf:
-                leaving.append(self._repeat_at)
-            if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
-                leaving.append(now if self._mode() == "idle" else now + _POLL_S)
-            times.append(max(min(leaving), self._slot))
-        return min(times) if times else None
+        return min(times, default=None)
+
+    def next_departure(self) -> float | None:
+        """When ``next_packet`` may have something, if nothing is called before."""
+        now = self._now
+        if self._credits == 0 or not self._speaks:
+            return None
+        leaving = [self._talk.due]
+        waiting = self.outbox.next_timeout(now)
+        if waiting is not None:
+            leaving.append(waiting)
+        if self.settings.hears:
+            leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+        if self._repeat_at < inf:
+            leaving.append(self._repeat_at)
+        if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
+            leaving.append(now if self._mode() == "idle" else now + _POLL_S)
+        return max(min(leaving), self._slot)
 
     # ---- what leaves
 
     def _compose(self, now: float) -> bytes | None:
         if not self._started:
             self._start(now)
-        if self._talk.urgent(now, idle=self.outbox.idle):
+        idle, latency, heard = self.outbox.idle, self.outbox.urgent, bool(self.window.receivers())
+        if self._talk.urgent(now, idle=idle, latency=latency, heard=heard):
             return self._hello(now)
         if now >= self._repeat_at:
             self._repeat_at = now + self.settings.repeat_s
@@ -539,7 +547,7 @@ class Endpoint:
         """A robot that was not known, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
-            self._report_all(opened.replaced.inbox.close(Row.SENDER_RESTARTED))
+            self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
         self.window.forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears:

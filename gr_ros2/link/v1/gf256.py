@@ -4,8 +4,8 @@ The field is that of the polynomial 0x11D (x^8 + x^4 + x^3 + x^2 + 1) with gener
 multiplied by one ``bytes.translate`` with a table of 256 bytes, and added as one long integer: that is faster in Python
 than numpy for rows of a packet's size.
 
-Law: any square part of the Cauchy matrix ``coefficient(row, number)`` is invertible as long as its rows differ mod 128
-and its numbers differ mod 128. So as many different repairs as packets are missing always bring them back.
+Invariant: any square part of the Cauchy matrix ``coefficient(row, number)`` is invertible as long as its rows differ
+mod 128 and its numbers differ mod 128. So as many different repairs as packets are missing always bring them back.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ here, or given up: it is not known what those carried. A packet is given up for 
 it is over, or ``hold_s`` after it was missed; and at once while hardly any missing packet comes back. Messages of other
 topics are delivered as they come, and never after a later one.
 
-Laws: nothing is delivered twice, nor after a later message of its topic; every message of which something came ends in
-one Delivered or Lost; memory is bounded.
+Invariants: nothing is delivered twice, nor after a later message of its topic; every message of which something came
+ends in one Delivered or Lost; memory is bounded.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from zlib import crc32
 
 from gr_ros2.errors import CodecError, WireError
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Announced, Delivered, Lost
-from gr_ros2.link.outcome import ROWS, Row
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.key import Key
@@ -189,7 +189,7 @@ class Inbox:
         self._now = now
         self._settle()
         for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
-            self._lose(partial, Row.EXPIRED)
+            self._lose(partial, LedgerRow.EXPIRED)
         return self._given()
 
     def next_timeout(self) -> float | None:
@@ -202,14 +202,14 @@ class Inbox:
             times.append(waiting + self._settings.reassembly_timeout_s)
         return min(times) if times else None
 
-    def close(self, reason: Row) -> Events:
+    def close(self, reason: LedgerRow) -> Events:
         """Give up everything that is not delivered."""
         for partial in self._reassembly.clear():
             self._lose(partial, reason)
         for waiting in [ready for line in self._ready.values() for ready in line]:
             self._events.append(Lost(self.src_id, waiting.topic_id, reason, self._key(waiting.order)))
         for waiting in self._unknown:
-            self._events.append(Lost(self.src_id, waiting.topic_id, Row.UNKNOWN_TOPIC, self._key(waiting.order)))
+            self._events.append(Lost(self.src_id, waiting.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(waiting.order)))
         self._ready.clear()
         self._unknown.clear()
         return self._given()
@@ -308,12 +308,12 @@ class Inbox:
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
         for partial in self._reassembly.overflowing():
-            self._lose(partial, Row.MEMORY)
+            self._lose(partial, LedgerRow.MEMORY)
         if whole is None:
             return
         payload = whole.payload()
         if payload is None:
-            self._lose(whole, Row.DAMAGED)
+            self._lose(whole, LedgerRow.DAMAGED)
             return
         order = (whole.begin, whole.place)
         self._arrived(_Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
@@ -330,7 +330,7 @@ class Inbox:
             while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
                 lost = self._unknown.popleft()
                 self._waiting -= len(lost.payload)
-                self._events.append(Lost(self.src_id, lost.topic_id, Row.UNKNOWN_TOPIC, self._key(lost.order)))
+                self._events.append(Lost(self.src_id, lost.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(lost.order)))
         elif row.reliable and ready.order[0] > self._low:
             self._ready.setdefault(ready.topic_id, []).append(ready)
         else:
@@ -422,11 +422,11 @@ class Inbox:
         self.rows = {row.topic_id: row for row in rows}
         for topic_id in [topic_id for topic_id in self._ready if topic_id not in self.rows]:
             for ready in self._ready.pop(topic_id):
-                self._events.append(Lost(self.src_id, topic_id, Row.UNKNOWN_TOPIC, self._key(ready.order)))
+                self._events.append(Lost(self.src_id, topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(ready.order)))
         if self._decoder_for is not None:
             self._codec = self._decoder_for(rows)
 
-    def _lose(self, partial: Partial, reason: Row) -> None:
+    def _lose(self, partial: Partial, reason: LedgerRow) -> None:
         key = self._key((partial.begin, partial.place))
         self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
 
@@ -434,6 +434,6 @@ class Inbox:
         return Key(self.boot, *order)
 
 
-def _passed_over(row: TableRow) -> Row:
+def _passed_over(row: TableRow) -> LedgerRow:
     """Where a message ends that is not delivered since a later one of its topic was."""
-    return Row.GIVEN_UP if row.reliable else Row.OVERTAKEN
+    return LedgerRow.GIVEN_UP if row.reliable else LedgerRow.OVERTAKEN

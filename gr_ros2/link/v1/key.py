@@ -1,6 +1,6 @@
 """What names a message of version 1 among all messages of its sender.
 
-Law: no two messages of a sender have the same key, over all its starts.
+Invariant: no two messages of a sender have the same key, over all its starts.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ packet number below which nothing is taken: it is stored before a packet above i
 a restart is refused after it. A robot that stands still is taken again below that number once it has heard this start
 of ours, which only it can say and only now.
 
-Laws: nothing is given out that was not opened; no standing packet is given out twice; an older start of a robot is
-never gone back to where packets are sealed.
+Invariants: nothing is given out that was not opened; no standing packet is given out twice; an older start of a robot
+is never gone back to where packets are sealed.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ what is free, and nothing about it is fixed beforehand.
 with a lifespan, until that is over; otherwise until ``depth`` newer ones have left, or newer ones that fill a repair.
 Where receivers report they say when they have it, and no more than the publishers' depth limits it.
 
-Laws: a topic's messages begin one after the other, each after the one before has left whole; every message ends in
-being sent or in a Refused with its row.
+Invariants: a topic's messages begin one after the other, each after the one before has left whole; every message ends
+in being sent or in a Refused with its row.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from zlib import crc32
 
 from gr_ros2.config import QueuePolicy
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.codec import MessageCodec
 from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
-from gr_ros2.link.outcome import Row
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.key import Key
@@ -42,6 +42,11 @@ from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
 
+SHARE = 3
+"""What others leave of a packet is used for a fragment from this part of a packet's room on: a message in more packets
+than it needs is lost with any of them. Of class latency, whatever fits goes."""
+TABLE_FIRST = 2
+"""Packets up to which the table of topics goes before messages."""
 SETTLING_S = 1.0
 """s after which a latched message is named in hellos: who lacks it then has not merely not got it yet."""
 STARTING_S = 2.0
@@ -150,7 +155,7 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, Row.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         if topic.latched:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
@@ -166,7 +171,9 @@ class Outbox:
             return
         for kept in self._kept.get(topic_id, ()):
             if topic_id == TABLE_TOPIC:
-                queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, 0, now, repeat=True))
+                # Nothing is delivered without it. A long one does not hold up what is urgent.
+                qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
+                queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
             else:
                 assert self._topics is not None
                 weight = self._topics[topic_id].options.weight
@@ -267,6 +274,11 @@ class Outbox:
         return min(times) if times else None
 
     @property
+    def urgent(self) -> bool:
+        """Whether a message of class latency waits, the table of topics apart: it follows a hello."""
+        return any(queue and queue[0].qos == 1 for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC)
+
+    @property
     def idle(self) -> bool:
         """Whether nothing waits."""
         return not any(self._queues.values())
@@ -326,7 +338,7 @@ class Outbox:
         """Whether a fragment of so many bytes is worth its header."""
         if not used:
             return True
-        if taken < self._settings.min_fragment:
+        if taken < max(self._settings.min_fragment, 0 if message.qos == 1 else room // SHARE):
             return False
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
@@ -392,6 +404,6 @@ class Outbox:
             if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: Row, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))

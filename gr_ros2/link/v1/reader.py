@@ -3,7 +3,8 @@
 What a receiver learns in time, a reader is told beforehand: the hellos, without which no trailer can be checked, and
 the keys of the fleet. What it cannot check or open it says, and shows what stands in the clear.
 
-Laws: ``read`` raises nothing but a named WireError; what it gives out as checked belongs to a hello that was learned.
+Invariants: ``read`` raises nothing but a named WireError; what it gives out as checked belongs to a hello that was
+learned.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A fragment names its message by the packet in which that began, and says where in it it belongs. Packet numbers are full
 ones here, of one start of the sender, so two messages cannot be taken for one.
 
-Laws: memory grows with what has arrived, never with what was announced; what it holds is bounded, the message longest
-without a fragment goes first.
+Invariants: memory grows with what has arrived, never with what was announced; what it holds is bounded, the message
+longest without a fragment goes first.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ separate groups of 64.
 *Overload.* Where the idle slots cannot make up for the losses, a long window decodes nothing at all. It shrinks then:
 to ``FEW`` packets, and to those of the newest message.
 
-Laws: a standing packet's row is used once per number; coefficients of a window are never those of another repair of the
-same packets; nothing alive is older than ``span`` numbers.
+Invariants: a standing packet's row is used once per number; coefficients of a window are never those of another repair
+of the same packets; nothing alive is older than ``span`` numbers.
 """
 
 from __future__ import annotations

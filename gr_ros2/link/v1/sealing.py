@@ -6,8 +6,8 @@ with the robot's id and the number of the start, its *boot number*. The nonce is
 bits, and its row. So no pair of key and nonce comes twice as long as boot numbers grow, a number is sent once, and a
 row is used once per number; a packet that is sent again is the same packet, byte for byte.
 
-Laws: ``open`` gives out a body only if the trailer belongs to the packet's bytes (but for the hop count of a sealed
-packet, which relays change), its sender's boot number and its full packet number; otherwise it raises a named
+Invariants: ``open`` gives out a body only if the trailer belongs to the packet's bytes (but for the hop count of a
+sealed packet, which relays change), its sender's boot number and its full packet number; otherwise it raises a named
 WireError.
 """
 

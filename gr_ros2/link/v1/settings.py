@@ -1,6 +1,6 @@
 """What an endpoint of version 1 is told about itself and its radio.
 
-Law: values only; everything has the default that suits a radio of some kB/s between two robots.
+Invariant: values only; everything has the default that suits a radio of some kB/s between two robots.
 """
 
 from __future__ import annotations

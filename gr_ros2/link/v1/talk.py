@@ -1,9 +1,10 @@
 """When a robot says who it is, what it says, and what it asks others for.
 
 Hellos leave at the start, a few in the first second since any may be lost; whenever the table of topics changes; at
-once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about 50 bytes/s.
+once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about 50 bytes/s. Where
+messages wait they are late: by half a second, or by two where receivers report.
 
-Law: a hello never says of a message that it is kept before whoever listens had time to get it the first time.
+Invariant: a hello never says of a message that it is kept before whoever listens had time to get it the first time.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 HELLO_BYTES_S = 50.0
 """Bytes/s that hellos take, as far as that means one every ``OFTEN_S`` to ``SELDOM_S``."""
 OFTEN_S, SELDOM_S = 1.0, 2.0
+LATENCY_S = 0.15
+"""s that a hello lets messages of class latency go first."""
 ASK_S = 0.5
 """s after which a request is made again."""
 LOOK_S = 0.02
@@ -66,10 +69,19 @@ class Talk:
         """The next hello leaves at once."""
         self.due = min(self.due, now)
 
-    def urgent(self, now: float, *, idle: bool) -> bool:
-        """Whether a hello goes before messages. ``idle``: none waits."""
+    def urgent(self, now: float, *, idle: bool, latency: bool, heard: bool) -> bool:
+        """Whether a hello goes before messages.
+
+        :param idle: no message waits
+        :param latency: one of class latency waits
+        :param heard: somebody reports, so who is new here says so, and is answered at once
+        """
         late = now - self.due
-        return late >= 0 and (idle or bool(self._starting) or late > OFTEN_S / 2)
+        if late < 0 or idle:
+            return late >= 0
+        if self._starting:
+            return late >= latency * LATENCY_S
+        return late > (SELDOM_S if heard else OFTEN_S / 2) + latency * LATENCY_S
 
     def hello(self, room: int, turns: int, digest: int, marks: Sequence[tuple[int, int]], now: float) -> list[Control]:
         """The entries of a hello; the next one is due later.

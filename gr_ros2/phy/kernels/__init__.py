@@ -1,7 +1,7 @@
 """Compiled kernels of the burst modems: search and reading in C++17, an optional part of the package.
 
-Laws: numpy is the reference and the fallback, and finds the same packets; which one runs can be told in one line; the
-C++ has no dependencies, starts no threads and knows neither Python nor GNU Radio.
+Invariants: numpy is the reference and the fallback, and finds the same packets; one line says which of the two runs;
+the C++ code has no dependencies, starts no threads and uses neither Python nor GNU Radio.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from gr_ros2.phy.kernels.modem import CompiledModem
 
 
 def fastest(modem: BurstModem, kernels: Kernels) -> BurstModem:
-    """The modem as it is to run: with its compiled kernel where that is wanted and there is one, else itself."""
+    """The modem with its compiled kernel where one exists and the setting allows it, otherwise the modem itself."""
     wanted = kernels == "auto" and loaded().functions is not None and modem.constants() is not None
     return CompiledModem(modem) if wanted else modem
 
@@ -23,4 +23,4 @@ def which(kernels: Kernels) -> str:
     if kernels == "numpy":
         return "numpy, as set"
     found = loaded()
-    return f"compiled, {found.about}" if found.functions is not None else f"numpy, for want of kernels: {found.about}"
+    return f"compiled, {found.about}" if found.functions is not None else f"numpy, no compiled kernels: {found.about}"

@@ -1,6 +1,6 @@
 // The C interface of the kernels, for ctypes.
 //
-// Laws: no exception leaves; arrays are the caller's; a call takes no lock and keeps nothing of what it was given.
+// Invariants: no exception leaves; arrays are the caller's; a call takes no lock and keeps nothing of what it was given.
 
 #include <cstddef>
 #include <exception>

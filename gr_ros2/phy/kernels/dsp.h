@@ -1,6 +1,6 @@
 // What the kernels share: complex arithmetic, FFT, peaks. Single precision, as the samples are.
 //
-// Laws: no floating-point flag of the process is touched; a NaN goes through every function here without undefined
+// Invariants: no floating-point flag of the process is touched; a NaN goes through every function here without undefined
 // behaviour, and where numpy's argmax would stop at it, so does ours.
 
 #pragma once
@@ -98,7 +98,7 @@ inline void squares(const Sample* values, int count, float* out) {
 }
 
 // Where the parabola through three neighbours is highest, -0.5..0.5 from the middle one.
-inline double summit(double before, double at, double after) {
+inline double parabola_peak(double before, double at, double after) {
     const double bend = before - 2 * at + after;
     return bend < 0 ? std::max(-0.5, std::min(0.5, 0.5 * (before - after) / bend)) : 0.0;
 }

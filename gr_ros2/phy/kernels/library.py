@@ -1,7 +1,7 @@
-"""The library of compiled kernels: which variant this processor runs, or why there is none.
+"""Loads the library of compiled kernels: the variant for this processor, or the reason why there is none.
 
-Laws: what is missing or does not load is no error, but a reason that can be told; a library is loaded once, and changes
-nothing in the process beside itself.
+Invariants: a missing library, or one that does not load, is not an error but a reason in words; a library is loaded
+once, and changes nothing else in the process.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 
 @dataclass(frozen=True)
 class Loaded:
-    """What came of looking for the library.
+    """Result of loading the library.
 
-    :param functions: those of ``abi.cpp``, None where there is no library
+    :param functions: the functions of ``abi.cpp``, None where there is no library
     :param about: what they were compiled for, such as ``AVX2``, or why there are none
     """
 
@@ -55,14 +55,14 @@ def load(folder: Path) -> Loaded:
     """The variant for this processor out of a folder."""
     baseline = _file(folder, _EVERYWHERE)
     if baseline is None:
-        return Loaded(None, "they were not built; install a C++ compiler (apt install g++), then gr-ros2 once more")
+        return Loaded(None, "they were not built; install a C++ compiler (apt install g++), then install gr-ros2 again")
     try:
         functions = _open(baseline)
         newer = _file(folder, _AVX2)
         if newer is not None and functions.kernels_has_avx2():
             functions = _open(newer)
     except (OSError, AttributeError) as error:  # built for another machine, or by another version
-        return Loaded(None, f"they do not load ({error}); install gr-ros2 once more")
+        return Loaded(None, f"they do not load ({error}); install gr-ros2 again")
     return Loaded(functions, functions.kernels_target().decode())
 
 

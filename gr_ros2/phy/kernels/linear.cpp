@@ -201,7 +201,7 @@ class Linear final : public Modem {
         squares(s.spectrum.data(), size, s.heights.data());
         const int peak = argmax(s.heights.data(), size);
         const auto height = [&](int bin) { return std::sqrt(static_cast<double>(s.heights[bin & (size - 1)])); };
-        const double place = peak + summit(height(peak - 1), height(peak), height(peak + 1));
+        const double place = peak + parabola_peak(height(peak - 1), height(peak), height(peak + 1));
         const double frequency = kTau * (wrapped(place + size / 2.0, size) - size / 2.0) / size;
         const double all = static_cast<double>(p_.preamble) * power;
         return {frequency, std::isfinite(power) ? s.heights[peak] / std::max(all, kTiny) : 0.0};
@@ -254,7 +254,7 @@ class Linear final : public Modem {
             }
             heights[off + 1] = std::sqrt(re * re + im * im);
         }
-        return summit(heights[0], heights[1], heights[2]);
+        return parabola_peak(heights[0], heights[1], heights[2]);
     }
 
     // The payload's points, straightened, in blocks and chunks; false where this cannot be a burst.
@@ -333,7 +333,7 @@ class Linear final : public Modem {
                 sum += s.other[k].real() * s.turned[k].real() - s.other[k].imag() * s.turned[k].imag();
             heights[off + 1] = sum;
         }
-        return summit(heights[0], heights[1], heights[2]);
+        return parabola_peak(heights[0], heights[1], heights[2]);
     }
 
     // `count` values a symbol apart from a fractional place on, by cubic interpolation; zeros outside.

@@ -267,7 +267,7 @@ class Lora final : public Modem {
     // The strongest place of such a spectrum, in bins either side of 0.
     double bin(const float* powers) const {
         const int fine = p_.fine * p_.chips, top = argmax(powers, fine);
-        const double place = top + summit(powers[(top - 1 + fine) % fine], powers[top], powers[(top + 1) % fine]);
+        const double place = top + parabola_peak(powers[(top - 1 + fine) % fine], powers[top], powers[(top + 1) % fine]);
         return wrapped(place / p_.fine + p_.chips / 2.0, p_.chips) - p_.chips / 2.0;
     }
 

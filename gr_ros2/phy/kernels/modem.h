@@ -1,6 +1,6 @@
 // What a kernel is: a burst modem's search and reading (gr_ros2/phy/burst.py has the meaning of each).
 //
-// Laws: a modem never changes once it is made, so that any number of threads may use it; what a call works in belongs to
+// Invariants: a modem never changes once it is made, so that any number of threads may use it; what a call works in belongs to
 // its thread; samples outside of those given are never looked at, whatever the start.
 
 #pragma once

@@ -1,7 +1,7 @@
-"""A burst modem whose samples a compiled kernel searches and reads.
+"""A burst modem that uses a compiled kernel for search and demodulation.
 
-Laws: everything that is no work on samples is the numpy modem's, which stays the reference; a kernel knows nothing but
-the constants that modem tells; calls from several threads do not meet.
+Invariants: the numpy modem, which is the reference, does everything except the processing of samples; a kernel knows
+only the constants of that modem; calls from several threads do not share memory.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Constants, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.kernels.library import loaded
 
 _NONE = -(2**63)
@@ -63,7 +63,7 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         ),
     ),
 }
-"""Number of each kernel, and what it has to be told."""
+"""Number of each kernel, and the names of its parameters."""
 _NUMBERS = {"int32": ctypes.c_int32, "float64": ctypes.c_double}
 
 
@@ -80,10 +80,10 @@ class _Report(ctypes.Structure):
 
 
 class CompiledModem(BurstModem):
-    """The modem given, with the compiled kernel's search and reading.
+    """The given modem, with search and demodulation of the compiled kernel.
 
-    :param reference: whose constants tell of a kernel
-    :raises MemoryError: where there is not enough
+    :param reference: the numpy modem; its constants name the kernel
+    :raises MemoryError: when memory is short
     """
 
     def __init__(self, reference: BurstModem) -> None:
@@ -142,7 +142,7 @@ class CompiledModem(BurstModem):
         return Reading(report.length, soft[: report.soft], points[: report.points], report.snr, report.end)
 
 
-def _new(functions: Any, constants: Constants) -> int:
+def _new(functions: Any, constants: ModemConstants) -> int:
     """A kernel in the library's memory."""
     number, fields = KERNELS[constants.kernel]
     arrays = []
@@ -163,7 +163,7 @@ def _new(functions: Any, constants: Constants) -> int:
 
 
 def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]  # a third of the time that array.ctypes takes
+    address: int = array.__array_interface__["data"][0]  # three times as fast as array.ctypes
     return address
 
 

@@ -1,7 +1,7 @@
 """Which swept key goes where in the figures, and the summaries sorted into panels, curves and fields.
 
-Laws: summaries of different settings are never averaged: what is neither along an axis nor a curve has a panel of its
-own; an axis is numeric only where every value is a number.
+Invariants: summaries of different settings are never averaged: what is neither along an axis nor a curve has a panel of
+its own; an axis is numeric only where every value is a number.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 from gr_ros2.record.statistics import Estimate
-from gr_ros2.study.sweep.definition import Cell, Plan, label
-from gr_ros2.study.sweep.table import ALL, Summary
+from gr_ros2.study.sweep.definition import SweepCell, SweepPlan, label
+from gr_ros2.study.sweep.summaries import ALL, Summary
 
 NAMES = {
     "channel.snr_db": "SNR [dB]",
@@ -54,7 +54,7 @@ class Panel:
     curves: dict[str, list[tuple[Place, Estimate]]]
 
 
-def choose_axes(plan: Plan) -> Axes:
+def choose_axes(plan: SweepPlan) -> Axes:
     """The axes the sweep asks for, or those its keys suggest."""
     sweep = plan.sweep
     keys = [key for key in plan.keys if len(places(plan, key)) > 1] or list(plan.keys[:1])
@@ -67,7 +67,7 @@ def choose_axes(plan: Plan) -> Axes:
     return Axes(x, by, y)
 
 
-def curve_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[Panel]:
+def curve_panels(plan: SweepPlan, axes: Axes, found: Sequence[Summary]) -> list[Panel]:
     """One panel per combination of what is neither x nor by, one curve per combination of by."""
     rest = [key for key in plan.keys if key != axes.x and key not in axes.by]
     panels: dict[Hashable, Panel] = {}
@@ -83,7 +83,9 @@ def curve_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[Panel
     return list(panels.values())
 
 
-def heat_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[tuple[str, dict[tuple[Place, Place], float]]]:
+def heat_panels(
+    plan: SweepPlan, axes: Axes, found: Sequence[Summary]
+) -> list[tuple[str, dict[tuple[Place, Place], float]]]:
     """Per combination of what is neither x nor y its title, and (x, y) -> value."""
     assert axes.y is not None
     rest = [key for key in plan.keys if key not in (axes.x, axes.y)]
@@ -94,13 +96,13 @@ def heat_panels(plan: Plan, axes: Axes, found: Sequence[Summary]) -> list[tuple[
     return list(panels.items())
 
 
-def places(plan: Plan, key: str) -> list[Place]:
+def places(plan: SweepPlan, key: str) -> list[Place]:
     """Every value of a key, numbers in ascending order, others as they come."""
     found = list(dict.fromkeys(cell.values[key] for cell in plan.cells))
     return sorted(found) if all(_is_number(value) for value in found) else found
 
 
-def _numeric(plan: Plan, key: str) -> bool:
+def _numeric(plan: SweepPlan, key: str) -> bool:
     return all(_is_number(value) for value in places(plan, key))
 
 
@@ -108,14 +110,14 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _shown(plan: Plan, found: Sequence[Summary]) -> list[tuple[Summary, Estimate]]:
+def _shown(plan: SweepPlan, found: Sequence[Summary]) -> list[tuple[Summary, Estimate]]:
     """The summaries of the topic that is drawn, where its number exists."""
     topic = plan.sweep.topic or ALL
     pairs = [(summary, summary.numbers[plan.sweep.value]) for summary in found if summary.topic == topic]
     return [(summary, estimate) for summary, estimate in pairs if estimate is not None]
 
 
-def _title(plan: Plan, cell: Cell, keys: Sequence[str]) -> str:
+def _title(plan: SweepPlan, cell: SweepCell, keys: Sequence[str]) -> str:
     """What a cell has of some keys: texts as they are, other values with their key."""
     parts = []
     for key in keys:

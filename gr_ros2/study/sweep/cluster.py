@@ -1,7 +1,7 @@
 """Runs on Dask: worker processes of this machine, or an existing cluster.
 
-Laws: a run that ends in an error, or takes its process down with it, costs itself only; runs of a worker that is lost
-are given to another; Ctrl-C reaches this process and never the workers, who end because they are told to.
+Invariants: a run that ends in an error, or takes its process down with it, costs itself only; runs of a worker that is
+lost are given to another; Ctrl-C reaches this process and never the workers, who end because they are told to.
 """
 
 from __future__ import annotations

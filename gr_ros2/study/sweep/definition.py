@@ -1,6 +1,6 @@
 """A sweep as one YAML file, and the cells it asks for: which settings, how often, drawn over what.
 
-Laws: every cell is a scenario that :func:`gr_ros2.run.scenario.load_scenario` accepts with a PHY that can be
+Invariants: every cell is a scenario that :func:`gr_ros2.run.scenario.load_scenario` accepts with a PHY that can be
 built, and all are made before the first one runs; repetition n of every cell has the same seed, the scenario's plus n.
 """
 
@@ -116,7 +116,7 @@ class Sweep:
 
 
 @plain_dataclass(frozen=True)
-class Cell:
+class SweepCell:
     """One point of a sweep.
 
     :param number: from 1
@@ -138,7 +138,7 @@ class Cell:
 
 
 @plain_dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """A sweep whose cells are known to be runnable.
 
     :param name: of the file
@@ -146,7 +146,7 @@ class Plan:
 
     name: str
     sweep: Sweep
-    cells: Sequence[Cell]
+    cells: Sequence[SweepCell]
 
     @property
     def keys(self) -> Sequence[str]:
@@ -159,7 +159,7 @@ class Plan:
         return any(scenario.time == "real" for cell in self.cells for scenario in cell.runs)
 
 
-def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Plan:
+def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> SweepPlan:
     """Read a built-in sweep or a YAML file and make all its cells.
 
     :param overrides: `key=value` for all cells, over the file's own ``set``
@@ -167,7 +167,7 @@ def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Plan:
     """
     path, where = _path(name_or_path), str(name_or_path)
     sweep = read_sweep(name_or_path)
-    return Plan(path.stem, sweep, _cells(sweep, path.parent, overrides, where))
+    return SweepPlan(path.stem, sweep, _cells(sweep, path.parent, overrides, where))
 
 
 def read_sweep(name_or_path: str | Path) -> Sweep:
@@ -199,7 +199,7 @@ def label(point: Overrides) -> str:
     return ", ".join(f"{key}={value if isinstance(value, str) else _json(value)}" for key, value in point.items())
 
 
-def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> Sequence[Cell]:
+def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> Sequence[SweepCell]:
     builtin = (SCENARIO_DIR / f"{sweep.scenario}.yaml").is_file()
     name = sweep.scenario if builtin else folder / Path(sweep.scenario).expanduser()
     try:
@@ -208,7 +208,7 @@ def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> 
         raise ConfigError(f"{where}: {error}") from error
     fixed = [f"time={sweep.time}", *_texts(sweep.set, folder), *overrides]
     points = sweep.points
-    cells: list[Cell] = []
+    cells: list[SweepCell] = []
     phys: dict[str, Phy] = {}
     for number, point in enumerate(points, start=1):
         try:
@@ -224,7 +224,7 @@ def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> 
         except ConfigError as error:
             raise ConfigError(f"{where}: cell {number} of {len(points)} ({label(point)}): {error}") from error
         config = dump(first)
-        cells.append(Cell(number, point, {key: _plain(_at(config, key)) for key in sweep.keys}, runs))
+        cells.append(SweepCell(number, point, {key: _plain(_at(config, key)) for key in sweep.keys}, runs))
     return cells
 
 

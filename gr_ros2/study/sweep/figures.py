@@ -1,6 +1,6 @@
 """The pictures of a sweep: curves with intervals, and a heat map. Returned, never written.
 
-Law: as in :mod:`gr_ros2.report.figures`, nothing of matplotlib's global state is changed.
+Invariant: as in :mod:`gr_ros2.report.figures`, nothing of matplotlib's global state is changed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from gr_ros2.report.figures import COLOURS
 from gr_ros2.study.sweep.axes import NAMES, Panel, Place, choose_axes, curve_panels, heat_panels, places
-from gr_ros2.study.sweep.definition import PDR, VALUES, Plan
-from gr_ros2.study.sweep.table import Summary
+from gr_ros2.study.sweep.definition import PDR, VALUES, SweepPlan
+from gr_ros2.study.sweep.summaries import Summary
 
 MOST_PANELS = 12
 """Panels in one figure; further ones are left to the table, and the report says so."""
@@ -26,7 +26,7 @@ _WRITTEN_OUT = 200
 """Fields of a heat map up to which each has its number in it."""
 
 
-def curves_figure(plan: Plan, found: Sequence[Summary]) -> tuple[Figure, int]:
+def curves_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int]:
     """The value against x, a curve per ``by``, with 95 % intervals; and how many panels were left out."""
     axes = choose_axes(plan)
     panels = curve_panels(plan, axes, found)
@@ -46,7 +46,7 @@ def curves_figure(plan: Plan, found: Sequence[Summary]) -> tuple[Figure, int]:
     return figure, max(len(panels) - MOST_PANELS, 0)
 
 
-def heat_figure(plan: Plan, found: Sequence[Summary]) -> tuple[Figure, int] | None:
+def heat_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int] | None:
     """The value over x and y, and how many panels were left out; None where the sweep has no second axis."""
     axes = choose_axes(plan)
     if axes.y is None:
@@ -103,12 +103,12 @@ def _write_out(field: Any, table: Any, middle: float) -> None:
             field.text(column, row, f"{value:.2g}", ha="center", va="center", fontsize=7, color=colour)
 
 
-def _name(field: Any, plan: Plan, x: str, title: str) -> None:
+def _name(field: Any, plan: SweepPlan, x: str, title: str) -> None:
     field.set_title(title or plan.sweep.description or plan.name, fontsize="medium")
     field.set_xlabel(NAMES.get(x, x))
 
 
-def _value_name(plan: Plan) -> str:
+def _value_name(plan: SweepPlan) -> str:
     topic = plan.sweep.topic
     return VALUES[plan.sweep.value] + (f" of {topic}" if topic else "")
 

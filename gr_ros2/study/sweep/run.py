@@ -1,7 +1,7 @@
 """Runs a sweep: what is missing in its folder, on workers, each run kept as it ends.
 
-Laws: whatever ends a sweep early, all runs that ended before are kept, and the next call does the others only; the
-tables, figures and page are written of what there is.
+Invariants: whatever ends a sweep early, all runs that ended before are kept, and the next call does the others only;
+the tables, figures and page are written of what there is.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pathlib import Path
 from gr_ros2.errors import ConfigError
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.study.sweep.cluster import Failed, local_workers, remote_workers, run_all
-from gr_ros2.study.sweep.definition import Plan
-from gr_ros2.study.sweep.page import write_sweep
+from gr_ros2.study.sweep.definition import SweepPlan
 from gr_ros2.study.sweep.store import Store, run_key
-from gr_ros2.study.sweep.table import Results
+from gr_ros2.study.sweep.summaries import Results
+from gr_ros2.study.sweep.sweep_page import write_sweep
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SweepOutcome:
 
 
 def run_sweep(
-    plan: Plan,
+    plan: SweepPlan,
     out: Path,
     *,
     scheduler: str | None = None,
@@ -112,7 +112,7 @@ def run_sweep(
     return SweepOutcome(results, tuple(failures), tuple(files), interrupted)
 
 
-def _workers(plan: Plan, scheduler: str | None, workers: int | None) -> int:
+def _workers(plan: SweepPlan, scheduler: str | None, workers: int | None) -> int:
     if scheduler is not None and workers is not None:
         raise ConfigError(f"workers = {workers}: the cluster at {scheduler} has its own; leave it out")
     if plan.real_time:

@@ -1,6 +1,6 @@
 """The finished runs of a sweep in its folder, one file each, so that none is run twice.
 
-Laws: a file is called after everything that decides what the run gives (every setting, the bytes of registry and
+Invariants: a file is called after everything that decides what the run gives (every setting, the bytes of registry and
 dictionaries, size and time of the recording, the version of gr-ros2), so that another run never has its name; it
 appears whole or not at all.
 """

@@ -139,7 +139,7 @@ def test_nothing_is_reserved_for_a_message_that_is_announced(per_topic: int) -> 
             for topic in range(240):
                 number += 1
                 part = Part(topic, bytes(body_len), 200 + begin, MAX_MESSAGE - body_len, True)
-                inbox.source(number, write_body([part], body_room(64)), 0, 1.0)
+                inbox.source(number, write_body([part], body_room(64)), [part], 0, 1.0)
         held, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -14,7 +14,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
 
-from gr_ros2.phy.burst import BurstModem, Constants, Samples
+from gr_ros2.phy.burst import BurstModem, ModemConstants, Samples
 from gr_ros2.phy.kernels.modem import KERNELS
 from tests.once import once
 from tests.phy.kernels.support import IDS, SETTINGS, make
@@ -48,7 +48,7 @@ def build(folder: Path) -> None:
     subprocess.run([COMPILER, *flags(), "-static", *map(str, sources), "-o", str(folder / "replay")], check=True)
 
 
-def written(path: Path, constants: Constants, samples: Samples) -> None:
+def written(path: Path, constants: ModemConstants, samples: Samples) -> None:
     """The file that ``replay.cpp`` reads."""
     kind, fields = KERNELS[constants.kernel]
     numbers, arrays = b"", []

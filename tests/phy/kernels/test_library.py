@@ -83,7 +83,7 @@ def test_without_a_library_numpy_runs_and_says_why(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(kernels, "loaded", lambda: found)
     phy: Any = PHY.load("psk")(64, 1e6)
     assert phy.running_modem is phy.modem
-    assert phy.runs_on().startswith("numpy, for want of kernels: they were not built; install a C++ compiler")
+    assert phy.runs_on().startswith("numpy, no compiled kernels: they were not built; install a C++ compiler")
 
 
 def test_a_library_of_another_machine_is_no_error(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_without_a_compiler_the_package_is_built_without_kernels(tmp_path: Path)
     said = subprocess.run(
         [sys.executable, "-c", asked], cwd=tmp_path / "lib", capture_output=True, text=True, check=True
     )
-    assert said.stdout.startswith("numpy, for want of kernels")
+    assert said.stdout.startswith("numpy, no compiled kernels")
 
 
 def test_a_source_distribution_has_all_sources(tmp_path: Path) -> None:

@@ -1,0 +1,241 @@
+"""How `gr-ros2 dashboard` finds programs of this user that run now, and asks one of them to show itself.
+
+Each program that can be looked at listens on a Unix socket named after its process in a folder only its user may enter;
+a client sends one line of JSON and gets one line back. Invariants: no other user can connect; a program that is killed
+leaves a socket that answers no more and is cleared away by the next client; a request never delays the program;
+whatever a client sends, or does not send, the next one is answered; nobody waits for anybody longer than a deadline,
+and nobody keeps more than a line of anybody else's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from gr_ros2.errors import GrRos2Error, RunError
+
+_LINE = 4096
+_MAX_CLIENTS = 32
+"""Connected at a time; when one more comes, the one that has said nothing for longest is sent away."""
+_SPEAK_S = 2.0
+"""s a client gets to say what it wants."""
+_PAUSE_S = 0.1
+_WAIT_S = 10.0
+"""s a client waits for the answer: a dashboard is drawn first."""
+
+Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
+def folder() -> Path:
+    """Where this user's sockets are; made if missing.
+
+    :raises RunError: when somebody else owns it
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    base = Path(runtime) if runtime and Path(runtime).is_dir() else Path(tempfile.gettempdir())
+    path = base / f"gr-ros2-{os.getuid()}"
+    path.mkdir(mode=0o700, exist_ok=True)
+    if path.stat().st_uid != os.getuid():
+        raise RunError(f"{path}: belongs to somebody else; set XDG_RUNTIME_DIR to a folder of your own")
+    return path
+
+
+class ControlSocket:
+    """Answers clients while it is open.
+
+    :param name: what this program is doing, for clients that find several
+    :param answer: called in a thread of its own with what a client asks; a GrRos2Error becomes the client's
+    """
+
+    def __init__(self, name: str, answer: Answer) -> None:
+        self._name = name
+        self._answer = answer
+        self._path = folder() / f"{os.getpid()}.sock"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._selector = selectors.DefaultSelector()
+        self._clients: dict[socket.socket, _Client] = {}
+        self._closed = False
+        self._thread = threading.Thread(target=self._serve, name="gr-ros2-control", daemon=True)
+
+    def __enter__(self) -> ControlSocket:
+        self._path.unlink(missing_ok=True)
+        self._socket.bind(str(self._path))
+        self._socket.listen()
+        self._socket.setblocking(False)
+        self._selector.register(self._socket, selectors.EVENT_READ)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._path.unlink(missing_ok=True)
+        self._closed = True
+        # Closing alone does not wake a thread that waits for the socket.
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._selector.close()
+        self._socket.close()
+
+    def _serve(self) -> None:
+        try:
+            while self._turn():
+                pass
+        finally:
+            for client in list(self._clients):
+                self._leave(client)
+
+    def _turn(self) -> bool:
+        """Wait for what comes next and see to it; false when the socket is closed."""
+        first = min((client.deadline for client in self._clients.values()), default=None)
+        wait = None if first is None else max(0.0, first - time.monotonic())
+        for key, _ in self._selector.select(wait):
+            if isinstance(key.data, _Client):
+                self._hear(key.data)
+            elif not self._let_in():
+                return False
+        now = time.monotonic()
+        for client in [client for client in self._clients.values() if client.deadline <= now]:
+            self._leave(client.socket)
+        return True
+
+    def _let_in(self) -> bool:
+        try:
+            came, _ = self._socket.accept()
+        except OSError as error:
+            if self._closed:
+                return False
+            if not isinstance(error, BlockingIOError):  # no file descriptor is left: whoever waits has to wait
+                time.sleep(_PAUSE_S)
+            return True
+        came.setblocking(False)
+        if len(self._clients) >= _MAX_CLIENTS:
+            self._leave(next(iter(self._clients)))
+        client = self._clients[came] = _Client(came, time.monotonic() + _SPEAK_S)
+        self._selector.register(came, selectors.EVENT_READ, client)
+        return True
+
+    def _leave(self, client: socket.socket) -> None:
+        if self._clients.pop(client, None) is not None:
+            self._selector.unregister(client)
+            client.close()
+
+    def _hear(self, client: _Client) -> None:
+        try:
+            more = client.socket.recv(_LINE - len(client.line))
+        except BlockingIOError:
+            return
+        except OSError:
+            more = b""
+        client.line += more
+        if more and b"\n" not in more and len(client.line) < _LINE:
+            return
+        if client.line:
+            with suppress(OSError):  # it left, or does not read what fits into its socket's buffer
+                client.socket.sendall(json.dumps(self._say(client.line)).encode() + b"\n")
+        self._leave(client.socket)
+
+    def _say(self, line: bytes) -> Mapping[str, Any]:
+        try:
+            asked = parse(line)
+            return {"name": self._name, **(self._answer(asked) if asked else {})}
+        except GrRos2Error as error:
+            return {"error": str(error)}
+        except (ValueError, LookupError, TypeError, ArithmeticError):
+            return {"error": "not understood"}
+        except Exception as error:  # noqa: BLE001 - whatever one client brings about, the next one is answered
+            return {"error": f"{type(error).__name__}: {error}"}
+
+
+class _Client:
+    """A connected client.
+
+    :param deadline: when its line has to be complete, s, monotonic
+    """
+
+    __slots__ = ("deadline", "line", "socket")
+
+    def __init__(self, connection: socket.socket, deadline: float) -> None:
+        self.socket, self.deadline = connection, deadline
+        self.line = b""
+
+
+def running_programs() -> dict[int, str]:
+    """What this user's programs are doing, by process id."""
+    found = {}
+    for path in sorted(folder().glob("*.sock")):
+        try:
+            found[int(path.stem)] = str(_ask(path, {}).get("name", "?"))
+        except (ConnectionRefusedError, FileNotFoundError):
+            path.unlink(missing_ok=True)
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def request(pid: int, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Ask a program.
+
+    :raises RunError: when it is gone, does not answer, or refuses
+    """
+    try:
+        said = _ask(folder() / f"{pid}.sock", asked)
+    except (OSError, ValueError) as error:
+        raise RunError(f"process {pid}: does not answer ({error}); has it ended?") from error
+    if "error" in said:
+        raise RunError(f"process {pid}: {said['error']}")
+    return said
+
+
+def parse(line: bytes) -> Mapping[str, Any]:
+    """One line of JSON that is an object.
+
+    :raises ValueError: for anything else
+    """
+    try:
+        found = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if not isinstance(found, Mapping):
+        raise ValueError("not a JSON object")
+    return found
+
+
+def receive(connection: socket.socket, most: int, deadline: float, end: bytes = b"") -> bytes:
+    """What comes until the other side closes, ``end`` is there, or it is enough.
+
+    :param most: bytes
+    :param deadline: s, monotonic
+    :raises TimeoutError: when the time is over
+    """
+    data = b""
+    while len(data) < most and not (end and end in data):
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("timed out")
+        connection.settimeout(left)
+        more = connection.recv(most - len(data))
+        if not more:
+            break
+        data += more
+    return data
+
+
+def _ask(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    deadline = time.monotonic() + _WAIT_S
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(_WAIT_S)
+        client.connect(str(path))
+        client.sendall(json.dumps(asked).encode() + b"\n")
+        return parse(receive(client, _LINE, deadline, b"\n"))

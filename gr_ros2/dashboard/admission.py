@@ -1,0 +1,255 @@
+"""Who may come in: the limits of the dashboard's web server, and what is said to those for whom there is no room.
+
+Invariants: at most MAX_VIEWERS pages at a time, and one more is told so by a page that tries again; pages are made and
+drawn for the first time one after another, which in the long run takes at most a quarter of a core; connections are
+bounded, and those that say nothing are closed; whatever comes in on a WebSocket, the worst that follows is that it is
+closed; a WebSocket belongs to a page that was served here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from bokeh.document import Document
+from bokeh.protocol.exceptions import ProtocolError
+from bokeh.server.connection import ServerConnection
+from bokeh.server.contexts import ApplicationContext
+from bokeh.server.session import ServerSession
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.views.doc_handler import DocHandler
+from bokeh.server.views.ws import WSHandler
+from jinja2 import Environment, FileSystemLoader
+from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
+from tornado.web import ErrorHandler
+
+MAX_VIEWERS = 8
+"""Pages at a time. Each takes about 2 % of a core and 2 MB."""
+_RETRY_S = 10
+"""s after which the page that says that there is no room tries again."""
+SHARE, BURST_S = 0.25, 4.0
+"""Of a core, for making pages and drawing them for the first time; and s whose share may be used at once."""
+_MAX_SOCKETS = 2 * MAX_VIEWERS
+"""WebSockets at a time; a page that is loaded anew has two for a moment."""
+_MAX_CONNECTIONS = 256
+"""Connections that are no WebSocket, at a time; a browser opens up to six."""
+_SILENT_S = 15
+"""s a connection may take for a request, or for an answer to a ping."""
+_MAX_BODY, _MAX_HEADER = 1 << 12, 1 << 14
+_MAX_FRAME = 65_536
+"""Bytes of a WebSocket message; a viewer sends positions of sliders."""
+_TRY_AGAIN_LATER, _NOT_UNDERSTOOD = 1013, 1002
+"""Status codes of a WebSocket that is closed (RFC 6455, section 7.4, and IANA's registry)."""
+_UNDERSTOOD = ("PULL-DOC-REQ", "PATCH-DOC")
+_CHANGES = ("ModelChanged", "MessageSent")
+_log = logging.getLogger(__name__)
+_TEMPLATES = Path(__file__).parent / "templates"
+
+SETTINGS: dict[str, Any] = {
+    "sign_sessions": True,
+    "include_headers": [],
+    "include_cookies": [],  # other programs' cookies on this host would make the token too long for a header
+    "keep_alive_milliseconds": 0,  # its pings expect no answer; these do:
+    "websocket_ping_interval": _SILENT_S,
+    "websocket_ping_timeout": _SILENT_S,
+    "websocket_max_message_size_bytes": _MAX_FRAME,
+    "log_function": lambda _handler: None,
+}
+"""Of the Bokeh application."""
+
+
+class Admission:
+    """Counts those who are in."""
+
+    def __init__(self) -> None:
+        self.documents: set[Document] = set()
+        self.waiting = 0
+        self.sockets: set[PageSocket] = set()
+        self.budget = ProcessorBudget()
+        self._busy = asyncio.Lock()
+
+    @property
+    def full(self) -> bool:
+        """Whether one more page would be one too many."""
+        return len(self.documents) + self.waiting >= MAX_VIEWERS
+
+    def enter(self, document: Document) -> bool:
+        """Whether there was room. Its place is free again when the session ends."""
+        if len(self.documents) >= MAX_VIEWERS:
+            return False
+        self.documents.add(document)
+        document.on_session_destroyed(lambda _context: self.documents.discard(document))
+        return True
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """For what takes long: one after another, and no more than the budget allows."""
+        async with self._busy:
+            await asyncio.sleep(self.budget.wait_s(time.monotonic()))
+            begin = time.thread_time()
+            try:
+                yield
+            finally:
+                self.budget.spend(time.thread_time() - begin, time.monotonic())
+
+
+class ProcessorBudget:
+    """Processor time that may be spent: a share of each second, of the last BURST_S seconds together."""
+
+    def __init__(self) -> None:
+        self._paid_until = -math.inf
+
+    def wait_s(self, now: float) -> float:
+        """s until something may be spent again."""
+        return max(0.0, self._paid_until - now)
+
+    def spend(self, processor_s: float, now: float) -> None:
+        """So much has been spent."""
+        self._paid_until = max(self._paid_until, now - BURST_S) + processor_s / SHARE
+
+
+def keep(pages: BokehTornado, admission: Admission) -> None:
+    """Put these bounds in front of an application."""
+    inside = {"application_context": pages.applications["/"], "bokeh_websocket_path": "/ws"}
+    pages.add_handlers(
+        ".*",
+        [
+            (r"/?", PageHandler, {**inside, "admission": admission}),
+            (r"/ws", PageSocket, {**inside, "admission": admission}),
+            (r"/(?:metadata|autoload\.js)", ErrorHandler, {"status_code": 404}),  # they would make pages too
+        ],
+    )
+
+
+class BoundedServer(HTTPServer):  # type: ignore[misc]
+    """An HTTP server with bounds on connections, on what they send and on how long they take."""
+
+    def initialize(self, *arguments: Any, **options: Any) -> None:
+        self._here = 0
+        bounds = {"max_body_size": _MAX_BODY, "max_header_size": _MAX_HEADER}
+        super().initialize(*arguments, idle_connection_timeout=_SILENT_S, body_timeout=_SILENT_S, **bounds, **options)
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        if self._here >= _MAX_CONNECTIONS:
+            stream.close()
+            return
+        self._here += 1
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: object) -> None:
+        self._here -= 1
+        super().on_close(server_conn)
+
+
+class PageHandler(DocHandler):  # type: ignore[misc]
+    """The page, or the page that says that there is no room."""
+
+    def initialize(
+        self, application_context: ApplicationContext, bokeh_websocket_path: str, admission: Admission
+    ) -> None:
+        del application_context, bokeh_websocket_path  # taken by the constructor
+        self._admission = admission
+
+    async def get(self, *arguments: Any, **named: Any) -> None:
+        admission = self._admission
+        if admission.full:
+            self._refuse()
+            return
+        # Whoever asks gets a page of its own: sessions are not chosen by those who come.
+        self.request.arguments.clear()
+        self.request.headers.pop("Bokeh-Session-Id", None)
+        admission.waiting += 1
+        try:
+            async with admission.turn():
+                await super().get(*arguments, **named)
+        finally:
+            admission.waiting -= 1
+
+    def _refuse(self) -> None:
+        page = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True).get_template("full.html.j2")
+        self.set_status(503)
+        self.set_header("Retry-After", str(_RETRY_S))
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("Connection", "close")
+        self.finish(page.render(viewers=MAX_VIEWERS, seconds=_RETRY_S))
+
+
+class PageSocket(WSHandler):  # type: ignore[misc]
+    """The connection between a page and its document."""
+
+    connection: ServerConnection | None
+
+    def initialize(
+        self, application_context: ApplicationContext, bokeh_websocket_path: str, admission: Admission
+    ) -> None:
+        del application_context, bokeh_websocket_path  # taken by the constructor
+        self._admission = admission
+        self._open = True
+
+    def open(self) -> None:
+        if len(self._admission.sockets) >= _MAX_SOCKETS:
+            self.close(_TRY_AGAIN_LATER, "too many viewers")
+            return
+        self._admission.sockets.add(self)
+        try:
+            super().open()
+        except Exception:  # noqa: BLE001 - a token that is none, or none of ours, fails in many ways
+            self.close(_NOT_UNDERSTOOD)
+
+    async def _async_open(self, token: str) -> None:
+        try:
+            await super()._async_open(token)
+        except Exception:  # noqa: BLE001 - as above
+            self.close(_NOT_UNDERSTOOD)
+        if not self._open:  # it left meanwhile, and nobody would tell its session
+            self._leave()
+
+    async def on_message(self, fragment: str | bytes) -> None:
+        """Take a part of a message; what is no message of a viewer's page closes the connection."""
+        if self.connection is None:
+            self.close(_NOT_UNDERSTOOD)
+            return
+        try:
+            message = await self.receiver.consume(fragment)
+            if message is None:
+                return
+            if not _is_viewers(message):
+                raise ProtocolError(f"no viewer's page sends {message.msgtype}")
+            if message.msgtype == "PULL-DOC-REQ":
+                async with self._admission.turn():
+                    answer = await ServerSession.pull(message, self.connection)
+            else:
+                answer = await ServerSession.patch(message, self.connection)
+            await self.send_message(answer)
+        except Exception as error:  # noqa: BLE001 - parsers fail in many ways on what is not meant for them
+            _log.info("a viewer's connection is closed, since it sent what is not understood: %r", error)
+            self.close(_NOT_UNDERSTOOD)
+
+    def on_pong(self, data: bytes) -> None:
+        """It is still there; that is all that is asked."""
+
+    def on_close(self) -> None:
+        self._open = False
+        self._admission.sockets.discard(self)
+        self._leave()
+
+    def _leave(self) -> None:
+        """Give the session back. Once: a connection that has none cannot be asked for it."""
+        if self.connection is not None:
+            super().on_close()
+            self.connection = None
+
+
+def _is_viewers(message: Any) -> bool:
+    """Whether a message is one that the page of a viewer sends: it changes models, and neither adds nor removes any."""
+    if message.msgtype not in _UNDERSTOOD:
+        return False
+    events = message.content.get("events", []) if message.msgtype == "PATCH-DOC" else []
+    return all(event["kind"] in _CHANGES for event in events)

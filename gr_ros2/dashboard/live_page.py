@@ -1,0 +1,306 @@
+"""The page one viewer sees: Bokeh models, made once and given new data with every snapshot.
+
+Invariants: it only draws, and hands the viewer's settings to the monitor; data is replaced and never appended, so a
+page is as large after an hour as after a minute; a viewer who cannot keep up gets fewer pictures, not a queue of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bokeh.core.properties import Int
+from bokeh.document import Document
+from bokeh.events import ConnectionLost, DocumentReady
+from bokeh.layouts import column
+from bokeh.model import DataModel
+from bokeh.models import (
+    Checkbox,
+    ColumnDataSource,
+    CustomJS,
+    Div,
+    HoverTool,
+    InlineStyleSheet,
+    LogTicker,
+    Range1d,
+    Slider,
+)
+from bokeh.plotting import figure
+from jinja2 import Environment, FileSystemLoader
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.dashboard.monitor import RadioView, RunMonitor
+from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_html, topics_html
+from gr_ros2.dashboard.views import Snapshot
+
+AHEAD = 3
+"""Pictures a viewer may be behind before it is left out."""
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_SENT, _RECEIVED = "#1f5fbf", "#d62728"
+_DEFAULT_SNR_DB = 20.0
+
+
+class PictureCounter(DataModel):  # type: ignore[misc]
+    """Counts pictures at both ends, so that the server knows how far behind a viewer is."""
+
+    drawn = Int(0)
+    seen = Int(0)
+
+
+class LivePage:
+    """The models of one document.
+
+    :param instance: names the server, so that the browser notices when another one answers
+    """
+
+    def __init__(self, document: Document, monitor: RunMonitor, instance: str) -> None:
+        self.document = document
+        self._monitor = monitor
+        self._counter = PictureCounter(name="pulse")
+        self._counter.js_on_change("drawn", CustomJS(args={"pulse": self._counter}, code="pulse.seen = pulse.drawn"))
+        style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
+        self._html = {
+            name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
+            for name in ("tiles", "topics", "paths", "packets", "note")
+        }
+        self._sources = {
+            name: ColumnDataSource({key: [] for key in columns.split()})
+            for name, columns in {
+                "series": "name colour t pdr goodput age queued",
+                "sent": "name x y",
+                "received": "name x y",
+                "gap": "x y",
+                "ends": "x y colour",
+                "error": "name colour t m",
+                "latency": "name colour ms share",
+                "constellation": "re im",
+                "spectrum": "khz db",
+            }.items()
+        }
+        self._html["tiles"].tags = [self._counter]  # it has no place on the page, but must be in the document
+        self._shown: ChannelConfig | None = None
+        self._following = False
+        self._ready = False
+        self._noise = Checkbox(label="noise", name="noise")
+        self._snr = _slider("snr", "SNR in the sampled band [dB]", (-5, 40), _DEFAULT_SNR_DB)
+        self._offset = _slider("offset", "carrier offset [1/1000 of the sample rate]", (-20, 20), 0)
+        self._loss = _slider("loss", "packets lost [%]", (0, 100), 0)
+        self._listen()
+        self._build(instance)
+        self.draw(monitor.snapshot, monitor.radio)
+        document.on_event(DocumentReady, lambda _event: self.ready())
+
+    @property
+    def behind(self) -> int:
+        """Pictures sent that the browser has not drawn."""
+        return int(self._counter.drawn - self._counter.seen) if self._ready else 0
+
+    def ready(self) -> None:
+        """The browser has the page."""
+        self._counter.seen = self._counter.drawn
+        self._ready = True
+        self.draw(self._monitor.snapshot, self._monitor.radio)
+
+    def offer(self, snapshot: Snapshot, radio: RadioView, always: bool = False) -> None:
+        """Draw it when the document is free; not at all before there is a viewer, or where it is too far behind."""
+        if self._ready and (always or self.behind < AHEAD):
+            self.document.add_next_tick_callback(partial(self.draw, snapshot, radio))
+
+    def draw(self, snapshot: Snapshot, radio: RadioView) -> None:
+        """Show this. With the document's lock held."""
+        self._html["tiles"].text = tiles_html(snapshot, radio.backlog, radio.snr_db)
+        self._html["topics"].text = topics_html(snapshot)
+        self._html["paths"].text = paths_html(snapshot)
+        self._html["packets"].text = packets_html(snapshot)
+        self._draw_series(snapshot)
+        self._draw_paths(snapshot)
+        self._draw_radio(radio)
+        self._show_channel(radio)
+        self._counter.drawn += 1
+
+    def _draw_series(self, snapshot: Snapshot) -> None:
+        series = snapshot.series
+        self._sources["series"].data = {
+            "name": [line.name for line in series],
+            "colour": [colour(line.colour) for line in series],
+            "t": [_small(line.t) for line in series],
+            "pdr": [_small(line.pdr) for line in series],
+            "goodput": [_small(line.goodput_Bps / 1000) for line in series],
+            "age": [_small(line.age_s) for line in series],
+            "queued": [_small(line.queued) for line in series],
+        }
+        curves = [topic for topic in snapshot.topics if topic.latency_cdf_s]
+        self._sources["latency"].data = {
+            "name": [topic.name for topic in curves],
+            "colour": [colour(topic.colour) for topic in curves],
+            "ms": [_small(np.array(topic.latency_cdf_s) * 1000) for topic in curves],
+            "share": [_small(np.linspace(0, 1, len(topic.latency_cdf_s))) for topic in curves],
+        }
+
+    def _draw_paths(self, snapshot: Snapshot) -> None:
+        paths = snapshot.paths
+        names = [path.name for path in paths]
+        self._sources["sent"].data = {
+            "name": names,
+            "x": [_small(path.sent_x) for path in paths],
+            "y": [_small(path.sent_y) for path in paths],
+        }
+        self._sources["received"].data = {
+            "name": names,
+            "x": [_small(path.received_x) for path in paths],
+            "y": [_small(path.received_y) for path in paths],
+        }
+        pairs = [(path.truth, path.belief) for path in paths if path.truth is not None and path.belief is not None]
+        self._sources["gap"].data = {
+            "x": [[one[0], other[0]] for one, other in pairs],
+            "y": [[one[1], other[1]] for one, other in pairs],
+        }
+        ends = [(path.truth, _SENT) for path in paths] + [(path.belief, _RECEIVED) for path in paths]
+        known = [(*point, ink) for point, ink in ends if point is not None]
+        self._sources["ends"].data = {
+            "x": [end[0] for end in known],
+            "y": [end[1] for end in known],
+            "colour": [end[2] for end in known],
+        }
+        self._sources["error"].data = {
+            "name": names,
+            "colour": [colour(path.colour) for path in paths],
+            "t": [_small(path.error_t) for path in paths],
+            "m": [_small(path.errors_m) for path in paths],
+        }
+
+    def _draw_radio(self, radio: RadioView) -> None:
+        symbols = np.empty(0, np.complex64) if radio.symbols is None else radio.symbols
+        self._sources["constellation"].data = {"re": _small(symbols.real), "im": _small(symbols.imag)}
+        if radio.frequencies is not None and radio.spectrum_db is not None:
+            self._sources["spectrum"].data = {
+                "khz": _small(radio.frequencies / 1000),
+                "db": _small(radio.spectrum_db),
+            }
+
+    # -- the channel --------------------------------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        """Hand on what the viewer sets."""
+        monitor = self._monitor
+
+        def listen(widget: Any, attribute: str, change: Callable[[float], None]) -> None:
+            def changed(_attribute: str, _old: Any, value: float) -> None:
+                if not self._following:
+                    change(value)
+                    self._shown = monitor.channel
+
+            widget.on_change(attribute, changed)
+
+        listen(self._noise, "active", lambda active: monitor.set_snr_db(float(self._snr.value) if active else None))
+        listen(self._snr, "value", lambda value: monitor.set_snr_db(float(value)))
+        listen(self._offset, "value", lambda value: monitor.set_frequency_offset(value / 1000))
+        listen(self._loss, "value", lambda value: monitor.set_packet_loss(value / 100))
+
+    def _show_channel(self, radio: RadioView) -> None:
+        """Follow what others set, and leave the widgets to whoever drags them."""
+        channel = self._monitor.channel
+        if channel is not None and channel != self._shown:
+            self._shown = channel
+            self._following = True
+            self._noise.active = channel.snr_db is not None
+            if channel.snr_db is not None:
+                self._snr.value = channel.snr_db
+            self._offset.value = channel.frequency_offset * 1000
+            self._loss.value = channel.packet_loss * 100
+            self._following = False
+        for widget in (self._noise, self._snr, self._offset):
+            widget.disabled = not radio.has_samples
+        text = self._monitor.refused
+        if not text and channel is not None and not radio.has_samples:
+            text = "This PHY has no samples: only packets can be lost."
+        self._html["note"].text = f'<div class="note {"bad" if self._monitor.refused else ""}">{escape(text)}</div>'
+
+    # -- making -------------------------------------------------------------------------------------------------
+
+    def _build(self, instance: str) -> None:
+        sources = self._sources
+        map_ = _plot("map", "name", match_aspect=True)
+        map_.multi_line("x", "y", source=sources["sent"], color=_SENT, line_width=6, alpha=0.4)
+        map_.multi_line("x", "y", source=sources["received"], color=_RECEIVED, line_width=1.5)
+        map_.multi_line("x", "y", source=sources["gap"], color="#1d2733", line_width=1.5, line_dash="dotted")
+        map_.scatter("x", "y", source=sources["ends"], color="colour", line_color="white", size=12)
+        error = _plot("error", "name")
+        error.multi_line("t", "m", source=sources["error"], color="colour", line_width=1.5)
+        error.y_range.start = 0
+        constellation = _plot("constellation", "", x_range=Range1d(-2.6, 2.6), y_range=Range1d(-1.9, 1.9))
+        constellation.scatter("re", "im", source=sources["constellation"], size=2.5, color=_SENT, alpha=0.35)
+        spectrum = _plot("spectrum", "", y_range=Range1d(-50, 3))
+        spectrum.varea("khz", -200, "db", source=sources["spectrum"], color=_SENT, alpha=0.15)
+        spectrum.line("khz", "db", source=sources["spectrum"], color=_SENT, line_width=1.2)
+        latency = _plot("latency", "name", x_axis_type="log", y_range=Range1d(0, 1.03))
+        latency.xaxis.ticker = LogTicker(desired_num_ticks=4, num_minor_ticks=0)
+        latency.multi_line("ms", "share", source=sources["latency"], color="colour", line_width=2)
+        plots = [map_, error, constellation, spectrum, latency]
+        series: tuple[tuple[str, str, dict[str, Any]], ...] = (
+            ("pdr", "pdr", {"y_range": Range1d(0, 1.1)}),
+            ("goodput", "goodput", {}),
+            ("age", "age", {"y_axis_type": "log"}),  # a map sent once is older than all else by magnitudes
+            ("queue", "queued", {}),
+        )
+        for name, values, options in series:
+            plot = _plot(name, "name", **options)
+            plot.multi_line("t", values, source=sources["series"], color="colour", line_width=1.8)
+            if not options:
+                plot.y_range.start = 0
+            plots.append(plot)
+        channel = column(
+            *(self._noise, self._snr, self._offset, self._loss, self._html["note"]),
+            name="channel",
+            sizing_mode="stretch_width",
+            spacing=12,
+        )
+        document = self.document
+        document.title = "gr-ros2 · live"
+        texts = [self._html[name] for name in ("tiles", "topics", "paths", "packets")]
+        with document.models.freeze():  # otherwise every root makes it walk through all models again
+            for root in (*plots, channel, *texts):
+                document.add_root(root)
+        document.template = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=False).get_template(
+            "page.html.j2"
+        )
+        document.template_variables["instance"] = instance
+        document.js_on_event(ConnectionLost, CustomJS(code="window.viewerLost = true"))
+
+
+def _small(values: Any) -> Any:
+    """As single-precision floats, which is more than a screen shows. Nothing is a NaN, which draws nothing: Bokeh
+    compares what is new with what was, and numpy has no truth for an empty array."""
+    return np.asarray(values if len(values) else [np.nan], dtype=np.float32)
+
+
+def _slider(name: str, title: str, ends: tuple[float, float], value: float) -> Slider:
+    start, end = ends
+    return Slider(name=name, title=title, start=start, end=end, step=0.5, value=value, sizing_mode="stretch_width")
+
+
+def _plot(name: str, hover: str, **options: Any) -> Any:
+    plot = figure(
+        name=name,
+        sizing_mode="stretch_both",
+        min_height=100,
+        toolbar_location=None,
+        tools=[HoverTool(tooltips=[("", f"@{hover}"), ("", "$x, $y")])] if hover else [],
+        output_backend="canvas",
+        min_border=2,
+        **options,
+    )
+    plot.outline_line_color = None
+    plot.grid.grid_line_color = "#eef1f5"
+    for axis in plot.axis:
+        axis.axis_line_color = "#c4cdd6"
+        axis.major_tick_line_color = "#c4cdd6"
+        axis.minor_tick_line_color = None
+        axis.major_label_text_color = "#66788a"
+        axis.major_label_text_font_size = "11px"
+    return plot

@@ -1,0 +1,164 @@
+"""What all viewers of a dashboard share: the run being watched, its newest snapshot, and the settings of its channel.
+
+Invariants: there is one state per run, whoever looks; what a viewer sets acts on the running flowgraph at once and is
+seen by all; a setting that the link refuses leaves it as it was and says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+import numpy.typing as npt
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.dashboard.spectrum import Spectrum
+from gr_ros2.dashboard.state import DashboardState
+from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.dashboard.windows import Floats
+from gr_ros2.errors import GrRos2Error
+from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.record.result import Result
+from gr_ros2.run.observers import LiveLink, LiveRun
+
+TICK_S = 0.5
+"""s between two snapshots."""
+
+
+@dataclass(frozen=True)
+class RadioView:
+    """The radio side of a link at one moment.
+
+    :param channel: as it was set then, None without a run
+    :param has_samples: whether there is anything between the antennas to set
+    :param backlog: packets between source and antenna
+    :param snr_db: of the newest packets received, dB over the sampled band; None where the PHY does not tell
+    :param frequencies: Hz, of each power in ``spectrum_db``; None where there is no signal
+    :param symbols: equalised payload symbols, None where the PHY shows none
+    """
+
+    channel: ChannelConfig | None = None
+    has_samples: bool = False
+    backlog: int | None = None
+    snr_db: float | None = None
+    frequencies: Floats | None = None
+    spectrum_db: Floats | None = None
+    symbols: npt.NDArray[np.complex64] | None = None
+
+
+class RunMonitor:
+    """A :class:`gr_ros2.run.observers.RunObserver` that keeps a snapshot for others to draw."""
+
+    name = "dashboard"
+    instruments = True
+
+    def __init__(self) -> None:
+        self.snapshot = Snapshot()
+        self.radio = RadioView()
+        self.refused = ""
+        """Why the last change to the channel was not made; '' if it was."""
+        self._run: LiveRun | None = None
+        self._state: DashboardState | None = None
+        self._spectrum: Spectrum | None = None
+        self._ticking = Lock()
+
+    # -- the run's side -----------------------------------------------------------------------------------------
+
+    def run_started(self, run: LiveRun) -> None:
+        sampled = [link.phy for link in run.links if link.phy.has_samples]  # on simulated time there is no link
+        self._spectrum = Spectrum(sampled[0].sample_rate) if sampled else None
+        self._state = DashboardState(
+            run.registry,
+            run.topics,
+            run.packet_len,
+            name=run.name,
+            duration_s=run.duration_s,
+            ledger=None if run.ledger is None else run.ledger.rows,
+            tick_s=TICK_S,
+        )
+        self._run = run
+        self.refused = ""
+
+    def run_ended(self, result: Result | None) -> None:
+        if self._state is not None:
+            whole = self._run is not None and self._run.ledger is not None
+            self._state.finish(result, failed=result is None and whole)
+            self.tick()
+        with self._ticking:
+            self._run = None  # its flowgraph may go
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        if self._state is not None:
+            self._state.sender_event(src_id, event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        if self._state is not None:
+            self._state.receiver_event(event, now)
+
+    # -- the viewers' side --------------------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Take one look at the received signal."""
+        run, spectrum = self._run, self._spectrum
+        samples = None if run is None or spectrum is None else run.links[0].samples()
+        if spectrum is not None and samples is not None:
+            spectrum.add(samples)
+
+    def tick(self) -> Snapshot:
+        """Make the next snapshot; without a run the last one stands."""
+        with self._ticking:
+            if self._run is not None and self._state is not None:
+                self._tick(self._run, self._state)
+        return self.snapshot
+
+    def _tick(self, run: LiveRun, state: DashboardState) -> None:
+        queued = {
+            (src_id, topic["topic_id"]): topic["queued"]
+            for src_id, source in run.sources.items()
+            for topic in source.stats()["topics"].values()
+        }
+        self.snapshot = state.tick(run.clock(), queued)
+        if not run.links:
+            return
+        spectrum = self._spectrum
+        counts = [link.counts() for link in run.links]
+        self.radio = RadioView(
+            channel=run.links[0].channel,
+            has_samples=run.links[0].phy.has_samples,
+            backlog=sum(count.backlog + max(count.passed - count.transmitted, 0) for count in counts),
+            snr_db=run.links[0].snr_db,
+            frequencies=None if spectrum is None else spectrum.frequencies,
+            spectrum_db=None if spectrum is None else spectrum.decibels(),
+            symbols=run.links[0].symbols(),
+        )
+
+    @property
+    def channel(self) -> ChannelConfig | None:
+        """The channel as it is set at this very moment; after the run as it was last, None before the first."""
+        run = self._run
+        return self.radio.channel if run is None or not run.links else run.links[0].channel
+
+    def set_snr_db(self, snr_db: float | None) -> None:
+        """Noise on every link; dB, None = none."""
+        self._change(lambda link: link.set_snr_db(snr_db))
+
+    def set_frequency_offset(self, offset: float) -> None:
+        """Carrier frequency offset on every link, fraction of the sample rate."""
+        self._change(lambda link: link.set_frequency_offset(offset))
+
+    def set_packet_loss(self, probability: float) -> None:
+        """Loss of whole packets on every link, 0..1."""
+        self._change(lambda link: link.set_packet_loss(probability))
+
+    def _change(self, change: Callable[[LiveLink], None]) -> None:
+        self.refused = ""
+        try:
+            run = self._run
+            for link in () if run is None else run.links:
+                change(link)
+            if run is not None and not run.links:
+                self.refused = "a run on simulated time has no channel to change"
+        except GrRos2Error as error:
+            self.refused = str(error)

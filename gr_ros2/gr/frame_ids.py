@@ -1,0 +1,186 @@
+"""Frame names of several robots on one graph: a prefix per sender, and all their transforms on one topic (REP 105).
+
+Invariants: a message is altered in its frame names only, and re-encoded as its type says (alignment gaps become zero);
+of the definitions that a type has in the distributions of ROS, the one that fits the bytes counts; a frame that has the
+prefix keeps it, an empty one stays empty; what cannot be taken apart passes as it is and is counted by name; of static
+transforms the newest of each child frame is kept, at most ``MAX_STATIC``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, cast
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.store import Typestore
+
+from gr_ros2.middleware import Middleware, Qos
+from gr_ros2.middleware.type_definitions import DAMAGED, typestores
+from gr_ros2.names import filled
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+MAX_STATIC = 4096
+"""Static transforms kept for late joiners; those of further child frames are published once and counted."""
+
+_HEADER = "std_msgs/msg/Header"
+_ENDING = "_frame_id"
+"""Of members that name a frame: child_frame_id, body_frame_id, reference_frame_id."""
+_LITTLE_ENDIAN = 1
+_TF_DEPTH = 100
+
+Plan = tuple[tuple[str, bool, Any], ...]
+"""Members that hold frame names: name, whether it is a sequence or array, and the plan within (None: a frame name)."""
+
+
+def prefixed_frame(prefix: str, frame: str) -> str:
+    """A frame name with a prefix, without the leading slash that tf2 forbids."""
+    if not frame or frame.startswith(prefix):
+        return frame
+    return prefix + frame.lstrip("/")
+
+
+class FramePrefix:
+    """Puts a prefix before the frame names of messages: ``frame_id`` of every Header, and every ``…_frame_id``.
+
+    :param form: the prefix, ``{src_id}`` is the sender; '' alters nothing
+    :param counters: gets ``frame_unknown_type`` (no definition of the type) and ``frame_damaged`` (the bytes are no
+        message of it): messages that passed as they were
+    """
+
+    def __init__(self, form: str, counters: Counter[str]) -> None:
+        self._form = form
+        self._counters = counters
+        self._plans: dict[str, list[tuple[Typestore, Plan]]] = {}
+        """Of every definition of a type, the likeliest first."""
+
+    def apply(self, type_name: str, src_id: int, payload: bytes) -> bytes:
+        """The message with prefixed frame names, or as it is."""
+        if not self._form:
+            return payload
+        plans = self._plans.get(type_name)
+        if plans is None:
+            plans = self._plans[type_name] = [(store, _plan(store, type_name)) for store in typestores(type_name)]
+        if not plans:
+            self._counters["frame_unknown_type"] += 1
+            return payload
+        if not any(plan for _, plan in plans):
+            return payload
+        for store, plan in plans:
+            message = _decode(store, type_name, payload)
+            if message is not None:
+                _rename(message, plan, filled(self._form, src_id))
+                return _encode(store, type_name, message, payload)
+        self._counters["frame_damaged"] += 1
+        return payload
+
+
+STATIC_DEPTH = 100
+"""Messages that a subscription of static transforms takes at least, as tf2's listener does: the depth counts over all
+broadcasters, of which each has told something else, and a DDS drops in silence what exceeds it."""
+
+
+class StaticTransforms:
+    """All static transforms of several broadcasters, of which each knows only its own.
+
+    :param counters: gets ``tf_damaged`` (messages that are none) and ``tf_static_full`` (transforms not kept)
+    """
+
+    def __init__(self, counters: Counter[str]) -> None:
+        self._counters = counters
+        self._newest: dict[str, Any] = {}  # by child frame
+        self._store = typestores(TF_TYPE)[0]
+
+    def union(self, payload: bytes) -> bytes | None:
+        """A message with all transforms so far, those of this one included; None where it is no message.
+
+        One that has them all already comes back as it is.
+        """
+        message = _decode(self._store, TF_TYPE, payload)
+        if message is None:
+            self._counters["tf_damaged"] += 1
+            return None
+        news = {transform.child_frame_id: transform for transform in message.transforms}
+        for child, transform in news.items():
+            if child in self._newest or len(self._newest) < MAX_STATIC:
+                self._newest[child] = transform
+            else:
+                self._counters["tf_static_full"] += 1
+        if self._newest.keys() <= news.keys():
+            return payload
+        message.transforms = list({**self._newest, **news}.values())
+        return _encode(self._store, TF_TYPE, message, payload)
+
+
+class MergedTransforms:
+    """One topic of all robots' transforms, and one of all their static ones, latched as a whole.
+
+    :param topics: absolute names of the two
+    :param counters: see :class:`StaticTransforms`
+    """
+
+    def __init__(self, topics: tuple[str, ...], middleware: Middleware, counters: Counter[str]) -> None:
+        self._static = StaticTransforms(counters)
+        moving, static = topics
+        self._moving_publisher = middleware.advertise(moving, TF_TYPE, Qos("reliable", "volatile", _TF_DEPTH))
+        self._static_publisher = middleware.advertise(static, TF_TYPE, Qos("reliable", "transient_local", 1))
+
+    def add(self, payload: bytes, *, static: bool) -> None:
+        """Publish the transforms of one robot's message, its frames prefixed already.
+
+        :raises MiddlewareError: when that fails
+        """
+        if not static:
+            self._moving_publisher.publish(payload)
+            return
+        union = self._static.union(payload)
+        if union is not None:
+            self._static_publisher.publish(union)
+
+    def close(self) -> None:
+        self._moving_publisher.close()
+        self._static_publisher.close()
+
+
+def _plan(store: Typestore, type_name: str) -> Plan:
+    """Where messages of a type hold frame names; () for nowhere."""
+    plan: list[tuple[str, bool, Any]] = []
+    for name, described in store.fielddefs[type_name][1]:
+        kind, detail = cast("tuple[Nodetype, Any]", described)
+        repeated = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        if repeated:
+            kind, detail = detail[0]
+        if kind is Nodetype.NAME:
+            if inner := _plan(store, detail):
+                plan.append((name, repeated, inner))
+        elif (
+            not repeated
+            and detail[0] == "string"
+            and (name.endswith(_ENDING) or (type_name, name) == (_HEADER, "frame_id"))
+        ):
+            plan.append((name, False, None))
+    return tuple(plan)
+
+
+def _rename(message: Any, plan: Plan, prefix: str) -> None:
+    for name, repeated, inner in plan:
+        value = getattr(message, name)
+        if inner is None:
+            setattr(message, name, prefixed_frame(prefix, value))
+            continue
+        for part in value if repeated else (value,):
+            _rename(part, inner, prefix)
+
+
+def _decode(store: Typestore, type_name: str, payload: bytes) -> Any:
+    """The message, None where the bytes are none."""
+    if len(payload) < 5 or payload[0] or payload[1] > _LITTLE_ENDIAN:
+        return None
+    try:
+        return store.deserialize_cdr(payload, type_name)
+    except DAMAGED:
+        return None
+
+
+def _encode(store: Typestore, type_name: str, message: Any, like: bytes) -> bytes:
+    """The bytes of a message, in the byte order of another."""
+    return bytes(store.serialize_cdr(message, type_name, little_endian=like[1] == _LITTLE_ENDIAN))

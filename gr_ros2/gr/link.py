@@ -1,0 +1,74 @@
+"""ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
+
+Invariant: source and sink are the blocks of these names around one end, so that what is heard changes what is sent.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from gnuradio import gr
+
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings, read_registry, start_of
+from gr_ros2.gr.sink import RosSink
+from gr_ros2.gr.source import RosSource
+from gr_ros2.link.observe import LinkObserver
+from gr_ros2.middleware import Middleware
+from gr_ros2.registry import Registry
+
+
+class RosLink(gr.hier_block2):  # type: ignore[misc]
+    """One robot's end of a link.
+
+    Message ports: `pdus` in and out, `credit` in, as of :class:`RosSource` and :class:`RosSink`.
+
+    :param registry: CSV path or Registry
+    :param source: settings of what it sends
+    :param sink: settings of what it receives
+    :param middleware: open ones of the source and of the sink; None opens what the settings say
+    :param half_duplex: what this end says takes air from what it hears
+    :param start: what is to be known of this start, for version 1; None takes it from the files of the settings
+    :param observer, clock, seed: see :class:`RosSource`
+    :raises ConfigError: for settings that do not go together
+    """
+
+    def __init__(
+        self,
+        registry: str | Registry,
+        source: SourceConfig,
+        sink: SinkConfig,
+        *,
+        middleware: tuple[Middleware, Middleware] | None = None,
+        half_duplex: bool = False,
+        start: Start | None = None,
+        observer: LinkObserver | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
+        rows = read_registry(registry, needed=not source.version)
+        begin = start or start_of(source, source.src_id(), reports=True, half_duplex=half_duplex)
+        rng = random.Random(seed)
+        self.end = LiveEnd(
+            lambda hears: make_endpoint(rows, source, sink, start=replace(begin, reports=True), rng=rng, observer=hears)
+        )
+        graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
+        common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
+        self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
+        self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
+        for port in ("pdus", "credit"):
+            self.message_port_register_hier_in(port)
+        self.message_port_register_hier_out("pdus")
+        self.msg_connect(self, "pdus", self.sink, "pdus")
+        self.msg_connect(self, "credit", self.source, "credit")
+        self.msg_connect(self.source, "pdus", self, "pdus")
+
+    def close(self) -> None:
+        """Leave the ROS graphs. Idempotent."""
+        self.source.close()
+        self.sink.close()

@@ -1,0 +1,68 @@
+"""The possible fates of a message: the rows of the loss ledger.
+
+Invariant: every message that was sent ends in exactly one row. A row is its name: it counts, compares and is written as
+that text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+
+
+class LedgerRow(str, Enum):
+    """A row of the ledger.
+
+    :ivar end: where the fate is known: source, sink, or link where the records of both ends have to be joined
+    :ivar colour: its colour in figures and on the dashboard
+    :ivar words: its description, as a part of a sentence about messages
+    """
+
+    DELIVERED = "delivered", "sink", "#2a9d5c", "delivered"
+    REPAIRED = "repaired", "sink", "#1d6b3f", "delivered after repair"
+    LOST_ON_GRAPH = "lost_on_graph", "source", "#5b5b9a", "lost by the ROS graph of the source before the link had them"
+    TOO_LARGE = "too_large", "source", "#c9a08a", "too large for the packet length"
+    QUEUE_BOUND = "queue_bound", "source", "#f0a330", "dropped at the bound of the source's queue"
+    SUPERSEDED = "superseded", "source", "#88ccee", "replaced by a newer one before the first packet"
+    STALE = "stale", "source", "#e7cf4f", "dropped at the source after their deadline"
+    CANNOT_COMPLETE = "cannot_complete", "source", "#661100", "not begun, since they would have missed their deadline"
+    ABANDONED = "abandoned", "source", "#332288", "given up half sent, since they would have missed their deadline"
+    LOST_FRAGMENTS = "lost_fragments", "link", "#d62728", "lost for want of a fragment"
+    GIVEN_UP = "given_up", "link", "#aa3377", "given up, since repair did not bring back what was lost in time"
+    OVERTAKEN = "overtaken", "sink", "#ccbb44", "complete only after a newer one of a topic that wants the newest"
+    EXPIRED = "expired", "sink", "#b565a7", "given up incomplete after the reassembly timeout"
+    MEMORY = "memory", "sink", "#7f7f7f", "given up incomplete when the sink's memory was full"
+    UNSUPPORTED = "unsupported", "sink", "#17becf", "coded or encrypted in a way the sink cannot undo"
+    UNKNOWN_DICTIONARY = "unknown_dictionary", "sink", "#999933", "coded with a dictionary the sink does not have"
+    DAMAGED = "damaged", "sink", "#882255", "complete but not decodable"
+    UNKNOWN_TOPIC = "unknown_topic", "sink", "#4477aa", "of a topic that its sender has not announced"
+    SENDER_RESTARTED = "sender_restarted", "sink", "#666633", "incomplete when their sender restarted"
+    PUBLISH_FAILED = "publish_failed", "sink", "#6b1d1d", "received whole but not published on the sink's ROS graph"
+    NOT_TAKEN = "not_taken", "link", "#8c564b", "received whole but not taken by the sink"
+    IN_FLIGHT = "in_flight", "link", "#9db8d9", "still in flight at the end"
+
+    end: str
+    colour: str
+    words: str
+
+    def __new__(cls, name: str, end: str, colour: str, words: str) -> LedgerRow:
+        row = str.__new__(cls, name)
+        row._value_ = name
+        row.end, row.colour, row.words = end, colour, words
+        return row
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+ARRIVED = (LedgerRow.DELIVERED, LedgerRow.REPAIRED)
+"""Where what was delivered ends."""
+
+
+def arrived(rows: Mapping[str, int]) -> int:
+    """How many of the messages in these rows were delivered."""
+    return sum(rows.get(row, 0) for row in ARRIVED)
+
+
+ROWS = {row.value: row for row in LedgerRow}
+"""By name. Results of another version may have rows that are not here."""

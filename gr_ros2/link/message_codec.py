@@ -1,0 +1,26 @@
+"""The interface of a message codec: whole messages in, fewer bytes out, and back.
+
+Invariant: every message is coded independently, so that a lost message damages no other.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class MessageCodec(Protocol):
+    """Codes the messages of one link; on such a link every packet carries C = 1 and every message begins with one
+    byte that names codec and dictionary, 0 = stored as it is."""
+
+    def canonical(self, topic_id: int, payload: bytes) -> bytes:
+        """The result of ``decode`` for the coded message: the payload itself, except for bytes without information and
+        for loss that was configured."""
+
+    def encode(self, topic_id: int, payload: bytes) -> bytes:
+        """The coded message, its naming byte first; at most one byte longer than the message."""
+
+    def decode(self, topic_id: int, coded: bytes) -> bytes:
+        """The message.
+
+        :raises CodecError: unknown codec, dictionary not held, or damaged; its ``row`` is the ledger row
+        """

@@ -1,0 +1,246 @@
+"""The two programs that talk over the radio: one plays a recording, the other notes what arrives.
+
+Invariants: they differ between contenders in the network they join, and in nothing else; a message counts as sent when
+it was due by the recording, so that a network that holds the talker up gains nothing by it; times are s of the
+machine's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
+from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.middleware.base import MessageCallback, Reliability
+from gr_ros2.race.contenders import ADDRESSES, Contender, cyclone_uri, zenoh_config
+from gr_ros2.race.links import DEPTH, SINK_DOMAIN, SOURCE_DOMAIN
+from gr_ros2.race.tun import INTERFACE
+
+_ROS_DEPTH = 10
+"""What ROS 2 nodes keep unless told otherwise."""
+_DOMAIN = 0
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class RaceTopic:
+    """What is sent, and what it is called where it comes out."""
+
+    name: str
+    type_name: str
+    output: str
+
+
+class Network(ABC):
+    """One end's connection to whatever carries the messages."""
+
+    @abstractmethod
+    def advertise(self, topic: str, type_name: str) -> Publisher:
+        """A publisher."""
+
+    @abstractmethod
+    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:
+        """A subscription."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class DdsNetwork(Network):
+    """A ROS 2 node on Cyclone DDS.
+
+    :param qos: of the publisher; a subscription keeps more, so that a busy computer does not cost it messages
+    """
+
+    def __init__(self, domain_id: int, localhost_only: bool, qos: Qos) -> None:
+        self._graph = join_graph("dds", domain_id=domain_id, node_name="race", localhost_only=localhost_only)
+        self._qos = qos
+
+    def advertise(self, topic: str, type_name: str) -> Publisher:
+        return self._graph.advertise(topic, type_name, self._qos)
+
+    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:
+        return self._graph.subscribe(topic, type_name, replace(self._qos, depth=DEPTH), callback)
+
+    def close(self) -> None:
+        self._graph.close()
+
+
+class ZenohNetwork(Network):
+    """A Zenoh session.
+
+    :param config: as in Zenoh's configuration file
+    :param congestion: what a publisher does where there is no room, a name of Zenoh's
+    """
+
+    def __init__(self, config: dict[str, Any], reliable: bool, congestion: str) -> None:
+        import zenoh  # only here: the other contenders race without it
+
+        self._reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
+        self._congestion = getattr(zenoh.CongestionControl, congestion)
+        self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+
+    def advertise(self, topic: str, type_name: str) -> Publisher:  # noqa: ARG002 - Zenoh has no types
+        return _PlainZenohPublisher(
+            self._session.declare_publisher(
+                topic.lstrip("/"),
+                congestion_control=self._congestion,
+                reliability=self._reliability,
+            )
+        )
+
+    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:  # noqa: ARG002
+        return _PlainZenohSubscription(
+            self._session.declare_subscriber(topic.lstrip("/"), lambda sample: callback(sample.payload.to_bytes())),
+            self._session,
+        )
+
+    def close(self) -> None:
+        self._session.close()
+
+
+class _PlainZenohPublisher(Publisher):
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+
+    def publish(self, payload: bytes) -> None:
+        self._publisher.put(payload)
+
+    def matched(self) -> int:
+        return int(self._publisher.matching_status.matching)
+
+    def close(self) -> None:
+        self._publisher.undeclare()
+
+
+class _PlainZenohSubscription(Subscription):
+    def __init__(self, subscriber: Any, session: Any) -> None:
+        super().__init__()
+        self._subscriber, self._session = subscriber, session
+
+    def matched(self) -> int:
+        return len(self._session.info.peers_zid())
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+
+
+def join(contender: Contender, receiving: bool) -> Network:
+    """Connect one end of a contender.
+
+    :raises MiddlewareError: when that fails
+    """
+    if contender.stack == "zenoh":
+        config = zenoh_config(contender.settings["transport"], receiving)
+        return ZenohNetwork(config, contender.reliable, contender.settings["congestion"])
+    if contender.stack == "gr-ros2":  # the local graph loses nothing; the radio is between the two
+        return DdsNetwork(SINK_DOMAIN if receiving else SOURCE_DOMAIN, True, Qos("reliable", "volatile", DEPTH))
+    os.environ["CYCLONEDDS_URI"] = cyclone_uri(ADDRESSES[not receiving], INTERFACE)
+    reliability: Reliability = "reliable" if contender.reliable else "best_effort"
+    return DdsNetwork(_DOMAIN, False, Qos(reliability, "volatile", _ROS_DEPTH))
+
+
+class RacePublisher:
+    """Plays one topic of a bag.
+
+    :param messages: how many of them
+    :param duration_s: s at most; what is not published by then because the network held it up never is
+    """
+
+    def __init__(self, contender: Contender, topic: RaceTopic, bag: Path, messages: int, duration_s: float) -> None:
+        self._contender, self._topic = contender, topic
+        self._messages, self._duration_s = messages, duration_s
+        self._bag = BagMiddleware(path=bag)
+        self._network: Network | None = None
+        self._published = 0
+        self._t_first = float("nan")
+
+    def connect(self) -> float:
+        """Join the network; returns when that began, s monotonic."""
+        began = time.monotonic()
+        self._network = join(self._contender, receiving=False)
+        self._publisher = self._network.advertise(self._topic.name, self._topic.type_name)
+        return began
+
+    def matched(self) -> bool:
+        """Whether there is somebody to talk to."""
+        return self._publisher.matched() > 0
+
+    def play(self) -> float:
+        """Publish as recorded; returns when the first message was, s monotonic."""
+        self._bag.subscribe(self._topic.name, self._topic.type_name, Qos(), self._publish)
+        self._bag.start()
+        end = time.monotonic() + self._duration_s
+        while self._published < self._messages and time.monotonic() < end:
+            time.sleep(_POLL_S)
+        self._bag.close()
+        return self._t_first
+
+    def _publish(self, payload: bytes) -> None:
+        if not self._published:
+            self._t_first = time.monotonic()
+        if self._published < self._messages:
+            self._publisher.publish(payload)
+            self._published += 1
+
+    def __enter__(self) -> RacePublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bag.close()
+        if self._network is not None:
+            self._network.close()
+
+
+class RaceSubscriber:
+    """Notes what arrives on one topic."""
+
+    def __init__(self, contender: Contender, topic: RaceTopic) -> None:
+        self._contender, self._topic = contender, topic
+        self._network: Network | None = None
+        self._heard: list[tuple[float, bytes]] = []
+        self._lock = threading.Lock()
+
+    def connect(self) -> float:
+        """Join the network; returns when that began, s monotonic."""
+        began = time.monotonic()
+        self._network = join(self._contender, receiving=True)
+        self._subscription = self._network.subscribe(self._topic.output, self._topic.type_name, self._take)
+        return began
+
+    def matched(self) -> bool:
+        """Whether there is somebody to listen to."""
+        return self._subscription.matched() > 0
+
+    def count(self) -> int:
+        """Messages that have arrived."""
+        return len(self._heard)
+
+    def heard(self) -> list[tuple[float, bytes]]:
+        """All that arrived: when, s monotonic, and the message."""
+        with self._lock:
+            return list(self._heard)
+
+    def _take(self, payload: bytes) -> None:
+        now = time.monotonic()
+        with self._lock:
+            self._heard.append((now, payload))
+
+    def __enter__(self) -> RaceSubscriber:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._network is not None:
+            self._network.close()

@@ -1,0 +1,306 @@
+"""The radio between two network namespaces: ROS topics over it, or IP packets over it, through the same flowgraph.
+
+Invariants: every frame has the air for the airtime of its length, one after the other, whoever sends it; it is noted
+when it leaves; nothing waits here, so that a sender feels the link being full; both directions have an air of their
+own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any
+
+from gnuradio import gr
+
+from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, TopicOptions
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.pmts import packet_of
+from gr_ros2.link import ReceiverEvent, SenderEvent
+from gr_ros2.link.events import SentPacket
+from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.pdus import PDUS, pdu_of
+from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
+from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
+from gr_ros2.race.namespaces import inside
+from gr_ros2.race.tun import Tun, loopback_up
+from gr_ros2.registry import Registry
+
+SOURCE_DOMAIN, SINK_DOMAIN = 1, 2
+"""DDS domains at the two ends of gr-ros2. One process cannot have a domain in two namespaces."""
+SOURCE_ID = 1
+DEPTH = 1000
+"""Messages the local graphs keep: nothing is to be lost there."""
+QUEUE_DEPTH = 8
+"""Messages at ROS Source, for moments in which the computer is busy."""
+
+_POLL_S = 0.05
+_JOIN_S = 1.0
+_SHORT_FRAME = 100
+
+
+@dataclass(frozen=True)
+class RaceRadio:
+    """What all contenders share: a PHY at a sample rate, and the share of its frames that are lost.
+
+    :param seed: of the losses; the way back draws its own
+    """
+
+    phy: str
+    options: dict[str, Any]
+    sample_rate: float
+    packet_loss: float
+    seed: int
+
+    def with_frames_of(self, length: int) -> Phy:
+        """The PHY for frames of this length, bytes, or of up to this length."""
+        phy: Phy = PHY.load(self.phy)(length, self.sample_rate, **self.options)
+        return phy
+
+    def airtime_s(self, length: int) -> float:
+        """s that a frame of this length, bytes, has the air."""
+        return self.with_frames_of(length).airtime()
+
+    def channel(self, direction: int) -> ChannelConfig:
+        """The channel of one direction, 0 or 1."""
+        return ChannelConfig(packet_loss=self.packet_loss, seed=2 * self.seed + direction)
+
+
+@dataclass
+class LinkLog:
+    """The frames of one direction: when they went (s, monotonic), their bytes, the s they had the air."""
+
+    t: array[float] = field(default_factory=lambda: array("d"))
+    size: array[float] = field(default_factory=lambda: array("d"))
+    airtime: array[float] = field(default_factory=lambda: array("d"))
+
+    def note(self, t: float, size: int, airtime: float) -> None:
+        """One frame more."""
+        self.t.append(t)
+        self.size.append(size)
+        self.airtime.append(airtime)
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """What went over the air: the frames there and back, and by name what was lost on the way."""
+
+    there: LinkLog
+    back: LinkLog
+    drops: dict[str, int]
+
+
+class RosLink:
+    """gr-ros2 between two namespaces: a ROS graph at each end, the radio between them, one way.
+
+    :param namespaces: paths, of the sending and the receiving end
+    :param topic: its absolute name and its type
+    :param packet_len: bytes
+    :param contender: its settings
+    :raises GrRos2Error: when a part does not start
+    """
+
+    def __init__(
+        self,
+        radio: RaceRadio,
+        namespaces: tuple[str, str],
+        topic: tuple[str, str],
+        packet_len: int,
+        contender: Contender,
+    ) -> None:
+        self._log = LinkLog()
+        registry = Registry.from_rows([topic])
+        phy = radio.with_frames_of(packet_len)
+        self._size, self._airtime = packet_len, phy.airtime()
+        with ExitStack() as stack:
+            graphs: list[Middleware] = []
+            for namespace, domain_id in zip(namespaces, (SOURCE_DOMAIN, SINK_DOMAIN), strict=True):
+                loopback_up(namespace)
+                graphs.append(stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain))))  # type: ignore[misc]
+            common: dict[str, Any] = {"packet_len": packet_len, "compression": contender.settings["compression"]}
+            source = RosSource(
+                registry,
+                middleware=graphs[0],
+                observer=self,
+                seed=radio.seed,
+                robot_id=SOURCE_ID,
+                scheduler="freshness",
+                queue_depth=QUEUE_DEPTH,
+                subscriber_depth=DEPTH,
+                topic_options={topic[0]: TopicOptions(queue=contender.settings["queue"])},
+                **common,
+            )
+            stack.callback(source.close)
+            self._sink = RosSink(registry, middleware=graphs[1], publisher_depth=DEPTH, **common)
+            stack.callback(self._sink.close)
+            self._sink.announce(SOURCE_ID, [0])
+            self._source, self._link = source, LoopbackLink(phy, source, self._sink, channel=radio.channel(0))
+            stack.callback(self._link.stop)
+            self._link.start()
+            self._stack = stack.pop_all()
+
+    @property
+    def output_topic(self) -> str:
+        """Where the messages come out."""
+        return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
+
+    def report(self) -> LinkReport:
+        """What went over the air so far."""
+        topics = self._source.stats()["topics"].values()
+        drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
+        return LinkReport(self._log, LinkLog(), {**drops, "on_air": self._link.counts().dropped})
+
+    def close(self) -> None:
+        """Stop the radio and leave both graphs."""
+        self._stack.close()
+
+    def __enter__(self) -> RosLink:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
+        """Note a packet that leaves."""
+        if isinstance(event, SentPacket):
+            self._log.note(event.now, self._size, self._airtime)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """The sink is not observed."""
+
+
+class IpLink:
+    """IP between two namespaces: a TUN device at each end, each IP packet one frame of its own length, both ways.
+
+    :param namespaces: paths, of the sending and the receiving end
+    :raises GrRos2Error: when a part does not start
+    """
+
+    def __init__(self, radio: RaceRadio, namespaces: tuple[str, str]) -> None:
+        byte_airtime = (radio.airtime_s(MTU) - radio.airtime_s(_SHORT_FRAME)) / (MTU - _SHORT_FRAME)
+        overhead = radio.airtime_s(_SHORT_FRAME) / byte_airtime - _SHORT_FRAME
+        self._logs = (LinkLog(), LinkLog())
+        with ExitStack() as stack:
+            self._tuns: list[Tun] = []
+            for namespace, own, other in zip(namespaces, ADDRESSES, reversed(ADDRESSES), strict=True):
+                tun = Tun(namespace, own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead)
+                stack.callback(tun.close)
+                self._tuns.append(tun)
+            self._links: list[LoopbackLink] = []
+            for direction, log in enumerate(self._logs):
+                phy = radio.with_frames_of(MTU)
+                source = TunSource(self._tuns[direction], radio, log)
+                sink = TunSink(self._tuns[1 - direction])
+                link = LoopbackLink(
+                    phy, source, sink, channel=radio.channel(direction), pace="flow", paced=False
+                )  # the source holds each frame for its own airtime
+                stack.callback(link.stop)
+                link.start()
+                phy.prefer_latency()
+                self._links.append(link)
+            self._stack = stack.pop_all()
+
+    def report(self) -> LinkReport:
+        """What went over the air so far."""
+        drops = {
+            "queue_full": sum(tun.dropped() for tun in self._tuns),
+            "on_air": sum(link.counts().dropped for link in self._links),
+            "not_taken": sum(link.sink.refused for link in self._links),
+        }
+        return LinkReport(*self._logs, drops)
+
+    def close(self) -> None:
+        """Stop the radio and remove the interfaces."""
+        self._stack.close()
+
+    def __enter__(self) -> IpLink:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class TunSource(gr.basic_block):  # type: ignore[misc]
+    """IP packets of a TUN device on message port `pdus`, each when its airtime is over.
+
+    :param log: of the frames that left
+    """
+
+    def __init__(self, tun: Tun, radio: RaceRadio, log: LinkLog) -> None:
+        super().__init__("gr_ros2_tun_source", None, None)
+        self._tun, self._log = tun, log
+        self.emitted = 0
+        """PDUs that have left."""
+        self._airtimes = [radio.airtime_s(length) for length in range(MTU + 1)]
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.message_port_register_out(PDUS)
+
+    def start(self) -> bool:
+        shorten_switch_interval()
+        self._thread = threading.Thread(target=self._run, name="gr-ros2-tun", daemon=True)
+        self._thread.start()
+        return True
+
+    def stop(self) -> bool:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        return True
+
+    def _run(self) -> None:
+        free = time.monotonic()
+        while not self._stop.is_set():
+            packet = self._tun.read(0)  # one that is here already has waited for the air to be free
+            if packet is None:
+                packet = self._tun.read(_POLL_S)
+                free = max(free, time.monotonic())
+                if packet is None:
+                    continue
+            airtime = self._airtimes[len(packet)]
+            free += airtime
+            if self._stop.wait(max(0.0, free - time.monotonic())):
+                return
+            self._log.note(free, len(packet), airtime)
+            self.message_port_pub(PDUS, pdu_of(packet))
+            self.emitted += 1
+
+
+class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
+    """Message port `pdus` to a TUN device."""
+
+    def __init__(self, tun: Tun) -> None:
+        super().__init__("gr_ros2_tun_sink", None, None)
+        self._tun = tun
+        self.handled = 0
+        """PDUs this block is done with."""
+        self.refused = 0
+        """Those of them that were no IP packet, or that the kernel did not take."""
+        self.message_port_register_in(PDUS)
+        self.set_msg_handler(PDUS, self._write)
+
+    def _write(self, pdu: Any) -> None:
+        packet, reason = packet_of(pdu)
+        try:
+            if reason:
+                self.refused += 1
+            else:
+                self._tun.write(packet)
+        except OSError:
+            self.refused += 1
+        self.handled += 1
+
+
+def _graph(domain_id: int) -> Middleware:
+    return join_graph(DEFAULT_MIDDLEWARE, domain_id=domain_id, node_name="gr_ros2_race", localhost_only=True)

@@ -1,0 +1,67 @@
+"""What a device tells while it runs, counted by name: samples it lost, bursts that came too late or were cut.
+
+Invariants: one name means the same on every device; what a device does not tell is left out, never counted as none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pmt
+from gnuradio import gr
+from numpy.typing import NDArray
+
+from gr_ros2.phy.threads import KeepsThreadState
+
+_MARK = pmt.intern("rx_rate")
+_ASYNC, _EVENTS = pmt.intern("async_msgs"), pmt.intern("event_code")
+_NAMES = {
+    "burst_ack": "bursts_out",
+    "underflow": "underflows",
+    "underflow_in_packet": "underflows",
+    "seq_error": "sequence_errors",
+    "seq_error_in_burst": "sequence_errors",
+    "time_error": "late",
+}
+"""What we call what ``uhd.usrp_sink`` calls that."""
+
+
+class GapCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
+    """Samples in; counts the places where some are missing.
+
+    A source marks its first sample, and each that follows lost ones, with a tag `rx_rate`: ``uhd.usrp_source``, and
+    ``soapy.source`` of GNU Radio 3.10.5 and later.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("gr_ros2_gap_counter", [np.complex64], None)
+        self.gaps: int | None = None
+        """Places so far; None where the source marks nothing."""
+
+    def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
+        count = len(input_items[0])
+        for tag in self.get_tags_in_window(0, 0, count, _MARK):
+            self.gaps = (self.gaps or 0) + (tag.offset > 0)
+        return count
+
+
+class UsrpEvents(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
+    """Message port `async_msgs` in: what a ``uhd.usrp_sink`` tells of its bursts.
+
+    :ivar counted: ``bursts_out``: bursts the USRP has sent whole; ``underflows``: it ran out of samples within one;
+        ``sequence_errors``: packets lost on their way to it; ``late``: bursts whose time was over
+    """
+
+    def __init__(self) -> None:
+        super().__init__("gr_ros2_usrp_events", None, None)
+        self.counted = Counter(dict.fromkeys(_NAMES.values(), 0))
+        self.message_port_register_in(_ASYNC)
+        self.set_msg_handler(_ASYNC, self._count)
+
+    def _count(self, message: Any) -> None:
+        events = pmt.dict_ref(pmt.cdr(message), _EVENTS, pmt.PMT_NIL)
+        for place in range(pmt.length(events)):
+            name = pmt.symbol_to_string(pmt.nth(place, events))
+            self.counted[_NAMES.get(name, name)] += 1

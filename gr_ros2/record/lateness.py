@@ -1,0 +1,80 @@
+"""What a run that keeps up with a clock says of the computer: how late it was, and what was lost after that.
+
+Invariants: lateness is measured, never inferred from losses; a loss is said to follow a late moment where its message
+was submitted in that moment or up to ``AFTER_S`` after it, which is an observation and no proof: the share of all
+messages that do stands beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from gr_ros2.link.lateness import Lateness
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.record.result import LatenessResult
+from gr_ros2.record.trace import Floats, Trace
+
+AFTER_S = 1.0
+"""s. Queues that ran full in a late moment are empty again by then, and what was incomplete has been given up."""
+
+
+def modem_lateness(passed_at: Sequence[float], received_at: Floats) -> Lateness:
+    """How much longer than the quickest packet others took from the gate to the sink.
+
+    :param passed_at: s, when each packet of a source passed the gate
+    :param received_at: s, when each reached the sink, NaN for those that did not; those of the first so many count
+    """
+    count = min(len(passed_at), len(received_at))
+    passed, received = np.array(passed_at[:count]), received_at[:count]
+    here = ~np.isnan(received)
+    passed, received = passed[here], received[here]
+    lateness = Lateness()
+    if len(passed):
+        due = passed + (received - passed).min()
+        for n in np.argsort(received, kind="stable"):
+            lateness.happened(float(due[n]), float(received[n]))
+    return lateness
+
+
+def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: float, trace: Trace) -> LatenessResult:
+    """All parts joined, and the messages that were submitted in late moments or after them.
+
+    :param parts: what was measured of each, by name; one of which nothing was measured is left out
+    :param begin: s, when submission began; the trace counts from there
+    :param end: s, when the run was over
+    """
+    measured = {name: list(several) for name, several in parts.items()}
+    worst = {name: max(one.worst for one in several) for name, several in measured.items() if several}
+    found = sorted(
+        (max(due, begin) - begin, happened - begin)
+        for several in measured.values()
+        for one in several
+        for due, happened in one.moments
+        if happened > begin
+    )
+    moments: list[tuple[float, float]] = []
+    for due, happened in found:
+        if moments and due <= moments[-1][1]:
+            moments[-1] = moments[-1][0], max(happened, moments[-1][1])
+        else:
+            moments.append((due, happened))
+    sent = lost = sent_after = lost_after = 0
+    for messages in trace.messages():
+        submitted = ~np.isnan(messages.t_sent)
+        gone = submitted & (messages.row != LedgerRow.DELIVERED) & (messages.row != LedgerRow.IN_FLIGHT)
+        after = np.zeros(len(submitted), dtype=bool)
+        for due, happened in moments:
+            after |= (messages.t_sent >= due) & (messages.t_sent <= happened + AFTER_S)
+        sent, sent_after = sent + int(submitted.sum()), sent_after + int(after.sum())
+        lost, lost_after = lost + int(gone.sum()), lost_after + int((gone & after).sum())
+    return LatenessResult(
+        worst_s=worst,
+        moments=len(moments),
+        share=sum(happened - due for due, happened in moments) / max(end - begin, 1e-9),
+        lost=lost,
+        lost_after=lost_after,
+        sent=sent,
+        sent_after=sent_after,
+    )

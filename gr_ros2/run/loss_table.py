@@ -1,0 +1,265 @@
+"""How many packets a PHY loses on a channel, measured on its flowgraph and kept: the losses of ``time: packets``.
+
+Invariants: a number here was measured, on the flowgraph of that very PHY, packet length and channel, at SNRs
+``STEP_DB`` apart; between two of them the log-odds of delivery is interpolated, beyond none is guessed; the same
+setting gives the same table on every machine. Tables lie in the package and in the user's cache folder; what neither
+has is measured when it is asked for, by one process at a time, and said in the log.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import math
+import os
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from gr_ros2 import __version__
+from gr_ros2.config import BurstLoss, ChannelConfig, replaced
+from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.phy import Phy
+
+BUILTIN_DIR = Path(__file__).resolve().parent.parent / "losses"
+"""Where the tables that come with gr-ros2 lie."""
+STEP_DB = 0.5
+PACKETS = 1000
+"""Sent at each SNR when a point is measured on demand: a PDR of one half is then known with a deviation of 0.016."""
+
+_SEEDS_APART = 2**40
+"""Losses of the PHY are not drawn from the seeds of the channel's own losses."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Point:
+    """What was counted at one SNR.
+
+    :param lost_in: runs of lost packets, one behind the other
+    """
+
+    sent: int
+    delivered: int
+    lost_in: int
+
+    @property
+    def pdr(self) -> float:
+        """Share of the packets that arrived."""
+        return self.delivered / self.sent
+
+    @property
+    def log_odds(self) -> float:
+        """Of delivery; finite, half a packet counted either way."""
+        return math.log((self.delivered + 0.5) / (self.sent - self.delivered + 0.5))
+
+    @property
+    def memory(self) -> float:
+        """How far a loss tells of the next packet: 0 = not at all, 1 = that it is lost too."""
+        lost = self.sent - self.delivered
+        if not lost or not self.delivered:
+            return 0.0
+        again = 1 - self.lost_in / lost
+        return min(max((again - (1 - self.pdr)) / self.pdr, 0.0), 0.999)
+
+
+@dataclass
+class LossTable:
+    """The points of one setting, by SNR in dB; None is the channel without noise.
+
+    :param setting: what the losses depend on beside the SNR
+    """
+
+    setting: dict[str, Any]
+    points: dict[float | None, Point] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        text = json.dumps(self.setting, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+        return f"{self.setting['phy']}-{self.setting['packet_len']}-{digest}.json"
+
+    def losses(self, snr_db: float | None) -> tuple[float, float]:
+        """Share of packets lost, and their memory (see :class:`Point`), from the points next to an SNR.
+
+        :raises KeyError: when they are not there
+        """
+        if snr_db is None or snr_db in self.points:
+            point = self.points[snr_db]
+            return 1 - point.pdr, point.memory
+        below, above = neighbours(snr_db)
+        low, high = self.points[below], self.points[above]
+        share = (snr_db - below) / (above - below)
+        memory = low.memory + share * (high.memory - low.memory)
+        if low.pdr == high.pdr and low.pdr in (0.0, 1.0):
+            return 1 - low.pdr, memory
+        odds = low.log_odds + share * (high.log_odds - low.log_odds)
+        return 1 / (1 + math.exp(odds)), memory
+
+
+def neighbours(snr_db: float) -> tuple[float, float]:
+    """The SNRs at which a table has points, next to this one; twice the same where it has this one."""
+    steps = snr_db / STEP_DB
+    return math.floor(steps) * STEP_DB, math.ceil(steps) * STEP_DB
+
+
+def setting_of(phy: Phy, channel: ChannelConfig) -> dict[str, Any]:
+    """What the losses of a PHY's packets depend on, beside the SNR; what is at its default is left out."""
+    chosen, default = phy.options, phy.Options()
+    names = [item.name for item in fields(chosen)]
+    options = {name: getattr(chosen, name) for name in names if getattr(chosen, name) != getattr(default, name)}
+    on_samples = {name: value for name, value in channel.on_samples().items() if name != "snr_db"}
+    setting = {"phy": phy.name, "packet_len": phy.packet_len, "options": options, "channel": on_samples}
+    if channel.doppler_hz:
+        setting["sample_rate"] = phy.sample_rate  # all else is relative to it
+    return dict(json.loads(json.dumps(setting, default=str)))
+
+
+def measure(phy: Phy, channel: ChannelConfig, packets: int) -> Point:
+    """Send packets and count.
+
+    :param channel: its seed and its losses of whole packets play no part
+    :param packets: how many, 1 or more
+    """
+    from gr_ros2.phy.measure import BatchChannel  # only here: a table that is there needs no flowgraph
+
+    passage = BatchChannel(phy, replaced(channel, seed=0))
+    source = random.Random(0)
+    delivered, runs, before = 0, 0, True
+    for first in range(0, packets, passage.batch):
+        batch = [source.randbytes(phy.packet_len) for _ in range(min(passage.batch, packets - first))]
+        arrived = {place for place, packet in passage.send(batch) if packet == batch[place]}
+        delivered += len(arrived)
+        for place in range(len(batch)):
+            runs += before and place not in arrived
+            before = place in arrived
+    return Point(packets, delivered, runs)
+
+
+def packet_losses(phy: Phy, channel: ChannelConfig) -> ChannelConfig:
+    """A channel that loses whole packets as the PHY does on ``channel``; what is not known of it is measured.
+
+    With fading the losses come in bursts (two states, as long as measured), otherwise one by one.
+
+    :raises ConfigError: for a channel the PHY cannot have, or sample clocks that differ: measured, what a packet
+        carries matters with these, and with nothing else
+    :raises RunError: when the cache folder cannot be written
+    """
+    phy.check_channel(channel)
+    if not phy.has_samples:
+        return ChannelConfig()
+    if channel.epsilon != 1:
+        raise ConfigError(
+            f"channel.epsilon = {channel.epsilon:g}: with sample clocks that differ, how many packets are lost depends "
+            "on what they carry, which no table tells; set time to samples"
+        )
+    table = table_for(phy, channel, snrs_of(channel))
+    lost, memory = table.losses(channel.snr_db)
+    seed = channel.seed + _SEEDS_APART
+    if channel.doppler_hz and 0 < lost < 1:
+        bursts = BurstLoss(p_good_to_bad=lost * (1 - memory), p_bad_to_good=(1 - lost) * (1 - memory))
+        return ChannelConfig(burst_loss=bursts, seed=seed)
+    return ChannelConfig(packet_loss=lost, seed=seed)
+
+
+def snrs_of(channel: ChannelConfig) -> set[float | None]:
+    """The points a channel needs."""
+    return {None} if channel.snr_db is None else set(neighbours(channel.snr_db))
+
+
+def table_for(
+    phy: Phy,
+    channel: ChannelConfig,
+    snrs: set[float | None],
+    *,
+    packets: int | None = None,
+    folder: Path | None = None,
+) -> LossTable:
+    """The table of a setting with at least these points; those missing are measured and kept.
+
+    :param packets: sent at each point that is measured, None = ``PACKETS``; points of fewer count as missing
+    :param folder: where it is kept, None = the cache folder
+    :raises RunError: when the folder cannot be written
+    """
+    packets = PACKETS if packets is None else packets
+    table = LossTable(setting_of(phy, channel))
+    _read(BUILTIN_DIR / table.name, table)
+    if _missing(table, snrs, packets):
+        path = (folder or cache_dir()) / table.name
+        try:
+            with _alone(path):
+                _read(path, table)
+                for snr_db in _missing(table, snrs, packets):
+                    at = "without noise" if snr_db is None else f"at {snr_db:g} dB"
+                    _log.warning(
+                        "measuring the packet loss of %s, %d B, %s; kept in %s", phy.name, phy.packet_len, at, path
+                    )
+                    table.points[snr_db] = measure(phy, replaced(channel, snr_db=snr_db), packets)
+                    write(table, path)
+        except OSError as error:
+            raise RunError(
+                f"{path}: the packet loss measured cannot be kept ({error.strerror or error}); set XDG_CACHE_HOME to a "
+                "folder that can be written"
+            ) from error
+    return table
+
+
+def cache_dir() -> Path:
+    """Where tables measured on demand are kept: ``gr-ros2/losses`` in ``$XDG_CACHE_HOME``, by default ``~/.cache``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gr-ros2" / "losses"
+
+
+def write(table: LossTable, path: Path) -> None:
+    """Write a table so that it appears whole or not at all."""
+    points = sorted(table.points.items(), key=lambda item: -math.inf if item[0] is None else item[0])
+    rows = [[snr_db, point.sent, point.delivered, point.lost_in] for snr_db, point in points]
+    values = {"program": _program(), "setting": table.setting, "columns": ["snr_db", "sent", "delivered", "lost_in"]}
+    lines = ",\n  ".join(json.dumps(row) for row in rows)
+    text = json.dumps(values, indent=1)[:-2] + f',\n "points": [\n  {lines}\n ]\n}}\n'
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
+@cache
+def _program() -> str:
+    """What measured: version and sources of the PHYs, since a changed one loses other packets."""
+    digest = hashlib.sha256()
+    for source in sorted((BUILTIN_DIR.parent / "phy").glob("*.py")):
+        digest.update(source.read_bytes())
+    return f"{__version__} {digest.hexdigest()[:12]}"
+
+
+def _read(path: Path, table: LossTable) -> None:
+    """Add the points of a file. One that is damaged, or measured with other PHYs, has none."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if (path.parent == BUILTIN_DIR or values["program"] == _program()) and values["setting"] == table.setting:
+            points = {row[0]: Point(*row[1:]) for row in values["points"]}
+            table.points.update(points)
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        _log.warning("%s: no table of losses (%s); measuring again", path, error)
+
+
+def _missing(table: LossTable, snrs: set[float | None], packets: int) -> list[float | None]:
+    found = {snr_db for snr_db, point in table.points.items() if point.sent >= packets}
+    return sorted(snrs - found, key=lambda snr_db: -math.inf if snr_db is None else snr_db)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """While this process has the file for itself; others wait."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(f".{path.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,210 @@
+"""What a run shows to whoever looks on, such as a dashboard: the events of both ends, and the parts while they run.
+
+Invariant: the run never depends on an observer, whether that raises, hangs or is slow; without one nothing of this
+costs anything.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from gr_ros2.backlog import Backlog
+from gr_ros2.config import ChannelConfig
+from gr_ros2.errors import RunError
+from gr_ros2.gr import RosSource
+from gr_ros2.guard import Guard
+from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.observe import LinkObserver, Observers, name_of
+from gr_ros2.phy import Phy
+from gr_ros2.phy.path import LinkCounts
+from gr_ros2.phy.tap import Samples
+from gr_ros2.record.ledger import Ledger
+from gr_ros2.record.result import Result
+from gr_ros2.registry import Registry
+
+_HELD_BYTES = 1 << 25
+"""Of events that an observer in a thread of its own has not heard yet."""
+_EVENT_BYTES = 256
+"""What an event holds beside packet and payload."""
+_PATIENCE_S = 5.0
+"""s an observer may take to come to the end of what it was told."""
+
+
+class LiveLink(Protocol):
+    """What can be seen of a flowgraph, and changed in it: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
+
+    The setters raise a GrRos2Error where that cannot be changed.
+    """
+
+    @property
+    def phy(self) -> Phy: ...
+    @property
+    def channel(self) -> ChannelConfig: ...
+    @property
+    def snr_db(self) -> float | None: ...
+    def counts(self) -> LinkCounts: ...
+    def samples(self) -> Samples | None: ...
+    def symbols(self) -> Samples | None: ...
+    def set_snr_db(self, snr_db: float | None) -> None: ...
+    def set_frequency_offset(self, frequency_offset: float) -> None: ...
+    def set_packet_loss(self, probability: float) -> None: ...
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """A run, or one robot's end of a link, whose flowgraph has been built.
+
+    :param name: of the scenario
+    :param duration_s: s during which messages will be submitted; 0 = until a bag ends
+    :param topics: absolute name at the source, by source id and topic id
+    :param sources: sending block by source id
+    :param links: every direction's flowgraph
+    :param ledger: where every message sent so far stands; None where only one end of the link is here
+    :param clock: s, the clock of the run's events
+    """
+
+    name: str
+    duration_s: float
+    packet_len: int
+    registry: Registry
+    topics: Mapping[tuple[int, int], str]
+    sources: Mapping[int, RosSource]
+    links: Sequence[LiveLink]
+    ledger: Ledger | None
+    clock: Callable[[], float] = time.monotonic
+
+
+class RunObserver(LinkObserver, Protocol):
+    """An observer. Its ``name``, where it has one, stands in what is said about it.
+
+    :param instruments: whether the link is to be built so that its channel can be changed and its signal seen
+    """
+
+    @property
+    def instruments(self) -> bool: ...
+
+    def run_started(self, run: LiveRun) -> None:
+        """Before the first event of a run."""
+
+    def run_ended(self, result: Result | None) -> None:
+        """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
+
+
+class LateObservers(Observers[RunObserver]):
+    """An observer that passes everything on to whoever looks on at the moment: they may come while the run goes on.
+
+    Who comes late is told of the run, and from then on of every event.
+
+    :param instruments: see :class:`RunObserver`; for everybody who may come
+    """
+
+    name = "audience"
+
+    def __init__(self, instruments: bool = True) -> None:
+        super().__init__()
+        self.instruments = instruments
+        self._lock = threading.Lock()
+        self._run: LiveRun | None = None
+
+    def invite(self, observer: RunObserver) -> None:
+        """Let one more look on, from now."""
+        with self._lock:
+            guard = Guard(name_of(observer))
+            if self._run is not None:
+                guard(observer.run_started, self._run)
+            self._guarded += ((observer, guard),)
+
+    def run_started(self, run: LiveRun) -> None:
+        with self._lock:
+            self._run = run
+            for observer, guard in self._guarded:
+                guard(observer.run_started, run)
+
+    def run_ended(self, result: Result | None) -> None:
+        with self._lock:
+            self._run = None
+            for observer, guard in self._guarded:
+                guard.last(observer.run_ended, result)
+
+
+class RunObservers(Observers[RunObserver]):
+    """The observers of one run or link, which can neither stop it nor hold it up.
+
+    :param threaded: give each a thread of its own and a bounded memory of what it has not heard yet; what does not fit
+        is left out and counted. Otherwise they hear everything at once, as is right where time waits: in simulated
+        time.
+    """
+
+    def __init__(self, observers: Iterable[RunObserver] = (), *, threaded: bool) -> None:
+        self._threaded = [ThreadedObserver(observer) for observer in observers] if threaded else []
+        super().__init__(self._threaded if threaded else observers)
+        self.instruments = any(observer.instruments for observer, _ in self._guarded)
+
+    def run_started(self, run: LiveRun) -> None:
+        """See :class:`RunObserver`."""
+        for observer, guard in self._guarded:
+            guard(observer.run_started, run)
+
+    def settle(self) -> None:
+        """Wait until all have heard everything so far; the link has stopped. Who takes too long has missed the rest."""
+        for observer in self._threaded:
+            observer.settle()
+
+    def run_ended(self, result: Result | None) -> None:
+        """See :class:`RunObserver`; nothing follows."""
+        for observer, guard in self._guarded:
+            guard.last(observer.run_ended, result)
+
+
+class ThreadedObserver(Observers[RunObserver]):
+    """An observer with a thread of its own."""
+
+    def __init__(self, observer: RunObserver) -> None:
+        super().__init__((observer,))
+        self.name = name_of(observer)
+        self.instruments = observer.instruments
+        self._observer, self._guard = self._guarded[0]
+        self._backlog = Backlog(f"gr-ros2-{self.name}"[:40], _HELD_BYTES)
+        self._over = False
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        self._pass_on(_size(event), self._observer.sender_event, src_id, event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        self._pass_on(_size(event), self._observer.receiver_event, event, now)
+
+    def run_started(self, run: LiveRun) -> None:
+        self._backlog.offer(0, self._guard, self._observer.run_started, run)
+
+    def settle(self) -> None:
+        if not self._backlog.settle(_PATIENCE_S):
+            self._give_up()
+
+    def run_ended(self, result: Result | None) -> None:
+        self._over = True
+        self._backlog.offer(0, self._guard.last, self._observer.run_ended, result)
+        if not self._backlog.close(_PATIENCE_S if self._guard.error is None else 0):
+            self._give_up()
+
+    def _pass_on(self, size: int, call: Callable[..., object], *arguments: object) -> None:
+        if self._over:
+            return
+        if self._guard.error is not None or not self._backlog.offer(_EVENT_BYTES + size, self._guard, call, *arguments):
+            self._guard.miss()
+
+    def _give_up(self) -> None:
+        """It hangs: what waits will not be heard."""
+        if self._guard.error is None:
+            self._guard.end(RunError(f"it has not come back for {_PATIENCE_S:g} s"))
+            self._guard.miss(self._backlog.pending)
+
+
+def _size(event: SenderEvent | ReceiverEvent) -> int:
+    """Bytes of packet or message that an event holds; a packet's are there as bytes and as payloads."""
+    if isinstance(event, SentPacket | Received):
+        return 2 * len(event.data)
+    return len(event.data) if isinstance(event, Rejected) else len(getattr(event, "payload", b""))

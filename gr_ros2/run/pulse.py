@@ -1,0 +1,40 @@
+"""How late threads of this process come to work: one that wakes up again and again, and looks when it does.
+
+Invariant: it does nothing else, so what it is late by is the computer's doing: busy with other programs, or with this
+one's other threads.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from gr_ros2.link.lateness import Lateness
+
+PERIOD_S = 0.02
+
+
+class Pulse:
+    """A thread that measures from ``start`` to ``close``."""
+
+    def __init__(self) -> None:
+        self.lateness = Lateness()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="gr-ros2-pulse", daemon=True)
+
+    def start(self) -> None:
+        """Begin; once only."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End. Idempotent, also before the start."""
+        self._over.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _beat(self) -> None:
+        while True:
+            due = time.monotonic() + PERIOD_S
+            if self._over.wait(PERIOD_S):
+                return
+            self.lateness.happened(due, time.monotonic())

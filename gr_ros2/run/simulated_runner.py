@@ -1,0 +1,345 @@
+"""Runs one scenario on simulated time: no ROS graph, no waiting, and the same numbers each time.
+
+Invariants: equal scenarios give equal results, but for ``wall_s``; with ``time: samples`` every packet goes through the
+scenario's own transmitter, channel and receiver, with ``time: packets`` it is lost as these were measured to lose
+(:mod:`gr_ros2.run.loss_table`); either way it comes out when its last sample was on the air. Idle air makes no
+samples, as in a run in real time, so neither noise nor fading moves on in it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gr_ros2.config import ChannelConfig, replaced
+from gr_ros2.guard import Guard
+from gr_ros2.link.events import Delivered, SenderEvent
+from gr_ros2.link.losses import PduLosses
+from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.phy import Phy
+from gr_ros2.record.recorder import Recorder
+from gr_ros2.record.result import ReceiverResult, Result
+from gr_ros2.registry import Registry
+from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
+from gr_ros2.run.load import make_phys, recording, source_names
+from gr_ros2.run.loss_table import packet_losses
+from gr_ros2.run.observers import LiveRun, RunObservers
+from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.scenario import Scenario, dump
+from gr_ros2.run.simulate import (
+    AirtimeEnded,
+    Branch,
+    End,
+    EventLoop,
+    LinkDirection,
+    TimedEvent,
+    make_ends,
+    offered,
+    report_ways,
+    tell,
+)
+
+if TYPE_CHECKING:
+    from gr_ros2.phy.measure import BatchChannel
+
+_REPORT_S = 0.05
+
+_log = logging.getLogger(__name__)
+
+
+def run_simulated(
+    scenario: Scenario,
+    out: Path | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    run_observers: RunObservers | None = None,
+    *,
+    registry: Registry | None = None,
+    bag: DeliveredBag | None = None,
+) -> Outcome:
+    """Run a scenario with ``time`` samples or packets to its end.
+
+    :param out: folder for the bag of delivered messages, made if missing; None writes none
+    :param on_progress: called about 20 times a second
+    :param run_observers: hear everything; there is no flowgraph for them to act on
+    :param registry: None takes the scenario's
+    :param bag: where delivered messages go instead
+    :raises ConfigError: when the scenario cannot be set up
+    :raises RunError: when it fails under way
+    """
+    began = time.monotonic()
+    registry = registry or scenario.load_registry()
+    ways = scenario.directions()
+    phys = make_phys(ways, registry)
+    with ExitStack() as stack:
+        if bag is None and out is not None:
+            origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
+            source = recording(scenario)
+            for line in source.differences:
+                _log.warning(line)
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
+            for way in ways:
+                ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
+                bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
+        recorder = _recorder(registry, ways, None if bag is None else bag.take)
+        run_observers = run_observers or RunObservers(threaded=False)
+        link_observers = Observers[LinkObserver]()
+        recorded = link_observers.add(recorder, needed=True)
+        link_observers.add(run_observers)
+        ends = make_ends(ways, registry, any_length=all(phy.any_length for phy in phys))
+        directions = [
+            _Direction(way, registry, phy, (first, second))
+            for way, phy, (first, second) in zip(ways, phys, (ends[:2], ends[1::-1]), strict=False)
+        ]
+        others = [_recorder(registry, ways) for _ in scenario.receivers]
+        loop = EventLoop(
+            [*(direction.way for direction in directions), *_further(scenario, phys[0], directions[0], ends)]
+        )
+        clock = _EventClock()
+        run_observers.run_started(_live_run(scenario, registry, recorder, clock))
+        reported, progress = 0.0, Guard("progress")
+        for timed_event in _all_events(loop, directions):
+            clock.now = timed_event[0]
+            number = timed_event[1].number
+            if isinstance(timed_event[2], SenderEvent):
+                for other in others:
+                    tell(other, timed_event)
+            tell(others[number - 1] if number else link_observers, timed_event)
+            recorded.check()
+            if on_progress is not None and time.monotonic() > reported + _REPORT_S:
+                reported = time.monotonic()
+                progress(on_progress, Progress(clock.now, scenario.duration_s, *recorder.progress()))
+        recorded.check()
+    played = max(direction.way.duration_s for direction in directions)
+    drained = all(direction.way.empty for direction in directions)
+    topics = recorder.finish(played, played, drained)
+    more = tuple(ReceiverResult(place, other.finish(played, played, drained)) for place, other in enumerate(others, 2))
+    there, *back = (direction.counters() for direction in directions)
+    result = Result(
+        scenario=scenario.name,
+        seed=scenario.seed,
+        duration_s=played,
+        config=dump(scenario),
+        topics=topics,
+        receivers=more,
+        packets=recorder.ledger.packets(),
+        phy=phy_numbers(phys[0], len(ways), recorder),
+        wall_s=time.monotonic() - began,
+        incomplete=tuple(run_observers.told()),
+        counters={**there, **({"back": back[0]} if back else {}), "listener": {} if bag is None else dict(bag.written)},
+    )
+    published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
+    return Outcome(result, recorder.trace(0.0, played, published_as))
+
+
+class _EventClock:
+    """The run's clock, for observers."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@dataclass(eq=False)
+class _PendingPacket:
+    """A packet whose samples have been on the air.
+
+    :param arrived: what came out of the receiver; None while that is not known
+    """
+
+    data: bytes
+    arrived: list[bytes] | None = None
+
+
+class _Air:
+    """What a channel does to packets, one by one, for ends whose next packet depends on it."""
+
+    def __init__(self, scenario: Scenario, phy: Phy, channel: ChannelConfig) -> None:
+        self._losses = PduLosses(channel)
+        self._batches_through: BatchChannel | None = None
+        self._measured: PduLosses | None = None
+        if scenario.time == "samples" and phy.has_samples:
+            from gr_ros2.phy.measure import BatchChannel
+
+            self._batches_through = BatchChannel(phy, channel)
+        else:
+            self._measured = PduLosses(packet_losses(phy, channel))
+
+    def pass_one(self, data: bytes, now: float) -> Iterator[bytes]:
+        """What comes of a packet."""
+        if self._measured is not None:
+            arrived = [data] if self._measured.passes(now) else []
+        else:
+            assert self._batches_through is not None
+            arrived = [packet for _, packet in self._batches_through.send([data])]
+        yield from (packet for packet in arrived if self._losses.passes(now))
+
+
+class _Direction:
+    """One direction, and what the air does to its packets.
+
+    :param ends: the one that sends, and the one that hears it
+    """
+
+    def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
+        self.way = LinkDirection(scenario, ends, phy.airtime, offered(scenario, registry))
+        self._scenario, self._registry = scenario, registry
+        self._losses = PduLosses(scenario.channel)
+        self._lost_by_phy: Counter[str] = Counter()
+        self._batches_through: BatchChannel | None = None
+        self._pending: list[_PendingPacket] = []
+        if scenario.time == "samples" and phy.has_samples:
+            from gr_ros2.phy.measure import BatchChannel  # with GNU Radio
+
+            self._batches_through = BatchChannel(phy, scenario.channel)
+            if ends[1].endpoint.answers or scenario.receivers:
+                self.way.air = self._packet_by_packet
+        else:
+            measured = PduLosses(packet_losses(phy, scenario.channel))
+            self._lost_by_phy = measured.dropped
+            self.way.air = lambda data, now: [data] if measured.passes(now) and self._losses.passes(now) else ()
+
+    def land(self, data: bytes) -> _PendingPacket:
+        """A packet's samples have been on the air; its fate is known when its batch is full."""
+        pending = _PendingPacket(data)
+        self._pending.append(pending)
+        if self._batches_through is not None and len(self._pending) == self._batches_through.batch:
+            self.decide()
+        return pending
+
+    def decide(self) -> None:
+        """Let what has landed pass through the flowgraph."""
+        if self._batches_through is None or not self._pending:
+            return
+        arrived: list[list[bytes]] = [[] for _ in self._pending]
+        for place, packet in self._batches_through.send([pending.data for pending in self._pending]):
+            arrived[place].append(packet)
+        for pending, packets in zip(self._pending, arrived, strict=True):
+            pending.arrived = packets
+            self._lost_by_phy["phy"] += pending.data not in packets
+        self._pending.clear()
+
+    def arrive(self, pending: _PendingPacket, now: float) -> Iterator[TimedEvent]:
+        """What the flowgraph made of a packet, less what is lost by setting."""
+        for data in pending.arrived or ():
+            if self._losses.passes(now):
+                yield from self.way.arrive(data, now)
+
+    def counters(self) -> dict[str, Any]:
+        """What each part counted; ``channel``: packets lost in the PHY, and on purpose by setting."""
+        sent, got = self.way.sender.endpoint.sent, self.way.receiver.endpoint.received
+        return {
+            "source": {
+                "packets": sent.packets,
+                "entries": sent.entries,
+                "payload_bytes": sent.payload_bytes,
+                "repeats": sent.repeats,
+                "topics": {
+                    name: {
+                        "submitted": sent.submitted[topic_id],
+                        "sent": sent.sent[topic_id],
+                        "refused": {reason: count for (key, reason), count in sent.refused.items() if key == topic_id},
+                    }
+                    for name, topic_id in source_names(self._scenario, self._registry).items()
+                },
+            },
+            "sink": {
+                "packets": got.packets,
+                "rejected": dict(got.rejected),
+                "dropped": dict(got.dropped),
+                "repeats": got.repeats,
+                "packet_loss_est": got.packet_loss_est,
+                "message_loss_est": got.message_loss_est,
+            },
+            "channel": {"phy": self._lost_by_phy.total(), **self._losses.dropped},
+        }
+
+    def _packet_by_packet(self, data: bytes, now: float) -> Iterator[bytes]:
+        """For ends that answer: what comes next depends on whether this one arrives."""
+        pending = self.land(data)
+        self.decide()
+        yield from (packet for packet in pending.arrived or () if self._losses.passes(now))
+
+
+def _recorder(
+    registry: Registry,
+    ways: Sequence[Scenario],
+    on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
+) -> Recorder:
+    return Recorder(
+        registry,
+        {way.ros_source.src_id(): way.ros_source.namespace for way in ways},
+        {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
+        on_delivery=on_delivery,
+    )
+
+
+def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End]) -> list[LinkDirection]:
+    """Let the further receivers hear the first way, and return those by which receivers report."""
+    first.way.branches = [
+        Branch(first.way, end, _Air(scenario, phy, channel).pass_one, number)
+        for number, (end, channel) in enumerate(zip(ends[2:], scenario.receivers, strict=False), 1)
+    ]
+    if scenario.reports is None:
+        return []
+    channel = scenario.reports.channel
+    channels = [replaced(channel, seed=channel.seed + number) for number in range(len(ends) - 1)]
+    return report_ways(scenario, ends, phy.airtime, [_Air(scenario, phy, each).pass_one for each in channels])
+
+
+def _all_events(loop: EventLoop, directions: Sequence[_Direction]) -> Iterator[TimedEvent]:
+    """Everything that happens. Packets go through the flowgraph many at a time where no end answers; until the fate of
+    one is known, what comes behind it waits."""
+    of = {id(direction.way): direction for direction in directions}
+    held: deque[tuple[TimedEvent, _PendingPacket | None]] = deque()
+
+    def decided() -> Iterator[TimedEvent]:
+        while held and (held[0][1] is None or held[0][1].arrived is not None):
+            timed_event, pending = held.popleft()
+            if pending is None:
+                yield timed_event
+            else:
+                yield from of[id(timed_event[1])].arrive(pending, timed_event[0])
+
+    for timed_event in loop.run():
+        _, way, event = timed_event
+        held.append((timed_event, of[id(way)].land(event.data) if isinstance(event, AirtimeEnded) else None))
+        yield from decided()
+    for direction in directions:
+        direction.decide()
+    yield from decided()
+    for direction in directions:
+        way = direction.way
+        yield from ((way.end, way, event) for event in way.receiver.endpoint.handle_timeout(way.end))
+
+
+def _published_as(way: Scenario, registry: Registry) -> dict[str, str]:
+    """Name of every topic at the sink, by its name at the source."""
+    format_, src_id = way.ros_sink.namespace_format, way.ros_source.src_id()
+    rows = registry.with_options(way.ros_sink.topic_options)
+    return {name: rows[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()}
+
+
+def _live_run(scenario: Scenario, registry: Registry, recorder: Recorder, clock: Callable[[], float]) -> LiveRun:
+    topics = {
+        (way.ros_source.src_id(), topic_id): name
+        for way in scenario.directions()
+        for name, topic_id in source_names(way, registry).items()
+    }
+    return LiveRun(
+        name=scenario.name,
+        duration_s=scenario.duration_s,
+        packet_len=scenario.packet_len,
+        registry=registry,
+        topics=topics,
+        sources={},
+        links=(),
+        ledger=recorder.ledger,
+        clock=clock,
+    )

@@ -1,0 +1,147 @@
+"""What the link sees: the first byte, ledger rows, bounds, options."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gr_ros2.compression import LinkCodec
+from gr_ros2.compression.dictionary import OWN
+from gr_ros2.compression.link_codec import FIELDS, FIELDS_AND_MORE, STORED, ZSTD
+from gr_ros2.compression.train import learn
+from gr_ros2.compression.zstd_frames import Zstd, varint
+from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
+from gr_ros2.registry import Registry
+from tests.compression.support import Writer, codec_for, simulated
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TYPES = (ODOMETRY, "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage", "std_msgs/msg/String", "my_msgs/msg/Thing",
+         "visualization_msgs/msg/MarkerArray")  # fmt: skip
+
+
+@given(st.sampled_from(TYPES), st.binary(max_size=400))
+@settings(max_examples=600, deadline=None)
+def test_arbitrary_bytes_end_in_a_message_or_a_codec_error(type_name: str, coded: bytes) -> None:
+    codec = codec_for(type_name, max_size=5000)
+    for first in (coded[:1], b"\x01", b"\x11", b"\x12", b"\x13"):
+        try:
+            assert len(codec.decode(0, first + coded[1:])) <= 5000
+        except CodecError as error:
+            assert error.row in ("damaged", "unsupported", "unknown_dictionary")
+
+
+@given(st.sampled_from(TYPES[:4]), st.integers(0, 1 << 32), st.data())
+@settings(max_examples=200, deadline=None)
+def test_damaged_messages_end_in_a_message_or_a_codec_error(type_name: str, seed: int, data: st.DataObject) -> None:
+    payload, _ = Writer(random.Random(seed)).message(type_name)
+    codec = codec_for(type_name)
+    coded = bytearray(codec.encode(0, payload))
+    for _ in range(data.draw(st.integers(1, 4))):
+        coded[data.draw(st.integers(0, len(coded) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        codec.decode(0, bytes(coded))
+    except CodecError as error:
+        assert error.row in ("damaged", "unsupported", "unknown_dictionary")
+
+
+@given(
+    st.sampled_from([ODOMETRY, "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"]),
+    st.integers(0, 1 << 32),
+    st.sampled_from(["auto", "none", "fields", "zstd"]),
+    st.booleans(),
+    st.sampled_from("<>"),
+)
+@settings(max_examples=300, deadline=None)
+def test_what_comes_out_is_the_canonical_form(type_name: str, seed: int, codec: str, rounded: bool, order: str) -> None:
+    steps = {ODOMETRY: "pose.pose=0.001", "sensor_msgs/msg/LaserScan": "ranges=0.01"}.get(type_name, "")
+    link = codec_for(type_name, codec=codec, quantize=steps * rounded)
+    payload, clean = Writer(random.Random(seed), order).message(type_name)
+    canonical = link.canonical(0, payload)
+    assert link.decode(0, link.encode(0, payload)) == canonical
+    assert link.canonical(0, canonical) == canonical
+    if not (steps and rounded):
+        assert canonical == (payload if codec == "none" else clean)
+
+
+def test_nothing_larger_than_the_bound_comes_out() -> None:
+    large = bytes(100_000)
+    for coded in (
+        b"\x01" + Zstd().compress(large),
+        b"\x01" + varint(1 << 34 | 1) + b"x" * 20,
+        b"\x00" + large,
+        codec_for("std_msgs/ByteMultiArray").encode(
+            0, b"\0\1\0\0" + bytes(8) + (99_000).to_bytes(4, "little") + bytes(99_000)
+        ),
+    ):
+        with pytest.raises(DamagedError, match="damaged message"):
+            codec_for("std_msgs/ByteMultiArray", max_size=50_000).decode(0, coded)
+
+
+def test_a_size_that_lies_is_found_out() -> None:
+    coded = Zstd().compress(b"abc" * 1000)
+    with pytest.raises(DamagedError, match="damaged"):
+        Zstd().decompress(varint(2 * 2000 | coded[0] & 1) + coded[2:], 10_000)
+
+
+def test_what_does_not_shrink_is_stored() -> None:
+    noise = random.Random(1).randbytes(700)
+    for type_name in TYPES:
+        assert codec_for(type_name).encode(0, noise) == b"\0" + noise
+
+
+def test_the_codec_of_a_topic_is_its_option() -> None:
+    payload = simulated("odom", 0.2)[0]
+    first = {
+        mode: codec_for(ODOMETRY, codec=mode).encode(0, payload)[0] & 15 for mode in ("none", "zstd", "fields", "auto")
+    }
+    assert first == {"none": STORED, "zstd": ZSTD, "fields": FIELDS, "auto": FIELDS}
+    assert codec_for("sensor_msgs/LaserScan").encode(0, simulated("scan", 0.5)[0])[0] & 15 == FIELDS_AND_MORE
+    assert codec_for("my_msgs/Thing").encode(0, payload)[0] == ZSTD
+
+
+def test_a_wrong_codec_is_an_error_that_names_it() -> None:
+    with pytest.raises(ConfigError, match=r"codec = 'gzip'.*'topic'.*auto, none, fields, zstd"):
+        codec_for(ODOMETRY, codec="gzip")
+
+
+def test_a_dictionary_that_is_not_held_is_its_own_row() -> None:
+    payloads = simulated("odom", 5.0)
+    mine = learn([(ODOMETRY, payload) for payload in payloads], "mine")
+    other = learn([(ODOMETRY, payload) for payload in payloads[:20]], "other")
+    for mode in ("fields", "zstd"):
+        coded = codec_for(ODOMETRY, mine, codec=mode).encode(0, payloads[0])
+        assert coded[0] >> 4 == OWN
+        assert codec_for(ODOMETRY, other, mine).decode(0, coded) == payloads[0]
+        for held in ([], [other]):
+            with pytest.raises(UnknownDictionaryError, match=f"own dictionary {mine.digest[:4]}") as error:
+                codec_for(ODOMETRY, *held).decode(0, coded)
+            assert error.value.row == "unknown_dictionary"
+    with pytest.raises(UnknownDictionaryError, match="shipped dictionaries 14"):
+        codec_for(ODOMETRY).decode(0, b"\xe2abc")
+
+
+@pytest.mark.parametrize("first", [0x02, 0x04, 0x15, 0x1F, 0x0F])
+def test_an_unknown_codec_is_unsupported(first: int) -> None:
+    with pytest.raises(CodecError, match="unknown codec") as error:
+        codec_for(ODOMETRY).decode(0, bytes([first]) + b"abc")
+    assert error.value.row == "unsupported"
+
+
+def test_topics_have_their_types() -> None:
+    registry = Registry.from_rows({"odom": ODOMETRY, "cmd_vel": "geometry_msgs/Twist"})
+    codec = LinkCodec(registry)
+    odom, twist = simulated("odom", 0.2)[0], simulated("cmd_vel", 0.2)[0]
+    assert codec.decode(0, codec.encode(0, odom)) == odom
+    assert codec.decode(1, codec.encode(1, twist)) == twist
+    assert len(codec.encode(1, twist)) < 20
+
+
+def test_two_dictionaries_of_one_id_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    payloads = [(ODOMETRY, payload) for payload in simulated("odom", 2.0)]
+    one, two = learn(payloads, "one"), learn(payloads[:20], "two")
+    monkeypatch.setattr(type(one), "prefix", b"ab")
+    with pytest.raises(ConfigError, match="'one' and 'two' share the id 6162"):
+        codec_for(ODOMETRY, one, two)

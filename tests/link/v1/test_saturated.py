@@ -1,0 +1,30 @@
+"""Links that are full: version 1 takes no air from what is new, so that no topic is older than with version 0."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.saturated import SCENARIOS, TOLERANCE, ratios, run
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_no_topic_is_older_than_with_version_0(name: str, loss: float) -> None:
+    for topic, (ratio, note) in ratios(name, loss).items():
+        assert ratio <= TOLERANCE[loss], f"{topic}: {note}"
+
+
+@pytest.mark.parametrize("name", SCENARIOS[1:])
+def test_a_full_link_repairs_nothing(name: str) -> None:
+    _, air = run(name, 1, 0.2, seconds=10.0)
+    assert air["new"] > 0.9 * air["sent"]
+    assert not air["repair"]
+
+
+def test_a_full_link_that_nobody_answers_tells_its_topics_in_the_first_second() -> None:
+    for seed in range(1, 9):
+        topics, _ = run("six-topics-paced", 1, 0.2, seconds=5.0, seed=seed)
+        assert all(topic.delivered > 5 for topic in topics if topic.submitted > 100)

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from gr_ros2.race.contenders import ADDRESSES, MTU
+from gr_ros2.race.links import IpLink, RaceRadio
+from gr_ros2.race.namespaces import Namespace, inside
+from gr_ros2.race.tun import INTERFACE, QUEUE_BYTES
+from tests.race.support import needs_namespaces
+from tests.waiting import wait_for
+
+pytestmark = needs_namespaces
+
+HEADERS = 28
+"""Bytes of IP and UDP."""
+PORT = 5000
+RADIO = RaceRadio("ofdm", {"gap": 112, "detection_threshold": "stock"}, 2e5, 0.0, 0)
+
+
+def udp(namespace: Namespace, address: str) -> socket.socket:
+    def opened() -> socket.socket:
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.bind((address, PORT))
+        made.settimeout(20)
+        return made
+
+    return inside(namespace.path, opened)
+
+
+@pytest.fixture
+def linked() -> Iterator[tuple[IpLink, socket.socket, socket.socket]]:
+    with ExitStack() as stack:
+        spaces = [stack.enter_context(Namespace()) for _ in ADDRESSES]
+        air = stack.enter_context(IpLink(RADIO, (spaces[0].path, spaces[1].path)))
+        ends = [stack.enter_context(udp(*pair)) for pair in zip(spaces, ADDRESSES, strict=True)]
+        yield air, ends[0], ends[1]
+
+
+def test_datagrams_cross_both_ways_and_every_byte_is_counted(
+    linked: tuple[IpLink, socket.socket, socket.socket],
+) -> None:
+    air, near, far = linked
+    for size in (1, 700, MTU - HEADERS):
+        began = time.monotonic()
+        near.sendto(bytes(size), (ADDRESSES[1], PORT))
+        assert far.recv(MTU) == bytes(size)
+        assert time.monotonic() - began >= RADIO.airtime_s(size + HEADERS)
+    far.sendto(b"back", (ADDRESSES[0], PORT))
+    assert near.recv(MTU) == b"back"
+    report = air.report()
+    assert list(report.there.size) == [29, 728, MTU]
+    assert list(report.there.airtime) == [RADIO.airtime_s(size) for size in (29, 728, MTU)]
+    assert list(report.back.size) == [32]
+    assert report.drops == {"queue_full": 0, "on_air": 0, "not_taken": 0}
+
+
+def test_what_the_air_cannot_take_waits_in_a_bounded_queue_and_is_counted_beyond_it(
+    linked: tuple[IpLink, socket.socket, socket.socket],
+) -> None:
+    air, near, far = linked
+    size, sent = 700, 40
+    for number in range(sent):
+        near.sendto(number.to_bytes(size, "big"), (ADDRESSES[1], PORT))
+    wait_for(lambda: len(air.report().there.t) + air.report().drops["queue_full"] == sent, "not all is accounted for")
+    report = air.report()
+    arrived = [int.from_bytes(far.recv(MTU), "big") for _ in report.there.t]
+    assert arrived == sorted(arrived)
+    assert arrived[0] == 0
+    assert QUEUE_BYTES // (size + HEADERS) <= len(arrived) < sent / 2
+    gaps = [after - before for before, after in zip(report.there.t, list(report.there.t)[1:], strict=False)]
+    assert min(gaps) >= RADIO.airtime_s(size + HEADERS) * 0.999
+
+
+def test_nothing_is_left_in_a_namespace_when_the_air_is_closed() -> None:
+    def names() -> list[str]:
+        return [name for _, name in socket.if_nameindex()]
+
+    with Namespace() as one, Namespace() as other:
+        with IpLink(RADIO, (one.path, other.path)):
+            assert INTERFACE in inside(one.path, names)
+        assert [inside(space.path, names) for space in (one, other)] == [["lo"], ["lo"]]
+    assert INTERFACE not in names()

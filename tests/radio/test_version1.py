@@ -1,0 +1,117 @@
+"""Links that speak version 1, live over ZeroMQ: repair, keys, and robots that know nothing of each other's topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("zmq", reason="needs pyzmq")
+
+from gr_ros2.gr.health import LinkHealth
+from gr_ros2.keys import new_key_file
+from gr_ros2.radio.config import load_link
+from tests.radio.robots import Robot
+from tests.waiting import wait_for
+
+SLOW = 2e5
+"""samples/s: some hundred packets a second, so that idle air costs little."""
+
+
+@pytest.fixture
+def ends(tmp_path: Path) -> list[dict[str, Any]]:
+    """Front end settings of robots 1 and 2."""
+    addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
+    return [{"name": "zmq", "bind": own, "connect": [other]} for own, other in (addresses, reversed(addresses))]
+
+
+def robot(number: int, front_end: dict[str, Any], tmp_path: Path, **values: Any) -> Robot:
+    """One that speaks version 1; the second has no registry."""
+    other = 3 - number
+    own: dict[str, Any] = {
+        "version": 1,
+        "phy": {"name": "psk", "sample_rate": SLOW},
+        "state": str(tmp_path / f"state-{number}"),
+        **({} if number == 1 else {"registry": ""}),
+    }
+    return Robot(number, front_end, hears=(other,), **{**own, **values})
+
+
+def rejected(one: Robot) -> dict[str, int]:
+    found: dict[str, int] = one.link.stats()["sink"]["rejected"]
+    return found
+
+
+def test_a_receiver_without_a_registry_gets_every_message_though_packets_are_lost(
+    ends: list[dict[str, Any]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (
+        robot(1, ends[0], tmp_path) as one,
+        robot(2, ends[1], tmp_path, channel={"packet_loss": 0.3, "seed": 1}) as two,
+    ):
+        said: list[bytes] = []
+        for number in range(20):
+            said += one.say(number)
+            wait_for(lambda: two.heard[-1:] == said[-1:], "the newest message")  # noqa: B023 - called at once
+        assert two.heard == said
+        assert two.link.stats()["sink"]["repaired"] > 0
+        air = one.link.stats()["source"]["air"]
+        assert air["repair"] > 0
+        assert air["hello"] > 0
+        assert two.link.stats()["source"]["air"]["report"] > 0
+        wait_for(lambda: one.link.source.idle, "the last report")
+    assert caplog.text.count("has no key") == 2
+
+
+def test_either_end_may_start_again(ends: list[dict[str, Any]], tmp_path: Path) -> None:
+    with robot(1, ends[0], tmp_path) as one:
+        for first in (10, 20):
+            with robot(2, ends[1], tmp_path) as two:
+                said = one.say(first)
+                wait_for(lambda: two.heard[-1:] == said, "a message to a robot that has come")  # noqa: B023
+                said = one.say(first + 1)
+                wait_for(lambda: two.heard[-1:] == said, "another one")  # noqa: B023
+    with robot(2, ends[1], tmp_path) as two:
+        for number in (30, 40):
+            with robot(1, ends[0], tmp_path) as one:
+                said = one.say(number)
+                wait_for(lambda: two.heard[-1:] == said, "a message of a robot that has come again")  # noqa: B023
+        assert len(two.heard) == len(set(two.heard)) == 2
+
+
+def test_with_a_key_only_those_who_have_it_are_heard(
+    ends: list[dict[str, Any]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fleet, other = (str(tmp_path / name) for name in ("fleet.key", "other.key"))
+    for path in (fleet, other):
+        new_key_file(path)
+    with robot(1, ends[0], tmp_path, key=fleet) as one:
+        with robot(2, ends[1], tmp_path, key=fleet) as two:
+            said = one.say(1)
+            wait_for(lambda: two.heard == said, "the message")
+            assert not rejected(two)
+        for key, kind in ((other, "wrong_key"), ("", "no_key")):
+            with robot(2, ends[1], tmp_path, key=key) as two:
+                one.say(2)
+                wait_for(lambda: rejected(two).get(kind, 0) > 0, kind)  # noqa: B023 - called at once
+                receiver, *_ = LinkHealth(two.link.config.diagnostics, "link").judge(two.link.stats(), 0.0)
+                assert any("packets refused: sealed" in problem for problem in receiver.problems)
+                assert not two.heard
+                assert f"({kind})" in caplog.text
+    with robot(1, ends[0], tmp_path) as one, robot(2, ends[1], tmp_path, key=fleet) as two:
+        one.say(3)
+        wait_for(lambda: rejected(two).get("not_sealed", 0) > 0, "a packet that is not sealed")
+        assert not two.heard
+
+
+def test_a_link_speaks_version_1_unless_told_otherwise(tmp_path: Path) -> None:
+    path = tmp_path / "link.yaml"
+    path.write_text("ros_source: {robot_id: 1}\nphy: {name: psk, sample_rate: 1e6}\nkey: fleet.key\n")
+    config = load_link(path)
+    assert config.version == config.ros_source.version == config.ros_sink.version == 1
+    assert config.ros_source.compression
+    assert config.ros_source.key == config.key == str(tmp_path / "fleet.key")
+    old = load_link(path, ["version=0", "registry=table4"])
+    assert (old.ros_source.version, old.ros_source.compression) == (0, False)
