@@ -8,8 +8,8 @@ based on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,6 +85,9 @@ class Forecast:
     pad: float
     pause_s: float
     topics: tuple[TopicForecast, ...]
+    air: Mapping[str, float] = field(default_factory=dict)
+    """Packets per message sent, by what they are spent on: new messages, repair, reports, hellos; version 0 does not
+    tell."""
 
     @property
     def load(self) -> float:
@@ -339,6 +342,7 @@ class Planner:
             pad=padded / sent_bytes if sent_bytes else 0.0,
             pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
+            air={kind: count / max(sum(run.stats.sent.values()), 1) for kind, count in run.stats.air.items()},
         )
 
 
