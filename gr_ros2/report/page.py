@@ -240,7 +240,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
             "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
         )
     )
-    airtime = result.phy.get("airtime_s")
+    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if airtime and result.config.get("pace") != "flow":
         pictures.append(
             save(
