@@ -161,6 +161,8 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
 
     said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     said(say, _opening(running))
+    if running.remark:
+        said(say, running.remark)
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
     waiting = Waiting(running.source)

@@ -39,6 +39,8 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
     )
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
+    if forecast.air:
+        console.print(_air(forecast), soft_wrap=True)
     if (needed := planner.reassembly_timeout_s(forecast)) is not None:
         console.print(
             f"Needed: --set ros_sink.reassembly_timeout_s={needed:g}: up to {forecast.pause_s:.2f} s lie between two "
@@ -87,6 +89,12 @@ def _verdict(forecast: Forecast) -> str:
         f"Load {forecast.load:.0%}: {fits}. {forecast.used:.0%} of the airtime is used, {forecast.pad:.0%} of it for "
         f"PAD; {per_message} bytes on the air per message delivered."
     )
+
+
+def _air(forecast: Forecast) -> str:
+    """What packets are spent on, per message."""
+    spent = ", ".join(f"{packets:.2f} {kind}" for kind, packets in forecast.air.items())
+    return f"{sum(forecast.air.values()):.2f} packets per message sent: {spent}."
 
 
 def _line(advice: Advice) -> str:

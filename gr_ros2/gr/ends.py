@@ -92,6 +92,7 @@ class Start:
     :param save: stores that, see :class:`gr_ros2.boots.BootFile`
     :param reports: whether it can be heard by those whom it hears
     :param half_duplex: whether what it says takes air from what it hears
+    :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     """
 
     boot: int = 1
@@ -100,6 +101,7 @@ class Start:
     save: Save | None = None
     reports: bool = False
     half_duplex: bool = False
+    any_length: bool = False
 
 
 def make_endpoint(
@@ -131,7 +133,7 @@ def make_endpoint(
     dictionaries = () if sink is None else sink.dictionaries
     return EndpointV1(
         None if source is None or not registry else registry.with_options(source.topic_options),
-        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex),
+        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
         codec=to_air,

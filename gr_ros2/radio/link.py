@@ -155,11 +155,8 @@ class RobotLink(Flowgraph):
         """
         super().start(max_noutput_items)
         self._started = self._clock()
-        if self.config.version and not self.config.key:
-            _log.warning(
-                "link %s has no key, so anybody can read, forge and replay its packets; gr-ros2 key new FILE makes one",
-                self.config.name,
-            )
+        if self.remark:
+            _log.info("link %s: %s", self.config.name, self.remark)
         self.phy.prefer_latency()
         if self._diagnostics is not None:
             self._diagnostics.start()
@@ -178,6 +175,12 @@ class RobotLink(Flowgraph):
         """
         if self._running:
             self.front_end.check(self._clock())
+
+    @property
+    def remark(self) -> str:
+        """What whoever starts it is to know; often nothing."""
+        open_to_all = self.config.version and not self.config.key
+        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
 
     @property
     def finished(self) -> bool:

@@ -53,7 +53,7 @@ def _outcome(result: Result) -> Iterator[str]:
 
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """What carrying everything would have needed, against what the air has."""
-    airtime = result.phy.get("airtime_s")
+    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
     needed = sum(
@@ -85,7 +85,12 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     )
     if result.phy.get("airtime_s") and result.config.get("time") != "unthrottled" and arrived:
         span = max(result.duration_s, float(np.nanmax(t_received)))
-        used = arrived * result.phy["airtime_s"] / span / result.phy.get("channels", 1)
+        used = (
+            arrived
+            * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"])
+            / span
+            / result.phy.get("channels", 1)
+        )
         text += f"; those that arrived took {_percent(used)} of the air"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)

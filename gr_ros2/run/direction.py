@@ -13,7 +13,7 @@ from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import own_settings
+from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
@@ -69,11 +69,13 @@ class Direction:
         # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
         pulled = scenario.bag_path is not None and scenario.bag_speed == 0
         backpressure = scenario.ros_source.backpressure or pulled
+        sends, hears = (self._end(source=True), self._end(source=False)) if scenario.version else (None, None)
         self.source = RosSource(
             registry,
             middleware=self.input,
             observer=observer,
             seed=scenario.seed,
+            end=sends,
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
         stack.callback(self.source.close)
@@ -81,6 +83,7 @@ class Direction:
             registry,
             middleware=self.output,
             observer=observer,
+            end=hears,
             **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)
@@ -94,6 +97,12 @@ class Direction:
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)
+
+    def _end(self, *, source: bool) -> LiveEnd:
+        """One end of a run: its starts are not counted, since nothing outlives the run."""
+        ends = (self.scenario.ros_source, None) if source else (None, self.scenario.ros_sink)
+        start = Start(self.scenario.seed + 1)
+        return LiveEnd(lambda observer: make_endpoint(self.registry, *ends, start=start, observer=observer))
 
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""

@@ -16,6 +16,7 @@ from shutil import copyfile
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
+from gr_ros2.files import make_folder, write_whole
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -25,7 +26,7 @@ from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
-from gr_ros2.record.trace import Trace, make_folder, write_trace, write_whole
+from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.direction import Direction, open_graph
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers

@@ -8,8 +8,8 @@ based on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -86,6 +86,9 @@ class Forecast:
     pad: float
     pause_s: float
     topics: tuple[TopicForecast, ...]
+    air: Mapping[str, float] = field(default_factory=dict)
+    """Packets per message sent, by what they are spent on: new messages, repair, reports, hellos; version 0 does not
+    tell."""
 
     @property
     def load(self) -> float:
@@ -291,20 +294,24 @@ class Planner:
         duration = scenario.duration_s or self._messages[-1].t
         messages = [message for message in self._messages if message.t <= duration]
         shares: Counter[int] = Counter()
-        padded = 0
+        padded = sent_bytes = 0
+        spent = 0.0
         cut = False
 
         wire = scenario.ros_source.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, cut
+            nonlocal padded, sent_bytes, spent, cut
             cut = cut or any(entry.total > 1 for entry in sent.entries)
-            layout = wire.layout(sent.packet, scenario.packet_len)
+            own_airtime = phy.airtime(len(sent.data))
+            spent += own_airtime
+            sent_bytes += len(sent.data)
+            layout = wire.layout(sent.packet, len(sent.data))
             padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
-                    shares[span.entry.topic_id] += airtime * span.size / whole  # type: ignore[assignment]
+                    shares[span.entry.topic_id] += own_airtime * span.size / whole  # type: ignore[assignment]
 
         run = simulate(scenario, phy=phy, messages=iter(messages), codec=codec, on_packet=share, overhead_s=OVERHEAD_S)
         names = source_names(scenario, self.registry)
@@ -326,17 +333,17 @@ class Planner:
                     result=result,
                 )
             )
-        packets = run.stats.packets
         delivered = sum(topic.result.delivered for topic in topics)
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
             capacity=1 / airtime,
-            used=min(packets * airtime / duration, 1.0),
-            air_bytes_per_message=packets * scenario.packet_len / delivered if delivered else None,
-            pad=padded / (packets * scenario.packet_len) if packets else 0.0,
+            used=min(spent / duration, 1.0),
+            air_bytes_per_message=sent_bytes / delivered if delivered else None,
+            pad=padded / sent_bytes if sent_bytes else 0.0,
             pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
+            air={kind: count / max(sum(run.stats.sent.values()), 1) for kind, count in run.stats.air.items()},
         )
 
 

@@ -47,6 +47,34 @@ def test_a_forecast_is_what_the_link_does() -> None:
         assert topic.result.delivered == done[topic.topic].delivered
 
 
+@pytest.mark.parametrize(
+    ("settings", "least_pdr", "most_packets"),
+    [
+        (["channel.packet_loss=0.2"], 0.995, 2.8),
+        (["channel.packet_loss=0.2", "reports={}"], 0.995, 1.75),
+        (["reports={}"], 1.0, 1.1),
+        (["channel.packet_loss=0.2", "ros_source.repair='off'"], 0.7, 1.1),
+    ],
+)
+def test_repair_is_forecast_as_a_run_in_simulated_time_has_it(
+    settings: list[str], least_pdr: float, most_packets: float
+) -> None:
+    """PDR, packets per message and latency of version 1 under a stated loss."""
+    scenario = load_scenario("paper-ofdm-paced", ["version=1", "time=packets", *settings], duration_s=10.0)
+    forecast = Planner(scenario).forecast()
+    real = run_scenario(scenario).result
+    (topic,), (there,) = forecast.topics, real.topics
+    assert topic.result.pdr == pytest.approx(there.pdr, abs=0.01)
+    assert topic.result.pdr is not None
+    assert topic.result.pdr >= least_pdr
+    assert topic.result.latency_s.p99 == pytest.approx(there.latency_s.p99 or 0, rel=0.15, abs=0.005)
+    packets = sum(forecast.air.values())
+    assert packets == pytest.approx(real.counters["source"]["packets"] / there.sent, rel=0.03)
+    assert 1 <= packets <= most_packets
+    assert forecast.air["new"] == pytest.approx(1, rel=0.03)
+    assert forecast.air.get("repair", 0) <= packets - 1
+
+
 def test_a_forecast_of_six_topics_is_what_the_flowgraph_does() -> None:
     """On the clock of its samples; in real time it is a row of the benchmark."""
     scenario = load_scenario("six-topics-paced", ["time=samples"], duration_s=5.0)

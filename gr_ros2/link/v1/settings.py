@@ -75,11 +75,12 @@ class Settings:
 
 
 def settings_of(
-    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False
+    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False, fixed: bool = True
 ) -> Settings:
     """The settings of an end from those of its blocks.
 
     :param hears: whether it receives and can say what
+    :param fixed: whether every packet has to be as long as the longest
     :raises ConfigError: neither names the robot, and it would have something to say
     """
     send = SourceConfig() if source is None else source
@@ -87,6 +88,7 @@ def settings_of(
     return Settings(
         src_id=(NOBODY if take.robot_id == AUTO else take.robot_id) if source is None else source.src_id(),
         packet_len=take.packet_len if source is None else source.packet_len,
+        fixed=fixed,
         dst_id=send.dst_id,
         hop=send.hop,
         repair=send.repair,
