@@ -1,6 +1,6 @@
 """What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
 
-Invariant: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever;
+Invariant: a sink must not publish what a source on the same graph subscribes, or a message would circulate without end;
 every block of this process is checked against every other when it is made.
 """
 
@@ -90,7 +90,7 @@ class Start:
     :param boot: number of the start, greater than all before
     :param heard: how far other robots had been heard before, by robot id: boot number and packet number
     :param save: stores that, see :class:`gr_ros2.boots.BootFile`
-    :param reports: whether it can be heard by those whom it hears
+    :param reports: whether the robots that it receives from can receive from it
     :param half_duplex: whether what it says takes air from what it hears
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     """

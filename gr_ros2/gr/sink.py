@@ -101,7 +101,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
         # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered anew. At most as many as there are source ids times topics of the registry.
+        # discovered again. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._published: Counter[tuple[int, int]] = Counter()

@@ -107,7 +107,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
         if self._receiving is not None:
             with suppress(RuntimeError):  # from GNU Radio 3.10.9 on, of one that does not run or was stopped already
                 self._receiving.stop()
-            # Kept for ever: its destructor waits for a thread of its own that never ends when it was not started, or
+            # Never deleted: its destructor waits for a thread of its own that never ends when it was not started, or
             # ran for less than a second.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._receiving))
         super().close()

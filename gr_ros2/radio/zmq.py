@@ -99,7 +99,7 @@ class ZmqFrontEnd(FrontEnd):
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
         self._context, self._sockets = zmq.Context(), list[Any]()
-        # With the sockets at hand: a context that is found to be garbage together with them waits for them for ever.
+        # Close the sockets first: a context that is garbage-collected together with them waits for them without end.
         self._let_go = weakref.finalize(self, _let_go, self._context, self._sockets)
         self._counters: Counter[str] = Counter()
         try:
@@ -206,7 +206,7 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):
-            # Waits outside Python's lock, and not for ever: GNU Radio can end this thread only between two calls.
+            # Wait without Python's lock, and for a limited time: GNU Radio can end this thread only between two calls.
             if not self._socket.poll(_POLL_MS):
                 return 0
             self._rest = self._take(self._socket.recv(zmq.NOBLOCK))
