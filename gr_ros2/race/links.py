@@ -200,7 +200,7 @@ class IpLink:
                 source = TunSource(self._tuns[direction], radio, log)
                 sink = TunSink(self._tuns[1 - direction])
                 link = LoopbackLink(
-                    phy, source, sink, channel=radio.channel(direction), pace="flow", paced=False
+                    phy, source, sink, channel=radio.channel(direction), throttled=False, paced=False
                 )  # the source holds each frame for its own airtime
                 stack.callback(link.stop)
                 link.start()

@@ -22,12 +22,12 @@ from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.settings import (
     PHY_NAME,
+    PHY_OPTIONS,
     Condition,
     RaceRecording,
     RaceSettings,
     check,
     conditions,
-    phy_options,
     read_recording,
 )
 from gr_ros2.race.workers import Worker
@@ -94,7 +94,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
 
 
 def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
-    radio = RaceRadio(PHY_NAME, phy_options(settings), condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(PHY_NAME, PHY_OPTIONS, condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)

@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import STRICT
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
-from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
+from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
 """Magic, who sends (random at each start), number of the burst, samples/s; then complex64, little-endian."""
@@ -84,9 +85,9 @@ class ZmqOptions(FrontEndOptions):
     :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
     """
 
-    bind: OwnAddress
-    connect: Annotated[tuple[Address, ...], Field(min_length=1)]
-    queue: Annotated[int, Field(ge=1, le=10_000)] = 300
+    bind: Annotated[OwnAddress, Field(title="Own address")]
+    connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
+    queue: Annotated[int, Field(ge=1, le=10_000, title="Queue for a slow peer (bursts)")] = 300
 
 
 class ZmqFrontEnd(FrontEnd):
