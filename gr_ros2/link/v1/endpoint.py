@@ -478,9 +478,6 @@ class Endpoint:
         stats = self.sent
         stats.air[kind] += 1
         stats.packets += 1
-        if parts:
-            stats.entries += len(parts)
-            stats.payload_bytes += sum([len(part.payload) for part in packet.entries])
         self._tell(SentPacket(data, packet, parts, now, kind))
         return data
 

@@ -366,6 +366,8 @@ class Outbox:
                 queue.popleft()
                 self._left(message, queue, now)
         self._turns.sent(self._holder)
+        self.stats.entries += len(picks)
+        self.stats.payload_bytes += sum([taken for _, taken in picks])
         lives = tuple({id(message.life): message.life for message, _ in picks}.values())
         ranks = [message.qos for message, _ in picks]
         qos = min(ranks, key=lambda qos: RANK[qos])
