@@ -13,6 +13,7 @@ OLD_NAMES: Mapping[str, tuple[str, str]] = {
     "guard": ("guard_s", "guard_s"),
     "pace": ("time", "time: unthrottled for pace: flow, and nothing for pace: airtime"),
     "paced": ("ros_source", "ros_source.packet_rate: 0 for paced: false, and nothing for paced: true"),
+    "queue": ("burst_queue", "burst_queue"),
     "reassembly_timeout": ("reassembly_timeout_s", "reassembly_timeout_s"),
     "start_time": ("start_time_s", "start_time_s"),
     "turnaround": ("turnaround_s", "turnaround_s"),

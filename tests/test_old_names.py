@@ -14,6 +14,7 @@ from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario, scenario_from
 
 SCENARIO = {"name": "old", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}}
+ADDRESSES = {"zmq": {"bind": "ipc:///tmp/a", "connect": ["ipc:///tmp/b"]}}
 LINK = {**SCENARIO, "phy": {"name": "direct"}}
 
 
@@ -51,13 +52,13 @@ def test_every_old_name_is_in_the_table_of_the_class_it_stood_in() -> None:
     assert new_name("colour", ("colour_of_hair",)) == ""
 
 
-@pytest.mark.parametrize(("name", "values"), [("sim", {"guard": 1})])
+@pytest.mark.parametrize(("name", "values"), [("zmq", {"queue": 3}), ("sim", {"guard": 1})])
 def test_a_front_ends_old_names(name: str, values: dict[str, Any]) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     from gr_ros2.radio import FRONT_ENDS
 
     (old,) = values
-    said = complaint(FRONT_ENDS.load(name).Options, values)
+    said = complaint(FRONT_ENDS.load(name).Options, {**ADDRESSES.get(name, {}), **values})
     assert said == f"unknown key {old}: write {OLD_NAMES[old][1]}"
 
 

@@ -82,12 +82,12 @@ class ZmqOptions(FrontEndOptions):
     :param bind: address to publish at: ``5555`` or ``tcp://*:5555`` (all interfaces), ``10.0.0.1:5555``,
         ``ipc:///tmp/a``. Whoever can reach it can listen; there is no encryption
     :param connect: addresses of the other robots, ``10.0.0.2:5555``
-    :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
+    :param burst_queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
     """
 
     bind: Annotated[OwnAddress, Field(title="Own address")]
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
-    queue: Annotated[int, Field(ge=1, le=10_000, title="Queue for a slow peer (bursts)")] = 300
+    burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue for a slow peer (bursts)")] = 300
 
 
 class ZmqFrontEnd(FrontEnd):
@@ -140,7 +140,7 @@ class ZmqFrontEnd(FrontEnd):
         socket = self._context.socket(kind)
         self._sockets.append(socket)
         socket.linger = 0
-        socket.sndhwm = socket.rcvhwm = self.options.queue
+        socket.sndhwm = socket.rcvhwm = self.options.burst_queue
         socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
         socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
