@@ -23,7 +23,12 @@ from gr_ros2.study.ablation import air_bytes
 from gr_ros2.study.forecast import Planner
 
 WHOLE_S, PART_S, PLAIN_S = 38.0, 15.0, 8.0
-PLAIN = ["ros_source.compression=false", "ros_sink.compression=false", "ros_source.scheduler=paper", "paced=false"]
+PLAIN = [
+    "ros_source.compression=false",
+    "ros_sink.compression=false",
+    "ros_source.scheduler=paper",
+    "ros_source.packet_rate=0",
+]
 PLAIN += ["ros_source.topic_options={}", "ros_source.queue_depth=0", "drain_s=0"]
 """What turns a scenario into plain version 0, unpaced."""
 WANTED = ["ros_source.compression=true", "ros_sink.compression=true", "ros_source.scheduler=freshness"]

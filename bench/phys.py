@@ -156,7 +156,7 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
     source = RosSource(registry, middleware=robot, robot_id=1, packet_len=phy.packet_len, backpressure=True)
     sink = RosSink(registry, middleware=base, packet_len=phy.packet_len)
     message = b"\0\1\0\0" + bytes(phy.packet_len - _HEADERS - 4)
-    with LoopbackLink(phy, source, sink, pace="flow"):
+    with LoopbackLink(phy, source, sink, throttled=False):
         phy.prefer_latency()
         single = _latency(lambda: robot.callback(message), lambda: base.counter.published, few)
         begin = time.perf_counter()

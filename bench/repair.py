@@ -89,7 +89,7 @@ def run(
     back: float | None = None,
     receivers: int = 1,
     packet_len: int = 64,
-    repair: str | None = "idle",
+    repair: str = "idle",
     keys: Keys | None = None,
     seed: int = 1,
     once: bool = False,

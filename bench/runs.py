@@ -16,7 +16,7 @@ from tests.recordings import DRIVES
 DRIVE = DRIVES[-1]
 """The recorded drive where it is, else that of the simulator."""
 DOMAINS = ["ros_source.domain_id=97", "ros_sink.domain_id=98"]
-PACED = ["paced=true", "drain_s=5", "ros_source.queue_depth=100"]
+PACED = ["ros_source.packet_rate=auto", "drain_s=5", "ros_source.queue_depth=100"]
 """What `paper-ofdm` needs in order not to be overdriven, beside a sample rate that carries it."""
 DDS_PADDING = 3
 
@@ -62,7 +62,7 @@ def fast() -> list[Row]:
 def ofdm() -> list[Row]:
     """The paper's OFDM loopback, at a sample rate that carries 120 % of what is offered."""
     with TemporaryDirectory() as folder:
-        result = _run("paper-ofdm", [*PACED, "phy.sample_rate=0"], Path(folder), 15.0)
+        result = _run("paper-ofdm", [*PACED, "phy.sample_rate=auto"], Path(folder), 15.0)
     return _delivery(f"OFDM at {result.phy['sample_rate']:,.0f} samples/s", result)
 
 
@@ -72,7 +72,13 @@ def recording() -> list[Row]:
     seconds = (recorded[-1].stamp_ns - recorded[0].stamp_ns) * 1e-9
     with TemporaryDirectory() as folder:
         registry = DRIVE.write_registry(Path(folder) / "drive.csv")
-        overrides = [f"registry={registry}", f"source=bag:{DRIVE.path}", "bag_speed=0", "pace=flow", "duration_s=0"]
+        overrides = [
+            f"registry={registry}",
+            f"source=bag:{DRIVE.path}",
+            "bag_speed=0",
+            "time=unthrottled",
+            "duration_s=0",
+        ]
         overrides += [*PACED, "packet_len=220", "phy.sample_rate=1e6"]
         begin = time.monotonic()
         result = _run("paper-ofdm", overrides, Path(folder))

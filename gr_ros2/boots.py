@@ -10,11 +10,11 @@ or the new one; a boot number is given out only after it has been written.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.files import replacing
 
 _LARGEST = (1 << 32) - 1
 
@@ -63,17 +63,8 @@ class BootFile:
 
     def _write(self) -> None:
         text = json.dumps({"boot": self.boot, "heard": {str(name): value for name, value in self._heard.items()}})
-        beside = self._path.with_name(f"{self._path.name}.new")
         try:
-            with open(beside, "w", encoding="ascii") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            beside.replace(self._path)
-            folder = os.open(self._path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            with replacing(self._path, durable=True) as part:
+                part.write_text(text, encoding="ascii")
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot be written ({error.strerror})") from error

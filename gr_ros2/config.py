@@ -1,7 +1,8 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Invariant: a setting exists in exactly one dataclass here; an unknown key or a value out of range is a ConfigError that
-names the key, the value and what is allowed.
+Invariants: a name is introduced by one dataclass, which others inherit from; what is derived is spelt ``auto``;
+durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the value and what
+is allowed.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config_errors import explain
 from gr_ros2.errors import ConfigError
 from gr_ros2.names import (
     checked_frame_form,
@@ -23,6 +25,7 @@ from gr_ros2.names import (
     checked_namespace_form,
     checked_topic_form,
 )
+from gr_ros2.setting import AUTO, Auto
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
 from gr_ros2.yaml_bounds import read_bounded
 from gr_ros2.yaml_text import parse_yaml
@@ -30,29 +33,20 @@ from gr_ros2.yaml_text import parse_yaml
 MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
 MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
 
-_STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
+STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 _T = TypeVar("_T")
-_KINDS = {
-    "bool": "true or false",
-    "complex": "a number such as 0.5 or 0.5+0.2j",
-    "dataclass": "keys and values",
-    "dict": "keys and values",
-    "float": "a number",
-    "int": "a whole number",
-    "list": "a list",
-    "string": "a text",
-    "tuple": "a list",
-}
-"""What a value must be, in words, by pydantic's name of the error."""
 
 PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
-RobotId = Annotated[int, Field(ge=-1, lt=BROADCAST)]
+RobotId = Annotated[int, Field(ge=0, le=BROADCAST - 1)]
+DomainId = Annotated[int, Field(ge=0, le=232)]
+SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+Text = Annotated[str, Field(min_length=1)]
 Namespace = Annotated[str, AfterValidator(checked_namespace)]
 NamespaceForm = Annotated[str, AfterValidator(checked_namespace_form)]
-TopicForm = Annotated[str, AfterValidator(checked_topic_form)]
+TopicForm = Annotated[str, Field(min_length=1), AfterValidator(checked_topic_form)]
 MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
@@ -61,118 +55,217 @@ WireVersion = Literal[0, 1]
 Repairs = Literal["idle", "thrifty", "off"]
 Kernels = Literal["auto", "numpy"]
 
+DEFAULT_MIDDLEWARE = "dds"
+"""Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
 
-@dataclass(frozen=True, config=_STRICT)
-class TopicOptions:
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Named:
+    """What has a name.
+
+    :param name: what results, tables and errors call it
+    """
+
+    name: Text
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Seeded:
+    """What draws random numbers.
+
+    :param seed: of everything random in it; the same seed draws the same numbers
+    """
+
+    seed: Count = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Traffic(Seeded):
+    """What a link is given to carry.
+
+    :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
+    :param duration_s: s during which messages are submitted; 0 = no limit: as long as the recording
+    :param drain_s: s the link may go on delivering after that
+    """
+
+    source: str = "sim"
+    duration_s: Seconds = 15.0
+    drain_s: Seconds = 2.0
+
+    @model_validator(mode="after")
+    def _sim_or_bag(self) -> Traffic:
+        if self.source != "sim" and not self.source.removeprefix("bag:").strip():
+            raise ValueError(f"source = {self.source!r}: the path of the bag is missing; write bag:PATH")
+        if self.source != "sim" and not self.source.startswith("bag:"):
+            raise ValueError(f"source = {self.source!r}: write sim or bag:PATH")
+        return self
+
+    @property
+    def bag_path(self) -> Path | None:
+        """The recording to play, None when the simulator is the source."""
+        return None if self.source == "sim" else Path(self.source.removeprefix("bag:").strip()).expanduser()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Sampled:
+    """What has samples.
+
+    :param sample_rate: samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told
+    """
+
+    sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Packets:
+    """What sends packets.
+
+    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
+    """
+
+    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Agreed(Packets):
+    """What all ends of a link have to agree on.
+
+    :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
+    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
+    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
+        forge; with one, sealed packets alone are taken
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts and says what was heard before a restart (version 1); '' keeps it
+        in the user's state folder
+    """
+
+    registry: Annotated[Text, Field(title="Registry CSV")]
+    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 0
+    key: Annotated[str, Field(title="Keys of the fleet")] = ""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    state: Annotated[str, Field(title="State file")] = ""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Queued:
+    """What keeps messages waiting.
+
+    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded, auto (of one topic)
+        takes the source's
+    """
+
+    queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TopicOptions(Queued):
     """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
 
     :param qos: class of its packets, the two QoS bits of the header
-    :param reliability: None adapts the subscription to the publishers found
-    :param durability: None adapts likewise; the sink publishes volatile unless this says transient_local
-    :param depth: QoS depth of subscription and publisher, None takes ``subscriber_depth``/``publisher_depth``
-    :param queue_depth: messages waiting at the source, 0 unbounded, None takes the source's ``queue_depth``
-    :param publish_as: topic name at the sink, ``{src_id}`` allowed; '' takes ``namespace_format``
+    :param reliability: auto adapts the subscription to the publishers found
+    :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
+    :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``
+    :param publish_as: topic name at the sink, ``{src_id}`` allowed; auto takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
-        ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); None follows ``depth`` and the
+        ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
-    :param deadline_s: s from submission to delivery at the other end; a later message is dropped. 0 = no deadline, or
-        without ``queue`` the publishers' lifespan
-    :param weight: weight of this topic's age relative to other topics, 0.001..1000 (``scheduler: freshness``)
+    :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
+        publishers' lifespan, where ``queue`` is auto too
+    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
 
     qos: QosClass = "default"
-    reliability: Literal["reliable", "best_effort"] | None = None
-    durability: Literal["volatile", "transient_local"] | None = None
-    depth: Count | None = None
-    queue_depth: Count | None = None
-    publish_as: TopicForm = ""
-    queue: QueuePolicy | None = None
-    deadline_s: Annotated[float, Field(ge=0, le=3_600, allow_inf_nan=False)] = 0.0
+    reliability: Literal["reliable", "best_effort"] | Auto = AUTO
+    durability: Literal["volatile", "transient_local"] | Auto = AUTO
+    depth: Count | Auto = AUTO
+    publish_as: TopicForm = AUTO
+    queue: QueuePolicy | Auto = AUTO
+    deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
-    codec: str = "auto"
+    codec: str = AUTO
     quantize: str = ""
 
     @model_validator(mode="after")
     def _deadline(self) -> TopicOptions:
-        if self.queue == "deadline" and not self.deadline_s:
+        if self.queue == "deadline" and self.deadline_s in (0, AUTO):
             raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
         return self
 
 
-DEFAULT_MIDDLEWARE = "dds"
-"""Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
-
-
-@dataclass(frozen=True, config=_STRICT)
-class SourceConfig:
-    """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class EndConfig(Agreed):
+    """What both ends of a link have.
 
     :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
+    :param robot_id: the robot's own id on the wire, 0..254. auto: a source takes the last run of digits of its
+        namespace; a sink takes that of the source beside it, and hears everything where there is none, or where the
+        front end loops back. A sink that has one drops and counts its own packets and those for others
+    :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
+    :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
+    :param compression: code every message, C = 1; on at both ends or at none
+    :param dictionaries: files of dictionaries of your own, made by `gr-ros2 dict train`; the same at both ends
+    :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
+    :param debug: readable log of headers, topic ids and entries
+    """
+
+    registry: Annotated[str, Field(title="Registry CSV")] = ""
+    robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
+    middleware: str = DEFAULT_MIDDLEWARE
+    domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
+    compression: bool = False
+    dictionaries: tuple[str, ...] = ()
+    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
+    debug: Annotated[bool, Field(title="Debug log")] = False
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SourceConfig(Queued, EndConfig):
+    """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
+
     :param topics: subset of the registry, with or without leading slash; [] = all
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
-    :param robot_id: source id 0..254; -1 takes the last run of digits of the namespace
     :param dst_id: destination id, 255 broadcast
-    :param packet_len: bytes on the wire, 14..4095; 40 or more with version 1
-    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same on both ends
-    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
-        forge
-    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
-    :param state: file that counts this robot's starts (version 1); '' takes one of its own in the user's state folder
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
     :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
     :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
     :param hop: initial hop count (TTL) 0..15
-    :param packet_rate: packets/s offered to the flowgraph, 0 unpaced
-    :param queue_depth: messages waiting per topic, oldest dropped and counted; 0 unbounded
-    :param backpressure: make the middleware wait instead of dropping when a queue is full (bags)
-    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only)
+    :param packet_rate: packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number
+        is a limit beside that; 0 = every packet at once, whatever the PHY grants, as the paper has it
+    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded
+    :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
+    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
+        joins fragments of different messages)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
-    :param repeat_s: s between repeats of a transient-local topic, 0 off; with version 1 only while no robot reports
+    :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
+        version 1 only while no robot reports
     :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
-        much as losses are known or expected, off; None takes thrifty where receivers report, idle where none does
+        much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
     :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
-    :param compression: code every message, C = 1; the sink must have the same setting
-    :param dictionaries: files of dictionaries of your own, the same at both ends
-    :param topic_options: per topic name, over the registry's columns
-    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
-    :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
-    :param debug: readable log of headers, topic ids and entries
     """
 
-    registry: str = ""
     topics: tuple[str, ...] = ()
     namespace: Namespace = ""
-    robot_id: RobotId = -1
-    dst_id: Annotated[int, Field(ge=0, le=BROADCAST)] = BROADCAST
-    packet_len: PacketLen = 220
-    version: WireVersion = 0
-    key: str = ""
-    seal: Literal["encrypt", "authenticate"] = "encrypt"
-    state: str = ""
-    min_fragment: Annotated[int, Field(ge=1)] = 16
+    dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
+    min_fragment: Annotated[int, Field(ge=1, title="Smallest fragment (bytes)")] = 16
     greedy: bool = False
     flush_timeout_s: Seconds = 0.0
-    subscriber_depth: Count = 10
-    hop: Annotated[int, Field(ge=0, le=15)] = 1
-    packet_rate: Seconds = 0.0
-    queue_depth: Count = 100
+    subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
+    hop: Annotated[int, Field(ge=0, le=15, title="Hop limit (hops)")] = 1
+    packet_rate: Annotated[
+        Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
+    ] = AUTO
+    queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
     backpressure: bool = False
-    entry_ids: Literal["sequential", "random"] = "sequential"
+    entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
     scheduler: str = "paper"
-    repeat_s: Seconds = 10.0
-    repair: Repairs | None = None
-    expected_loss: Annotated[float, Field(ge=0, lt=1)] = 0.2
-    compression: bool = False
-    dictionaries: tuple[str, ...] = ()
-    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
-    middleware: str = DEFAULT_MIDDLEWARE
-    domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
-    debug: bool = False
+    repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
+    repair: Repairs | Auto = AUTO
+    expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:
@@ -194,74 +287,48 @@ class SourceConfig:
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
 
-        :raises ConfigError: when -1 finds no digits or a number of 255 or more
+        :raises ConfigError: when ``auto`` finds no digits or a number of 255 or more
         """
-        if self.robot_id >= 0:
+        if self.robot_id != AUTO:
             return self.robot_id
         runs = re.findall(r"[0-9]+", self.namespace)
         if not runs:
-            raise ConfigError(f"robot_id = -1: namespace {self.namespace!r} has no digits; set robot_id to 0..254")
+            raise ConfigError(f"robot_id = auto: namespace {self.namespace!r} has no digits; set robot_id to 0..254")
         if int(runs[-1]) >= BROADCAST:
             raise ConfigError(
-                f"robot_id = -1: {int(runs[-1])} from namespace {self.namespace!r} is not below 255; "
+                f"robot_id = auto: {int(runs[-1])} from namespace {self.namespace!r} is not below 255; "
                 "set robot_id to 0..254"
             )
         return int(runs[-1])
 
 
-@dataclass(frozen=True, config=_STRICT)
-class SinkConfig:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SinkConfig(EndConfig):
     """ROS Sink (the paper, section 4.4).
 
-    :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
-    :param packet_len: bytes on the wire, 14..4095, the same on both ends
-    :param version: of the wire format, the same on both ends
-    :param key: file of the fleet's keys, with version 1; sealed packets alone are taken then
-    :param seal: how packets of this robot are sealed
-    :param state: file of what was heard before a restart (version 1), see :class:`SourceConfig`
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
     :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired (version 1)
-    :param robot_id: own id: its packets and those for others are dropped and counted; -1 takes everything
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all
-    :param compression: decode messages of packets with C = 1
-    :param dictionaries: files of dictionaries of your own, the same at both ends
-    :param topic_options: per topic name, over the registry's columns
     :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
     :param frame_prefix: before every frame name of a message, ``{src_id}`` is the sender; '' leaves messages as sent
     :param merge_tf: topic on which the transforms of all senders come out too, and their static ones, latched, on this
         + ``_static``; needs ``frame_prefix``; '' off
-    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE``
-    :param domain_id: DDS domain, -1 takes ROS_DOMAIN_ID
-    :param debug: readable log of headers, topic ids and entries
     """
 
-    registry: str = ""
-    packet_len: PacketLen = 220
-    version: WireVersion = 0
-    key: str = ""
-    seal: Literal["encrypt", "authenticate"] = "encrypt"
-    state: str = ""
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
-    publisher_depth: Count = 10
+    publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
-    hold_s: Seconds = 1.0
-    robot_id: RobotId = -1
-    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1)] = 16
-    max_source_bytes: Annotated[int, Field(ge=4096)] = 32_000_000
-    max_bytes: Annotated[int, Field(ge=4096)] = 64_000_000
-    compression: bool = False
-    dictionaries: tuple[str, ...] = ()
-    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
-    use_sim_time: bool = False
+    hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
+    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
+    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
+    max_bytes: Annotated[int, Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
+    use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
-    merge_tf: MergedTopic = ""
-    middleware: str = DEFAULT_MIDDLEWARE
-    domain_id: Annotated[int, Field(ge=-1, le=232)] = -1
-    debug: bool = False
+    merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
 
     @model_validator(mode="after")
     def _frames_stay_apart(self) -> SinkConfig:
@@ -278,7 +345,7 @@ class SinkConfig:
         return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
 
 
-@dataclass(frozen=True, config=_STRICT)
+@dataclass(frozen=True, config=STRICT)
 class BurstLoss:
     """Losses that come in bursts: the two-state model of Gilbert and Elliott, one step per packet.
 
@@ -307,33 +374,36 @@ class BurstLoss:
         return self.share_bad * self.loss_bad + (1 - self.share_bad) * self.loss_good
 
 
-@dataclass(frozen=True, config=_STRICT)
-class ChannelConfig:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ChannelConfig(Seeded):
     """The simulated channel between transmitter and receiver (docs/reference/channels.md).
 
     ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
     act on packets, whatever the PHY.
 
-    :param snr_db: mean burst power over noise power in the sampled band, dB, -50..100; None = no noise
+    :param snr_db: mean burst power over noise power in the sampled band, dB, -50..100; null = no noise
     :param frequency_offset: carrier frequency offset, fraction of the sample rate, -0.5..0.5
     :param epsilon: sample clock ratio, 1.0 = none, 0.99..1.01
     :param taps: complex impulse response at the sample rate
     :param doppler_hz: Rayleigh fading with this maximum Doppler shift, Hz; every tap fades by itself; 0 = none
     :param packet_loss: probability that a packet is dropped between PHY and sink, 0..1
-    :param burst_loss: losses in bursts; None = none
+    :param burst_loss: losses in bursts; null = none
     :param outages: [from_s, to_s) during which nothing passes, s since the run began, in order of time
-    :param seed: of noise, fading and losses
+    :param seed: of noise, fading and losses; in a scenario that of the scenario unless it is set
     """
 
-    snr_db: Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None = None
-    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    snr_db: Annotated[
+        Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None, Field(title="Signal-to-noise ratio (dB)")
+    ] = None
+    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5, title="Frequency offset (share of the sample rate)")] = (
+        0.0
+    )
     epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
     taps: Annotated[tuple[complex, ...], Field(min_length=1)] = (1.0 + 0.0j,)
-    doppler_hz: Seconds = 0.0
-    packet_loss: Probability = 0.0
+    doppler_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
     burst_loss: BurstLoss | None = None
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
-    seed: Count = 0
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:
@@ -359,26 +429,61 @@ class ChannelConfig:
         return bool(self.packet_loss or self.burst_loss or self.outages)
 
 
-@dataclass(frozen=True, config=_STRICT)
-class PhyConfig:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class PhyConfig(Sampled, Named):
     """Which physical layer, and how fast.
 
     :param name: a name of ``gr_ros2.phy.PHY``
-    :param sample_rate: samples/s; 0 = chosen by the experiment to carry ``headroom`` times the offered load
-    :param headroom: capacity over offered load where sample_rate is 0
+    :param headroom: capacity over offered load where sample_rate is auto
     :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
         numpy = the reference, several times slower
-    :param options: settings of that PHY, by its constructor's parameter names
+    :param options: settings of that PHY
     """
 
     name: str = "ofdm"
-    sample_rate: Seconds = 0.0
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
-    kernels: Kernels = "auto"
+    kernels: Kernels = AUTO
     options: dict[str, Any] = Field(default_factory=dict)
 
 
-@dataclass(frozen=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OverChannel:
+    """What crosses a channel.
+
+    :param channel: what lies between transmitter and receiver
+    """
+
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OneWay(OverChannel):
+    """One direction: the block that sends, what lies between, and the block that receives.
+
+    :param ros_source: the sending block
+    :param ros_sink: the receiving block
+    """
+
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class AnyLink(OneWay, Agreed, Named):
+    """What an experiment and a robot's end of a real link have in common.
+
+    :param name: what results, tables and errors call it; the file's name unless it is set
+    :param registry: CSV path, relative to the YAML file (on the command line: to the current directory), or the name of
+        a built-in one such as `table4`; the same at every robot
+    :param phy: which physical layer, and how fast; the same at every robot
+    :param localhost_only: DDS stays on the loopback interface; auto takes what the environment of ROS says
+    """
+
+    phy: PhyConfig = Field(default_factory=PhyConfig)
+    localhost_only: bool | Auto = AUTO
+
+
+@dataclass(frozen=True, config=STRICT)
 class DiagnosticsConfig:
     """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
 
@@ -424,11 +529,7 @@ def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
     try:
         return TypeAdapter(cls).validate_python(dict(values))
     except ValidationError as error:
-        items = error.errors()
-        # What several parts take over from the top level is wrong once, and not in every part.
-        top = [(item["loc"], item["input"]) for item in items if len(item["loc"]) == 1]
-        told = [item for item in items if len(item["loc"]) == 1 or (item["loc"][-1:], item["input"]) not in top]
-        raise ConfigError("; ".join(_explain(cls, item, where) for item in told)) from error
+        raise ConfigError(explain(cls, error.errors(), where)) from error
 
 
 def replaced(config: _T, **changes: Any) -> _T:
@@ -438,49 +539,6 @@ def replaced(config: _T, **changes: Any) -> _T:
     """
     current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
     return build(type(config), {**current, **changes})
-
-
-def meanings(cls: type[Any]) -> dict[str, str]:
-    """What the docstrings of a configuration class and its bases say of each setting, one line each."""
-    said: dict[str, str] = {}
-    for part in reversed(cls.__mro__):  # what a class says of a setting goes before what its base says
-        text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
-        said |= {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
-    return said
-
-
-def _explain(cls: type[Any], item: Any, where: str) -> str:
-    prefix = f"{where}: " if where else ""
-    key = ".".join(str(part) for part in item["loc"])
-    message = item["msg"].removeprefix("Value error, ")
-    if not key:
-        return f"{prefix}{message}"
-    owner = _class_at(cls, item["loc"][:-1])
-    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        known = [] if owner is None else [field.name for field in fields(owner)]
-        return f"{prefix}unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
-    meaning = {} if owner is None else meanings(owner)
-    said = re.split(r"[.;](?: |$)", meaning.get(item["loc"][-1], "").replace("``", ""))[0]  # its first sentence
-    said = f" ({said})" if said else ""
-    if item["type"] in ("missing", "missing_argument"):
-        return f"{prefix}{key} is missing{said}"
-    value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
-    kind, _, problem = item["type"].partition("_")
-    if kind in _KINDS and problem in ("type", "parsing", "str_parsing", "from_float"):
-        return f"{prefix}{key}{value}: must be {_KINDS[kind]}{said}"
-    asked = re.fullmatch(r"\w+ should (.+?)(?: after validation.*)?", message)
-    return f"{prefix}{key}{value}: " + (f"must {asked[1]}" if asked else f"{message[0].lower()}{message[1:]}")
-
-
-def _class_at(cls: Any, loc: tuple[Any, ...]) -> Any:
-    """The dataclass at a place in the tree, None where it is not one of ours."""
-    for part in loc:
-        known = {field.name: field.type for field in fields(cls)} if hasattr(cls, "__dataclass_fields__") else {}
-        annotation = known.get(part)
-        cls = getattr(cls, "__pydantic_fields__", {}).get(part)
-        cls = getattr(cls, "annotation", None) or annotation
-        cls = next((kind for kind in get_args(cls) if kind is not type(None)), cls)  # X of X | None
-    return cls if hasattr(cls, "__dataclass_fields__") else None
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from typing import overload
 from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
+from gr_ros2.old_names import new_name
+from gr_ros2.setting import AUTO
 from gr_ros2.wire import FORMATS, TableRow
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
@@ -62,7 +64,7 @@ class Topic:
 
     def republished(self, namespace_format: str, src_id: int) -> str:
         """Absolute topic name of this row at a sink, for one sender."""
-        if self.options.publish_as:
+        if self.options.publish_as != AUTO:
             name = filled(self.options.publish_as, src_id)
         else:
             name = f"{filled(namespace_format, src_id).rstrip('/')}/{self.name.lstrip('/')}"
@@ -71,7 +73,7 @@ class Topic:
     @property
     def latched(self) -> bool:
         """Whether late joiners get the last message: because the registry says so, or by ROS convention."""
-        if self.options.durability is not None:
+        if self.options.durability != AUTO:
             return self.options.durability == "transient_local"
         return self.name.rsplit("/", 1)[-1] in _LATCHED
 
@@ -253,7 +255,9 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
     known = [field.name for field in fields(TopicOptions)]
     for column in columns[2:]:
         if column not in known:
-            raise RegistryError(f"unknown column {column!r}; known are {', '.join(known)}", path, line)
+            new = new_name(column, known)
+            remedy = f"write {new}" if new else f"known are {', '.join(known)}"
+            raise RegistryError(f"unknown column {column!r}; {remedy}", path, line)
         if columns.count(column) > 1:
             raise RegistryError(f"column {column!r} stands twice", path, line)
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.config import read_yaml
+from gr_ros2.config import Agreed, read_yaml
 from gr_ros2.errors import ConfigError
 from gr_ros2.yaml_text import parse_yaml
 
 BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Folder of the built-in scenarios and registries."""
 
-SHARED_KEYS = ("registry", "packet_len", "version", "key", "seal", "state")
+SHARED_KEYS = tuple(field.name for field in fields(Agreed))
 """Settings both ends of a link must agree on."""
 
 _FILES = ("key", "state")

@@ -92,10 +92,11 @@ def test_every_row_has_a_summary_of_one_line(table: BackendTable[Backend]) -> No
 
 NAMES = {*MIDDLEWARE.own, *PHY.own, *FRONT_ENDS.own}
 MEANT = {
+    "config.py": {"sim"},  # the simulated robots, not the front end
     "doctor/ros.py": {"rclpy", "zenoh"},  # the Python module, and a part of the name of an RMW
     "race/endpoints.py": {"dds", "zenoh"},  # these very stacks are what races
-    "race/settings.py": {"zenoh", "sim"},
-    "run/scenario.py": {"sim"},  # the simulated robots, not the front end
+    "race/settings.py": {"zenoh"},
+    "run/scenario.py": {"sim"},
 }
 """Modules outside the back-ends' own that may name one, and which."""
 

@@ -40,10 +40,15 @@ def test_defaults_are_valid(cls: type[Any]) -> None:
 def test_the_defaults_are_the_designs() -> None:
     source, sink = SourceConfig(), SinkConfig()
     assert (source.packet_len, source.min_fragment, source.greedy, source.flush_timeout_s) == (220, 16, False, 0.0)
-    assert (source.robot_id, source.dst_id, source.subscriber_depth, source.hop) == (-1, 255, 10, 1)
-    assert (source.packet_rate, source.middleware, source.entry_ids, source.repeat_s) == (0, "dds", "sequential", 10.0)
+    assert (source.robot_id, source.dst_id, source.subscriber_depth, source.hop) == ("auto", 255, 10, 1)
+    assert (source.packet_rate, source.middleware, source.entry_ids, source.repeat_s) == (
+        "auto",
+        "dds",
+        "sequential",
+        10.0,
+    )
     assert (sink.namespace_format, sink.publisher_depth, sink.reassembly_timeout_s) == ("/rx_robot_{src_id}", 10, 1.0)
-    assert (sink.robot_id, sink.max_sources, sink.packet_len) == (-1, 16, 220)
+    assert (sink.robot_id, sink.max_sources, sink.packet_len) == ("auto", 16, 220)
 
 
 @pytest.mark.parametrize("cls", CONFIGS)
@@ -100,7 +105,7 @@ def test_out_of_range_names_key_and_value(cls: type[Any], key: str, value: Any) 
 
 @pytest.mark.parametrize(
     ("key", "low", "high"),
-    [("packet_len", 40, 4095), ("robot_id", -1, 254), ("dst_id", 0, 255), ("hop", 0, 15), ("domain_id", -1, 232)],
+    [("packet_len", 40, 4095), ("robot_id", 0, 254), ("dst_id", 0, 255), ("hop", 0, 15), ("domain_id", 0, 232)],
 )
 def test_the_ends_of_a_range_are_in_it(key: str, low: int, high: int) -> None:
     for value in (low, high):

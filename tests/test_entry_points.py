@@ -109,7 +109,7 @@ def test_the_command_line_takes_them_by_name_and_lives_with_broken_ones(folder: 
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     scenario = tmp_path / "echo.yaml"
     scenario.write_text(
-        "{name: echo, registry: table4, duration_s: 1, phy: {name: echo}, pace: flow, "
+        "{name: echo, registry: table4, duration_s: 1, phy: {name: echo}, time: unthrottled, "
         "ros_source: {robot_id: 1, namespace: /robot_1, middleware: echo, domain_id: 41}, "
         "ros_sink: {middleware: echo, domain_id: 42}}"
     )

@@ -166,7 +166,7 @@ def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("header", "row", "line", "says"),
     [
-        ("topic,type,colour", "odom,a/B,red", 1, "unknown column 'colour'; known are qos, reliability"),
+        ("topic,type,colour", "odom,a/B,red", 1, "unknown column 'colour'; known are queue_depth, qos, reliability"),
         ("topic,type,qos,qos", "odom,a/B,bulk,bulk", 1, "column 'qos' stands twice"),
         ("topic,type,qos", "odom,a/B,urgent", 2, "topic 'odom': qos = 'urgent'"),
         ("topic,type,depth", "odom,a/B,-1", 2, "topic 'odom': depth = '-1'"),
@@ -198,16 +198,16 @@ def test_names_on_both_graphs() -> None:
 @pytest.mark.parametrize(
     ("name", "durability", "latched"),
     [
-        ("map", None, True),
-        ("/tf_static", None, True),
-        ("robot/robot_description", None, True),
-        ("odom", None, False),
-        ("map_updates", None, False),
+        ("map", "auto", True),
+        ("/tf_static", "auto", True),
+        ("robot/robot_description", "auto", True),
+        ("odom", "auto", False),
+        ("map_updates", "auto", False),
         ("map", "volatile", False),
         ("odom", "transient_local", True),
     ],
 )
-def test_latched_by_convention_or_as_registered(name: str, durability: str | None, latched: bool) -> None:
+def test_latched_by_convention_or_as_registered(name: str, durability: str, latched: bool) -> None:
     options = TopicOptions(durability=durability)  # type: ignore[arg-type]
     assert Topic(0, name, ODOM, options).latched is latched
 

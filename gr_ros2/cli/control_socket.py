@@ -1,10 +1,10 @@
-"""How `gr-ros2 dashboard` finds programs of this user that run now, and asks one of them to show itself.
+"""Unix sockets with which `gr-ros2 dashboard` finds the running programs of this user, and asks one to open its page.
 
 Each program that can be looked at listens on a Unix socket named after its process in a folder only its user may enter;
 a client sends one line of JSON and gets one line back. Invariants: no other user can connect; a program that is killed
 leaves a socket that answers no more and is cleared away by the next client; a request never delays the program;
-whatever a client sends, or does not send, the next one is answered; nobody waits for anybody longer than a deadline,
-and nobody keeps more than a line of anybody else's.
+whatever a client sends or does not send, the next client is answered; every wait has a deadline, and at most one line
+is kept from each side.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LINE = 4096
 _MAX_CLIENTS = 32
 """Connected at a time; when one more comes, the one that has said nothing for longest is sent away."""
 _SPEAK_S = 2.0
-"""s a client gets to say what it wants."""
+"""s that a client may take to send its request."""
 _PAUSE_S = 0.1
 _WAIT_S = 10.0
 """s a client waits for the answer: a dashboard is drawn first."""
@@ -37,7 +37,7 @@ Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 def folder() -> Path:
-    """Where this user's sockets are; made if missing.
+    """The folder of this user's sockets; made if missing.
 
     :raises RunError: when somebody else owns it
     """
@@ -172,7 +172,7 @@ class _Client:
 
 
 def running_programs() -> dict[int, str]:
-    """What this user's programs are doing, by process id."""
+    """Names of this user's running programs, by process id."""
     found = {}
     for path in sorted(folder().glob("*.sock")):
         try:

@@ -10,6 +10,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from gr_ros2.backends import BackendTable
+from gr_ros2.setting import AUTO
 from gr_ros2.settings_file import BUILTIN_DIR
 
 
@@ -29,6 +30,17 @@ class ScenarioName(click.ParamType):
 
 
 SCENARIO = ScenarioName()
+
+
+class OrAuto(click.ParamType):
+    """`auto`, or what another type takes."""
+
+    def __init__(self, other: click.ParamType) -> None:
+        self._other = other
+        self.name = other.name
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if value == AUTO else self._other.convert(value, param, ctx)
 
 
 class RowName(click.ParamType):

@@ -9,6 +9,7 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.params import OrAuto
 from gr_ros2.config import build
 from gr_ros2.errors import ConfigError
 from gr_ros2.race.results import notes, race_grid, write_race
@@ -24,10 +25,10 @@ _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
 @click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20.")
 @click.option("--load", metavar="PERCENT,...", help="Of the link's capacity by the messages as they are; 50,200.")
-@click.option("--sample-rate", type=float, help="Samples/s instead of --load.")
+@click.option("--sample-rate", type=OrAuto(click.FLOAT), help="Samples/s instead of --load.")
 @click.option("--peers", metavar="NAME,...", help="Who races; default all.")
 @click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
-@click.option("--topic", help="Of the bag, where it has several.")
+@click.option("--topic", "bag_topic", help="Of the bag, where it has several.")
 @click.option("--duration", "duration_s", type=float, help="Seconds of the recording; default 15.")
 @click.option("--packet-len", type=int, help="Bytes of gr-ros2's packets; default 64.")
 @click.option("--seed", type=int, help="Of robot, losses and sender.")

@@ -16,6 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from gr_ros2.cli.params import OrAuto
 from gr_ros2.config import DEFAULT_MIDDLEWARE, TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
@@ -24,6 +25,7 @@ from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.names import INFRASTRUCTURE, checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
+from gr_ros2.setting import AUTO, Auto
 
 _NO_MESSAGES = {"srv": "a service", "action": "an action"}
 """Of types: the middle part where it is not ``msg``, and what has such types."""
@@ -89,10 +91,14 @@ class SharedGraph(click.ParamType):
     metavar="NAME",
     help=f"Whose graph: {', '.join(_SHARED)}.",
 )
-@click.option("--domain-id", default=-1, type=click.IntRange(-1, 232), help="DDS domain; -1 takes ROS_DOMAIN_ID.")
+@click.option(
+    "--domain-id", default=AUTO, type=OrAuto(click.IntRange(0, 232)), help="ROS domain; default auto: ROS_DOMAIN_ID."
+)
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
 @_out
-def from_graph(*, namespace: str, topics: str, middleware: str, domain_id: int, wait: float, out: Path | None) -> None:
+def from_graph(
+    *, namespace: str, topics: str, middleware: str, domain_id: int | Auto, wait: float, out: Path | None
+) -> None:
     """Write a registry from the topics that are published on the ROS graph."""
     with join_graph(middleware, domain_id=domain_id, node_name="gr_ros2") as graph:
         time.sleep(wait)  # discovery has no way to say that it is complete

@@ -30,6 +30,7 @@ from gr_ros2.run import runner
 from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.setting import AUTO
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
@@ -77,8 +78,8 @@ def _run(
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
-    # With pace `flow` the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
-    looked_at = audience(dashboard, console, scenario.name, instruments=scenario.pace == "airtime")
+    # Unthrottled, the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
+    looked_at = audience(dashboard, console, scenario.name, instruments=scenario.time != "unthrottled")
     with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
         seen: list[RunObserver] = [run_observers, *captures]
         if scenario.repetitions == 1:
@@ -97,7 +98,7 @@ def _run(
 def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
     """Something that shows how far a run is."""
     how_long = f"{scenario.duration_s:g} s" if scenario.duration_s else "its recording"
-    if scenario.time != "real":
+    if scenario.simulated:
         bar.console.print(f"{title}: {how_long} of simulated time, as fast as it can be computed", soft_wrap=True)
     task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
     shown = time.monotonic()
@@ -160,7 +161,9 @@ def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
     phy = result.phy
     if phy["sample_rate"]:
         chosen = (
-            "" if scenario.phy.sample_rate else f", chosen to carry {scenario.phy.headroom:.0%} of the offered load"
+            ""
+            if scenario.phy.sample_rate != AUTO
+            else f", chosen to carry {scenario.phy.headroom:.0%} of the offered load"
         )
         console.print(
             f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a packet of {scenario.packet_len} B takes "

@@ -1,6 +1,6 @@
 """Dictionaries: knowledge about the messages of some types that both ends have in advance.
 
-A dictionary is one JSON file: words (frame names and the like), constants (numbers that covariances are made of), and
+A dictionary is one JSON file: words (such as frame names), constants (numbers that covariances are made of), and
 for each type the float class of its fields, frequent sets of static values, a zstd dictionary, and the definition
 where ROS 2 Humble has none or another one.
 

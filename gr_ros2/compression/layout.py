@@ -1,7 +1,7 @@
 """From a shape to a compiled layout: one ``struct`` call splits a message, one packs it.
 
 An *outline* holds for all messages of a type with the same sequence lengths: which values there are and how each is
-coded. A *layout* adds the lengths of the strings, and thereby every offset.
+coded. A *layout* adds the lengths of the strings, which fixes every offset.
 
 Invariants: alignment gaps are skipped on the way in and zero on the way out; values are read as bits, never as floats,
 so that every NaN survives; how a value is coded depends only on the type and on sequence lengths, which the decoder

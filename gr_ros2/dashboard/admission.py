@@ -1,4 +1,4 @@
-"""Who may come in: the limits of the dashboard's web server, and what is said to those for whom there is no room.
+"""Admission of viewers: the limits of the dashboard's web server, and the page for viewers beyond the limit.
 
 Invariants: at most MAX_VIEWERS pages at a time, and one more is told so by a page that tries again; pages are made and
 drawn for the first time one after another, which in the long run takes at most a quarter of a core; connections are
@@ -37,7 +37,7 @@ _RETRY_S = 10
 SHARE, BURST_S = 0.25, 4.0
 """Of a core, for making pages and drawing them for the first time; and s whose share may be used at once."""
 _MAX_SOCKETS = 2 * MAX_VIEWERS
-"""WebSockets at a time; a page that is loaded anew has two for a moment."""
+"""WebSockets at a time; a page that is reloaded has two for a moment."""
 _MAX_CONNECTIONS = 256
 """Connections that are no WebSocket, at a time; a browser opens up to six."""
 _SILENT_S = 15
@@ -66,7 +66,7 @@ SETTINGS: dict[str, Any] = {
 
 
 class Admission:
-    """Counts those who are in."""
+    """Counts the open pages and WebSockets."""
 
     def __init__(self) -> None:
         self.documents: set[Document] = set()
@@ -77,7 +77,7 @@ class Admission:
 
     @property
     def full(self) -> bool:
-        """Whether one more page would be one too many."""
+        """Whether the limit of pages is reached."""
         return len(self.documents) + self.waiting >= MAX_VIEWERS
 
     def enter(self, document: Document) -> bool:
@@ -90,7 +90,7 @@ class Admission:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """For what takes long: one after another, and no more than the budget allows."""
+        """Run long work: one piece after another, and not more than the budget allows."""
         async with self._busy:
             await asyncio.sleep(self.budget.wait_s(time.monotonic()))
             begin = time.thread_time()
@@ -101,17 +101,17 @@ class Admission:
 
 
 class ProcessorBudget:
-    """Processor time that may be spent: a share of each second, of the last BURST_S seconds together."""
+    """Budget of processor time: a share of the last BURST_S seconds."""
 
     def __init__(self) -> None:
         self._paid_until = -math.inf
 
     def wait_s(self, now: float) -> float:
-        """s until something may be spent again."""
+        """s until processor time may be used again."""
         return max(0.0, self._paid_until - now)
 
     def spend(self, processor_s: float, now: float) -> None:
-        """So much has been spent."""
+        """Record used processor time."""
         self._paid_until = max(self._paid_until, now - BURST_S) + processor_s / SHARE
 
 

@@ -14,6 +14,7 @@ from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.middleware import join_graph
 from gr_ros2.middleware.ros_graph import discovery_options, resolve_domain_id
 from gr_ros2.names import INFRASTRUCTURE
+from gr_ros2.setting import AUTO
 
 ROS_ROOT = Path("/opt/ros")
 _LOOK_S = 3.0
@@ -53,7 +54,7 @@ def rmw() -> Finding:
 def domain() -> Finding:
     """The domain and how far discovery goes."""
     try:
-        number, options = resolve_domain_id(-1), discovery_options(None)
+        number, options = resolve_domain_id(AUTO), discovery_options()
     except ConfigError as error:
         remedy = "unset ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE ROS_STATIC_PEERS ROS_LOCALHOST_ONLY"
         return Finding("domain", "failed", str(error), remedy)
@@ -64,7 +65,7 @@ def domain() -> Finding:
 def graph() -> Iterator[Finding]:
     """The topics that are published in this domain."""
     try:
-        with join_graph(DEFAULT_MIDDLEWARE, domain_id=-1, node_name="gr_ros2_doctor") as joined:
+        with join_graph(DEFAULT_MIDDLEWARE, domain_id=AUTO, node_name="gr_ros2_doctor") as joined:
             time.sleep(_LOOK_S)
             found = joined.discover()
     except GrRos2Error as error:

@@ -1,6 +1,6 @@
 """What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
 
-Invariant: a sink must not publish what a source on the same graph subscribes, or a message would go round for ever;
+Invariant: a sink must not publish what a source on the same graph subscribes, or a message would circulate without end;
 every block of this process is checked against every other when it is made.
 """
 
@@ -29,6 +29,7 @@ from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.settings import settings_of
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.setting import Auto
 from gr_ros2.wire import BROADCAST, TableRow
 
 _T = TypeVar("_T")
@@ -89,8 +90,9 @@ class Start:
     :param boot: number of the start, greater than all before
     :param heard: how far other robots had been heard before, by robot id: boot number and packet number
     :param save: stores that, see :class:`gr_ros2.boots.BootFile`
-    :param reports: whether it can be heard by those whom it hears
+    :param reports: whether the robots that it receives from can receive from it
     :param half_duplex: whether what it says takes air from what it hears
+    :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     """
 
     boot: int = 1
@@ -99,6 +101,7 @@ class Start:
     save: Save | None = None
     reports: bool = False
     half_duplex: bool = False
+    any_length: bool = False
 
 
 def make_endpoint(
@@ -130,7 +133,7 @@ def make_endpoint(
     dictionaries = () if sink is None else sink.dictionaries
     return EndpointV1(
         None if source is None or not registry else registry.with_options(source.topic_options),
-        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex),
+        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
@@ -202,7 +205,7 @@ class Graph:
     :raises GrRos2Error: see :func:`gr_ros2.middleware.join_graph`
     """
 
-    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int, node_name: str) -> None:
+    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int | Auto, node_name: str) -> None:
         if isinstance(middleware, Middleware):
             self.middleware = middleware
             self.owned = False

@@ -29,11 +29,13 @@ from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.v1.settings import NOBODY
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
+from gr_ros2.setting import AUTO
 
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
@@ -79,7 +81,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             check_outputs(rows, self.config)
             self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.config.robot_id, reports=False)
+            own = NOBODY if self.config.robot_id == AUTO else self.config.robot_id
+            start = start_of(self.config, own, reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
         self._end, self._work = end.endpoint, end.work
         self._announced: dict[tuple[int, int], Topic] = {}
@@ -98,7 +101,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
         # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered anew. At most as many as there are source ids times topics of the registry.
+        # discovered again. At most as many as there are source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._published: Counter[tuple[int, int]] = Counter()
@@ -356,8 +359,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _advertise(self, key: tuple[int, int]) -> Publisher:
         topic = self._topic(key)
-        depth = self.config.publisher_depth if topic.options.depth is None else topic.options.depth
-        qos = Qos(topic.options.reliability, "transient_local" if topic.latched else "volatile", depth)
+        depth = self.config.publisher_depth if topic.options.depth == AUTO else topic.options.depth
+        asked = topic.options.reliability
+        qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
         publisher = self._publishers[key] = self.middleware.advertise(self._name(key), topic.type_name, qos)
         return publisher
 

@@ -35,6 +35,7 @@ from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.setting import AUTO, Auto
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 16
@@ -224,8 +225,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "middleware": dict(self.middleware.counters),
             }
 
-    def set_packet_rate(self, packet_rate: float) -> None:
-        """Packets/s offered to the flowgraph, 0 unpaced (raises ConfigError out of range, like all setters)."""
+    def set_packet_rate(self, packet_rate: float | Auto) -> None:
+        """Packets/s at most, auto as credits come, 0 unpaced (raises ConfigError out of range, like all setters)."""
         self._reconfigure(packet_rate=packet_rate)
 
     def set_flush_timeout_s(self, flush_timeout_s: float) -> None:
@@ -268,10 +269,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _subscribe(self) -> None:
         for name, topic in self.subscribed.items():
             options = topic.options
-            depth = self.config.subscriber_depth if options.depth is None else options.depth
+            depth = self.config.subscriber_depth if options.depth == AUTO else options.depth
             if topic.topic_id in self._static and depth:
                 depth = max(depth, STATIC_DEPTH)
-            qos = Qos(options.reliability, options.durability, depth)
+            reliability = None if options.reliability == AUTO else options.reliability
+            durability = None if options.durability == AUTO else options.durability
+            qos = Qos(reliability, durability, depth)
             callback = partial(self._take, topic.topic_id)
             subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
             self._subscriptions[topic.topic_id] = subscription

@@ -73,7 +73,7 @@ class Endpoint(Protocol):
 
         :param reliable: whether all are
         :param depth: of their history, 0 unbounded or not known
-        :param lifespan_s: s after which a message is of no use, 0 for ever
+        :param lifespan_s: s after which a message is useless, 0 without limit
         :param period_s: s within which they promise a message, 0 no promise
         :return: whether that changed its queue; ``queue`` has what it is
         """

@@ -16,6 +16,7 @@ from math import inf
 from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.setting import AUTO
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +134,9 @@ def queue_for(
     :param lifespan_s: s, 0 without limit
     :param period_s: their deadline: s within which they promise a message, 0 no promise
     """
-    if options.queue is not None:
-        return options.queue, options.deadline_s
-    deadline_s = options.deadline_s or lifespan_s
-    if options.depth == 1 or (options.depth is None and (depth == 1 or period_s)):
+    if options.queue != AUTO:
+        return options.queue, 0.0 if options.deadline_s == AUTO else options.deadline_s
+    deadline_s = lifespan_s if options.deadline_s == AUTO else options.deadline_s
+    if options.depth == 1 or (options.depth == AUTO and (depth == 1 or period_s)):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

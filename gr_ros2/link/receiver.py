@@ -19,6 +19,7 @@ from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.registry import Registry
+from gr_ros2.setting import AUTO
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.v0 import V0, Packet
 
@@ -106,7 +107,7 @@ class Receiver:
     def _admit(self, packet: Packet, now: float) -> _Source | None:
         """The source of a packet, None if the packet is not for this receiver."""
         own = self.config.robot_id
-        if own >= 0:
+        if own != AUTO:
             if packet.src_id == own:
                 self.stats.dropped["own"] += 1
                 return None

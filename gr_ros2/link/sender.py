@@ -25,6 +25,7 @@ from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.registry import Registry, Topic
+from gr_ros2.setting import AUTO
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
@@ -143,10 +144,10 @@ class Sender:
         if plan is None or now < self._departure(plan):
             return None
         data = self._compose(plan, now)
-        if self._credits is not None:
+        if self._credits is not None and not self.unpaced:
             self._spend_credit(now)
-        if self.config.packet_rate > 0:
-            interval = 1 / self.config.packet_rate
+        if self._rate:
+            interval = 1 / self._rate
             # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.
             self._slot = max(self._slot, now - interval) + interval
         return data
@@ -187,21 +188,31 @@ class Sender:
     def depth(self, topic_id: int) -> int:
         """Messages of a topic that may wait, 0 unbounded."""
         depth = self.registry[topic_id].options.queue_depth
-        return self.config.queue_depth if depth is None else depth
+        return self.config.queue_depth if depth == AUTO else depth
 
     def use_credit(self) -> None:
-        """From now on a packet leaves only for a credit."""
+        """From now on a packet leaves only for a credit, unless it is :attr:`unpaced`."""
         if self._credits is None:
             self._credits = 0
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take this many further packets; the first call implies ``use_credit``."""
-        self._credits = (self._credits or 0) + packets
+        """The PHY can take this many further packets; the first call does what ``use_credit`` does."""
+        self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
 
     @property
     def out_of_credit(self) -> bool:
-        """Whether no packet can leave before the next credit, whatever is submitted."""
-        return self._credits == 0
+        """Whether nothing leaves before the next credit, whatever is submitted."""
+        return self._credits == 0 and not self.unpaced
+
+    @property
+    def unpaced(self) -> bool:
+        """Whether every packet leaves as soon as there is one, whatever the PHY grants."""
+        return self.config.packet_rate == 0
+
+    @property
+    def _rate(self) -> float:
+        """Packets/s at most, 0 without limit."""
+        return 0.0 if self.config.packet_rate == AUTO else self.config.packet_rate
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
@@ -213,8 +224,8 @@ class Sender:
 
         0 where neither is known.
         """
-        if self.config.packet_rate > 0:
-            return 1 / self.config.packet_rate
+        if self._rate:
+            return 1 / self._rate
         return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
 
     @property

@@ -20,6 +20,7 @@ from gr_ros2.middleware.bag_files import BagContents, BagMessage, bag_contents, 
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.registry import normalize_type
+from gr_ros2.setting import AUTO, Auto
 
 __all__ = ["BagMessage", "BagMiddleware", "BagPublisher", "bag_definitions", "bag_topics", "read_bag"]
 
@@ -106,7 +107,7 @@ class BagMiddleware(Middleware):
         storage: Literal["mcap", "sqlite3"] = "mcap",
         definitions: Mapping[str, str] | None = None,
         lossless: bool = True,
-        domain_id: int = -1,  # noqa: ARG002
+        domain_id: int | Auto = AUTO,  # noqa: ARG002
         node_name: str = "gr_ros2",  # noqa: ARG002
         namespace: str = "/",  # noqa: ARG002
     ) -> None:

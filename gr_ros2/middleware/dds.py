@@ -32,6 +32,7 @@ from gr_ros2.middleware.cdr_dds import (
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
 from gr_ros2.registry import normalize_type
+from gr_ros2.setting import AUTO, Auto
 
 _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
 _PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
@@ -42,10 +43,10 @@ _log = logging.getLogger(__name__)
 class DdsMiddleware(DdsParticipant):
     """A participant.
 
-    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
+    :param domain_id: 0..232, auto takes ROS_DOMAIN_ID, default 0
     :param node_name: as ``ros2 node list`` shows it
     :param namespace: of the node
-    :param localhost_only: use the loopback interface only; None takes ROS_LOCALHOST_ONLY. Where both are unset,
+    :param localhost_only: use the loopback interface only; auto takes ROS_LOCALHOST_ONLY. Where both are unset,
         ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS apply
     :raises ConfigError: a name, number or environment variable is malformed, or the domain is open with other options
     :raises MiddlewareError: the domain cannot be joined
@@ -56,10 +57,10 @@ class DdsMiddleware(DdsParticipant):
     def __init__(
         self,
         *,
-        domain_id: int = -1,
+        domain_id: int | Auto = AUTO,
         node_name: str = "gr_ros2",
         namespace: str = "/",
-        localhost_only: bool | None = None,
+        localhost_only: bool | Auto = AUTO,
     ) -> None:
         super().__init__()
         self.domain_id: int = ros_graph.resolve_domain_id(domain_id)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware.base import Middleware
+from gr_ros2.setting import AUTO, Auto
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,13 @@ MIDDLEWARE = BackendTable(
 )
 
 
-def join_graph(name: str, *, domain_id: int, node_name: str, localhost_only: bool | None = None) -> Middleware:
+def join_graph(name: str, *, domain_id: int | Auto, node_name: str, localhost_only: bool | Auto = AUTO) -> Middleware:
     """A new participant on a graph; the caller closes it.
 
     :param name: of the table
-    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID
+    :param domain_id: 0..232, auto takes ROS_DOMAIN_ID
     :param node_name: its name on the graph
-    :param localhost_only: whether it uses only the loopback interface, where the middleware supports that; None takes
+    :param localhost_only: whether it uses only the loopback interface, where the middleware supports that; auto takes
         the environment's setting
     :raises ConfigError: for a name that is not in the table or stands for a file; for a setting that the middleware
         refuses
@@ -91,7 +92,7 @@ def join_graph(name: str, *, domain_id: int, node_name: str, localhost_only: boo
             "over, or play it on a graph"
         )
     settings: dict[str, Any] = {"domain_id": domain_id, "node_name": node_name}
-    if row.localhost_only and localhost_only is not None:
+    if row.localhost_only and localhost_only != AUTO:
         settings["localhost_only"] = localhost_only
     graph: Middleware = cls(**settings)
     return graph

@@ -17,6 +17,7 @@ from gr_ros2.middleware.adapt import offered, refused_policies
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, TopicInfo, grouped
 from gr_ros2.middleware.delivery import CallbackThread, QueuedSubscription
 from gr_ros2.registry import normalize_type
+from gr_ros2.setting import Auto
 
 
 class _Graph:
@@ -146,14 +147,14 @@ class MemorySubscription(QueuedSubscription):
 class MemoryMiddleware(Middleware):
     """A participant of a graph in this process.
 
-    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID; participants of equal domain share a graph
+    :param domain_id: 0..232, auto takes ROS_DOMAIN_ID; participants of equal domain share a graph
     :param node_name: checked, otherwise unused; likewise the namespace
     :raises ConfigError: a name or number is malformed
     """
 
     name = "memory"
 
-    def __init__(self, *, domain_id: int = 0, node_name: str = "gr_ros2", namespace: str = "/") -> None:
+    def __init__(self, *, domain_id: int | Auto = 0, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
         self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         ros_graph.check_node(node_name, namespace)

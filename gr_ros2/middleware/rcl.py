@@ -11,14 +11,15 @@ import threading
 from collections.abc import Iterator
 
 from gr_ros2.errors import MiddlewareError
+from gr_ros2.setting import AUTO, Auto
 
 _environment = threading.Lock()
 
 
 @contextlib.contextmanager
-def told(localhost_only: bool | None) -> Iterator[None]:
+def told(localhost_only: bool | Auto) -> Iterator[None]:
     """Set ROS_LOCALHOST_ONLY: rcl reads it when a context is initialised, and offers no other interface for it."""
-    if localhost_only is None:
+    if localhost_only == AUTO:
         yield
         return
     with _environment:

@@ -45,6 +45,7 @@ from gr_ros2.middleware.base import (
 from gr_ros2.middleware.rcl import told, translated
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.registry import normalize_type
+from gr_ros2.setting import AUTO, Auto
 
 try:  # its name since Iron
     from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -125,10 +126,10 @@ class RclpyMiddleware(Middleware):
 
     ``counters`` also has ``executor_failed``: errors of rclpy itself, for instance a message that it could not take.
 
-    :param domain_id: 0..232; -1 takes ROS_DOMAIN_ID
+    :param domain_id: 0..232; auto takes ROS_DOMAIN_ID
     :param node_name: base name of the node
     :param namespace: its namespace
-    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
+    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless auto
     :raises ConfigError: for a domain id or name ROS does not allow
     :raises MiddlewareError: when ROS cannot start, e.g. no RMW installed
     """
@@ -138,10 +139,10 @@ class RclpyMiddleware(Middleware):
     def __init__(
         self,
         *,
-        domain_id: int = -1,
+        domain_id: int | Auto = AUTO,
         node_name: str = "gr_ros2",
         namespace: str = "/",
-        localhost_only: bool | None = None,
+        localhost_only: bool | Auto = AUTO,
     ) -> None:
         super().__init__()
         self.domain_id = domain_id = resolve_domain_id(domain_id)

@@ -9,13 +9,18 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from functools import cache
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.names import check_node, check_topic
+from gr_ros2.setting import AUTO, Auto
 
 __all__ = [
     "DISCOVERY_TOPIC",
@@ -47,6 +52,13 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 PARTICIPANT_USER_DATA = b"enclave=/;"
 
+_DISCOVERY_MESSAGES = (
+    "rmw_dds_common/msg/Gid",
+    "rmw_dds_common/msg/NodeEntitiesInfo",
+    "rmw_dds_common/msg/ParticipantEntitiesInfo",
+)
+
+
 _OURS = b"gr_ros2=;"
 DISCOVERY_USER_DATA = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e;" + _OURS
 """User data of this package's endpoint on ros_discovery_info: the hash of its type since Iron, and a mark of this
@@ -54,7 +66,6 @@ package."""
 
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
 _TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
-_CDR_LE = b"\x00\x01\x00\x00"
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 
 
@@ -80,13 +91,13 @@ def ros_type(name: str) -> str:
     return f"{match[1]}/{match[2]}/{match[3]}" if match else name
 
 
-def resolve_domain_id(domain_id: int, environment: Mapping[str, str] = os.environ) -> int:
-    """The DDS domain, 0..232; -1 takes ROS_DOMAIN_ID, default 0.
+def resolve_domain_id(domain_id: int | Auto, environment: Mapping[str, str] = os.environ) -> int:
+    """The DDS domain, 0..232; auto takes ROS_DOMAIN_ID, default 0.
 
     :raises ConfigError: out of range, or ROS_DOMAIN_ID is not a number
     """
     origin, text = "domain_id", str(domain_id)
-    if domain_id == -1:
+    if domain_id == AUTO:
         origin, text = "ROS_DOMAIN_ID", environment.get("ROS_DOMAIN_ID", "").strip() or "0"
     if not re.fullmatch(r"[0-9]{1,3}", text) or int(text) > MAX_DOMAIN_ID:
         raise ConfigError(f"{origin} = {text!r}: a DDS domain is 0..{MAX_DOMAIN_ID}")
@@ -114,18 +125,18 @@ class DiscoveryOptions:
 
 
 def discovery_options(
-    localhost_only: bool | None = None, environment: Mapping[str, str] = os.environ
+    localhost_only: bool | Auto = AUTO, environment: Mapping[str, str] = os.environ
 ) -> DiscoveryOptions:
     """The options of ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS; the first takes
     precedence, as in rcl.
 
-    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless None
+    :param localhost_only: in place of ROS_LOCALHOST_ONLY, unless auto
     :raises ConfigError: for an invalid value (where rcl assumes a value and warns)
     """
     text = environment.get("ROS_LOCALHOST_ONLY", "").strip() or "0"
     if text not in ("0", "1"):
         raise ConfigError(f"ROS_LOCALHOST_ONLY = {text!r}: write 0 or 1")
-    if localhost_only or (localhost_only is None and text == "1"):
+    if localhost_only is True or (localhost_only == AUTO and text == "1"):
         return DiscoveryOptions("LOCALHOST")
     found = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip() or "SUBNET"
     if found not in get_args(DiscoveryRange):
@@ -179,13 +190,16 @@ def participant_entities_info(
 
     :param participant: GUID, 16 bytes; likewise those of readers and writers
     """
-    body = bytearray(participant.ljust(gid_bytes, b"\0"))
-    body += struct.pack("<I", 1)
-    for text in (namespace, node_name):
-        data = text.encode() + b"\0"
-        body += struct.pack("<I", len(data)) + data
-        body += bytes(-len(body) % 4)
-    for guids in (readers, writers):
-        body += struct.pack("<I", len(guids))
-        body += b"".join(guid.ljust(gid_bytes, b"\0") for guid in guids)
-    return _CDR_LE + bytes(body)
+    store = _discovery_types(gid_bytes)
+    gid_class, node_class, info_class = (store.types[name] for name in _DISCOVERY_MESSAGES)
+
+    def gids(*guids: bytes) -> list[Any]:
+        return [gid_class(np.frombuffer(guid.ljust(gid_bytes, b"\0"), np.uint8)) for guid in guids]
+
+    node = node_class(namespace, node_name, gids(*readers), gids(*writers))
+    return bytes(store.serialize_cdr(info_class(*gids(participant), [node]), _DISCOVERY_MESSAGES[-1]))
+
+
+@cache
+def _discovery_types(gid_bytes: int) -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE if gid_bytes == 24 else Stores.ROS2_JAZZY)

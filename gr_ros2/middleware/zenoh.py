@@ -42,6 +42,7 @@ from gr_ros2.middleware.zenoh_graph import (
     topic_key,
 )
 from gr_ros2.registry import normalize_type
+from gr_ros2.setting import AUTO, Auto
 
 _DEFAULTS = {
     "mode": '"peer"',
@@ -87,7 +88,7 @@ def session_config(environment: Mapping[str, str] = os.environ) -> Any:
 class ZenohMiddleware(Middleware):
     """One session with one node.
 
-    :param domain_id: 0..232, -1 takes ROS_DOMAIN_ID, default 0
+    :param domain_id: 0..232, auto takes ROS_DOMAIN_ID, default 0
     :param node_name: as ``ros2 node list`` shows it
     :param namespace: of the node
     :raises ConfigError: a name, number or environment variable is malformed
@@ -96,7 +97,7 @@ class ZenohMiddleware(Middleware):
 
     name = "zenoh"
 
-    def __init__(self, *, domain_id: int = -1, node_name: str = "gr_ros2", namespace: str = "/") -> None:
+    def __init__(self, *, domain_id: int | Auto = AUTO, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()
         self.domain_id: int = ros_graph.resolve_domain_id(domain_id)
         self._node_name, self._namespace = ros_graph.check_node(node_name, namespace)

@@ -31,7 +31,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     :param airtime_of: the same by the packet's bytes, at most ``airtime``; None = that of all
     :param lead: s before the air is free at which a credit is given
     :param early: s before its airtime is over at which a packet passes, see :class:`AirtimeClock`
-    :param times: keep when each packet passed; a link that runs for ever would keep too many
+    :param times: keep when each packet passed; a link that runs without end would keep too many
     :ivar lateness: of packets against when they were to pass
     :ivar passed_at: s, monotonic, of every packet; empty unless asked for
     :raises ConfigError: for a value out of range

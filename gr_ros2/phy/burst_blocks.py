@@ -28,26 +28,32 @@ from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive
+from gr_ros2.setting import AUTO, Auto
 
 STOCK = "GNU Radio's blocks"
 """Text of ``runs_on`` for PHYs made of GNU Radio's own blocks."""
 _log = logging.getLogger(__name__)
 
 
+_GAP = 32
+"""Zero samples after a packet, unless a receiver needs more."""
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class BurstOptions:
     """Settings that every burst PHY has.
 
-    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next
+    :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next.
+        auto = 32, or as many as another receiver needs
     :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
     :param lengths: ``any`` = a packet is as long on the air as its bytes need, and says so; ``fixed`` = as long as the
         longest, as the blocks of others send (``detection_threshold: stock``, ``lora_sdr``) whatever is set here. The
         same at both ends
     """
 
-    gap: Annotated[int, Field(ge=16, le=100_000)] = 32
-    fec: CodeName = "none"
-    lengths: Literal["any", "fixed"] = "any"
+    gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
+    fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
+    lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
 
 
 class BurstPhy(Phy):
@@ -62,7 +68,7 @@ class BurstPhy(Phy):
     def __init__(self, packet_len: int, sample_rate: float, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)
         self._padded = False
-        self.gap: int = BurstOptions.gap if self.options.gap is None else self.options.gap
+        self.gap: int = _GAP if self.options.gap == AUTO else self.options.gap
 
     def frames(self, **form: Any) -> Frames:
         """The frames of this link, as set.

@@ -16,8 +16,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.burst import Frames, Samples
-from gr_ros2.phy.burst_blocks import BurstOptions
-from gr_ros2.phy.linear import LinearModem, LinearPhy, Reals, preamble_steps, shape
+from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, Reals, preamble_steps, shape
 
 _PULSE_SYMBOLS = 4
 """Length of the Gaussian frequency pulse."""
@@ -28,15 +27,13 @@ _DESIGN_NOISE = 0.1
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class GfskOptions(BurstOptions):
+class GfskOptions(LinearOptions):
     """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
 
-    :param sps: samples per bit, 2..64
     :param bt: bandwidth-time product of the Gaussian filter, 0.3..1; smaller is narrower and needs more SNR
     """
 
-    sps: Annotated[int, Field(ge=2, le=64)] = 4
-    bt: Annotated[float, Field(ge=0.3, le=1)] = 0.5
+    bt: Annotated[float, Field(ge=0.3, le=1, title="Bandwidth-time product")] = 0.5
 
 
 class GfskModem(LinearModem):

@@ -9,13 +9,15 @@ payload begins with the word of its length, where lengths differ.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.burst import BurstModem, Frames, ModemConstants, Reading, Samples, Search
-from gr_ros2.phy.burst_blocks import BurstPhy
+from gr_ros2.phy.burst_blocks import BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.length_word import WORD_BITS, LengthWord
 from gr_ros2.phy.soft import Points, spread_about
@@ -326,9 +328,20 @@ class LinearModem(BurstModem):
         return parabola_peak(*(float(height) for height in heights))
 
 
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LinearOptions(BurstOptions):
+    """Settings that every single-carrier PHY has.
+
+    :param sps: samples per symbol, with one bit per symbol samples per bit
+    """
+
+    sps: Annotated[int, Field(ge=2, le=64, title="Samples per symbol")] = 4
+
+
 class LinearPhy(BurstPhy):
     """A PHY of single-carrier bursts, whose mean power is 1."""
 
+    Options = LinearOptions
     modem: LinearModem
 
     @property

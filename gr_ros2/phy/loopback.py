@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
@@ -20,21 +19,18 @@ from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.phy.window import CreditWindow
 
-Pace = Literal["airtime", "flow"]
-
 
 class LoopbackLink(PacketPath, Flowgraph):
     """A flowgraph from a source's message port `pdus` to a sink's.
 
     :param phy: which physical layer
-    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``, and `credit` in where
-        ``paced``
+    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
     :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
-    :param pace: `airtime` as on the air (:class:`AirtimeGate`), `flow` as fast as the flowgraph takes it
-        (:class:`CreditWindow`)
-    :param paced: credits pace the source; False offers every packet at once, as the paper does. A PHY without samples
-        has no airtime to pace by, except with pace `flow`
+    :param throttled: packets pass at the pace of the air (:class:`AirtimeGate`); False lets them pass as fast as the
+        flowgraph takes them (:class:`CreditWindow`)
+    :param paced: either grants credits to the source; False for a source without port `credit`. A PHY without samples
+        has no airtime to pace by
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
     :raises ConfigError: for a channel that this PHY cannot have
@@ -47,7 +43,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         sink: Any,
         *,
         channel: ChannelConfig | None = None,
-        pace: Pace = "airtime",
+        throttled: bool = True,
         paced: bool = True,
         instrumented: bool = False,
     ) -> None:
@@ -55,11 +51,9 @@ class LoopbackLink(PacketPath, Flowgraph):
         self.phy, self.source, self.sink = phy, source, sink
         self.channel = ChannelConfig() if channel is None else channel
         phy.check_channel(self.channel)
-        if pace not in get_args(Pace):
-            raise ConfigError(f"pace = {pace!r}: write {' or '.join(get_args(Pace))}")
-        self._pace = pace
+        self._throttled = throttled
         last = source
-        if phy.has_samples and pace == "airtime":
+        if phy.has_samples and throttled:
             airtime_of = phy.airtime if phy.any_length else None
             self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)
@@ -78,14 +72,14 @@ class LoopbackLink(PacketPath, Flowgraph):
             last = self._follow(last, self._loss)
         self._follow(last, sink)
         # Keep a reference, since GNU Radio holds none to a Python block.
-        self._pacer = CreditWindow(self._progress) if pace == "flow" else self._gate
+        self._pacer = self._gate if throttled else CreditWindow(self._progress)
         if paced and self._pacer is not None:
             source.use_credit()
             self.msg_connect(self._pacer, "credit", source, "credit")
 
     def start(self, max_noutput_items: int = 10_000_000) -> None:
         super().start(max_noutput_items)
-        if self._pace == "airtime":
+        if self._throttled:
             self.phy.prefer_latency()
 
     def run_began(self, now: float) -> None:

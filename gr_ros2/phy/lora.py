@@ -24,6 +24,7 @@ from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import parabola_peak
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
+from gr_ros2.setting import AUTO, Auto
 
 MAX_BURST = 1 << 22
 """Samples; a longer burst would take more memory than small computers have."""
@@ -67,25 +68,24 @@ class LoraOptions(BurstOptions):
     :param implementation: ``own``, or ``lora_sdr`` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr,
         which has to be installed. Neither understands the other, so it is chosen by name, the same at both ends, and
         never by what is installed
-    :param gap: zero samples after each packet, up to 100000; None = 32, with ``lora_sdr`` 32 chips. Below 16, with
+    :param gap: zero samples after each packet, up to 100000; auto = 32, with ``lora_sdr`` 32 chips. Below 16, with
         ``lora_sdr`` 24 chips, the receiver would keep the last packet waiting for the next
-    :param oversampling: ``lora_sdr`` only: samples per chip, 2, 4 or 8; None = 2. With 1 the module loses packets that
+    :param oversampling: ``lora_sdr`` only: samples per chip, 2, 4 or 8; auto = 2. With 1 the module loses packets that
         come half a sample late; symbols of more than 2048 samples (factor 11 with 2) make it crash and are refused
-    :param sync_word: ``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; None = 0x12, private networks
+    :param sync_word: ``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks
     :param ldro: ``lora_sdr`` only: low data rate optimisation, two bits fewer per symbol; LoRa modems turn it on where
-        a symbol takes more than 16 ms; None = off
+        a symbol takes more than 16 ms; auto = off
     :param carrier_hz: ``lora_sdr`` only: the radio's carrier frequency, 1e6..4.2e9 Hz, by which the module tells how
-        much the clocks differ; None = it takes them to be alike
+        much the clocks differ; null = it takes them to be alike
     """
 
-    spreading_factor: Annotated[int, Field(ge=7, le=12)] = 7
-    coding_rate: Annotated[int, Field(ge=1, le=4)] = 4
+    spreading_factor: Annotated[int, Field(ge=7, le=12, title="Spreading factor (bits/symbol)")] = 7
+    coding_rate: Annotated[int, Field(ge=1, le=4, title="Coding rate (check bits per 4 bits)")] = 4
     implementation: Literal["own", "lora_sdr"] = "own"
-    gap: Annotated[int, Field(ge=16, le=100_000)] | None = None  # type: ignore[assignment]
-    oversampling: Literal[2, 4, 8] | None = None
-    sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | None = None
-    ldro: bool | None = None
-    carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9)] | None = None
+    oversampling: Annotated[Literal[2, 4, 8] | Auto, Field(title="Oversampling (samples/chip)")] = AUTO
+    sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | Auto = AUTO
+    ldro: Annotated[bool | Auto, Field(title="Low data rate optimisation")] = AUTO
+    carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9, title="Carrier frequency (Hz)")] | None = None
 
 
 class _ChirpPlace(NamedTuple):
@@ -415,7 +415,7 @@ class LoraPhy(BurstPhy):
             self.gap = self._sdr.gap
             return
         for name in _SDR_ONLY:
-            if getattr(chosen, name) is not None:
+            if getattr(chosen, name) != getattr(LoraOptions, name):
                 raise ConfigError(f"phy lora: {name} = {getattr(chosen, name)}: only with implementation = lora_sdr")
         self.modem: LoraModem = LoraModem(self.frames(), chosen)
         if self.modem.burst_samples > MAX_BURST:
@@ -435,11 +435,11 @@ class LoraPhy(BurstPhy):
                 f"phy lora: packet_len = {self.packet_len}: at most {MAX_PAYLOAD - CRC_LEN} with lora_sdr; "
                 f"a LoRa frame has {MAX_PAYLOAD} bytes, {CRC_LEN} of them our CRC-32"
             )
-        sync_word = 0x12 if chosen.sync_word is None else chosen.sync_word
+        sync_word = 0x12 if chosen.sync_word == AUTO else chosen.sync_word
         if not sync_word & 0x0F:
             raise ConfigError(f"phy lora: sync_word = 0x{sync_word:02x}: the module takes no digit of 0")
-        per_chip = chosen.oversampling or 2
-        gap = _SDR_GAP * per_chip if chosen.gap is None else chosen.gap
+        per_chip = 2 if chosen.oversampling == AUTO else chosen.oversampling
+        gap = _SDR_GAP * per_chip if chosen.gap == AUTO else chosen.gap
         if gap < _SDR_LEAST_GAP * per_chip:
             raise ConfigError(
                 f"phy lora: gap = {gap}: below {_SDR_LEAST_GAP * per_chip} the last packet stays in gr-lora_sdr"
@@ -456,7 +456,7 @@ class LoraPhy(BurstPhy):
             coding_rate=chosen.coding_rate,
             oversampling=per_chip,
             sync_word=sync_word,
-            ldro=bool(chosen.ldro),
+            ldro=chosen.ldro is True,
             gap=gap,
             carrier=None if chosen.carrier_hz is None else chosen.carrier_hz * per_chip / self.sample_rate,
         )

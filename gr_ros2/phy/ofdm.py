@@ -19,6 +19,7 @@ from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
+from gr_ros2.setting import AUTO, Auto
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -27,30 +28,29 @@ class OfdmOptions(BurstOptions):
 
     :param payload_modulation: of the payload symbols; preamble and header are BPSK always
     :param fft_len: carriers, used or not; about 13 of 16 are used
-    :param cp_len: samples of the cyclic prefix, a quarter to a half of ``fft_len``; None = a quarter. With a shorter
+    :param cp_len: samples of the cyclic prefix, a quarter to a half of ``fft_len``; auto = a quarter. With a shorter
         one the stock synchroniser loses packets even without noise
-    :param carriers: how far either side of the middle carrier data and pilots go, below half of ``fft_len``; None = 26
+    :param carriers: how far either side of the middle carrier data and pilots go, below half of ``fft_len``; auto = 26
         of 64. Fewer make room for the analogue filters, more carry more
     :param pilots: carriers that carry no data but a known sign, by which phase is followed, such as (-21, -7, 7, 21);
-        None = these, spread over a larger ``fft_len``
+        auto = these, spread over a larger ``fft_len``
     :param scramble: scramble header and payload bits. Without, data of many zeros makes high peaks, and the stock
         receiver loses packets at a clock offset of 0.1 %
     :param detection_threshold: of the preamble's metric (Schmidl and Cox), 0.05..0.95, from which on samples are looked
-        at closely; None = what noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their
+        at closely; auto = what noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their
         0.9, which need 5 to 7 dB more SNR; at a lower one these lose packets without any noise
-    :param gap: zero samples after each packet, up to 100000; None = 32, with stock two symbols. The stock receiver
+    :param gap: zero samples after each packet, up to 100000; auto = 32, with stock two symbols. The stock receiver
         needs one symbol and half an FFT length, below which it keeps the last packet waiting for the next, and is
         refused; ours needs 16
     """
 
     payload_modulation: Literal["bpsk", "qpsk", "8psk", "16qam", "64qam"] = "bpsk"
-    fft_len: Literal[64, 128, 256, 512] = 64
-    cp_len: Annotated[int, Field(ge=16, le=256)] | None = None
-    gap: Annotated[int, Field(ge=16, le=100_000)] | None = None  # type: ignore[assignment]
-    carriers: Annotated[int, Field(ge=17, le=255)] | None = None
-    pilots: tuple[int, ...] | None = None
-    scramble: bool = False
-    detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | None = None
+    fft_len: Annotated[Literal[64, 128, 256, 512], Field(title="FFT length (carriers)")] = 64
+    cp_len: Annotated[int, Field(ge=16, le=256, title="Cyclic prefix (samples)")] | Auto = AUTO
+    carriers: Annotated[int, Field(ge=17, le=255, title="Carriers to either side")] | Auto = AUTO
+    pilots: Annotated[tuple[int, ...] | Auto, Field(title="Pilot carriers")] = AUTO
+    scramble: Annotated[bool, Field(title="Scrambling")] = False
+    detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | Auto = AUTO
 
 
 class OfdmPhy(BurstPhy):
@@ -69,13 +69,14 @@ class OfdmPhy(BurstPhy):
         super().__init__(packet_len, sample_rate, **options)
         chosen: OfdmOptions = self.options
         fft_len = chosen.fft_len
-        cp_len = fft_len // 4 if chosen.cp_len is None else chosen.cp_len
+        cp_len = fft_len // 4 if chosen.cp_len == AUTO else chosen.cp_len
         if not fft_len <= 4 * cp_len <= 2 * fft_len:
             raise ConfigError(
                 f"phy ofdm: cp_len = {cp_len}: {fft_len // 4} to {fft_len // 2} samples with fft_len = {fft_len}"
             )
-        carriers = (chosen.carriers, chosen.pilots)
-        self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, *carriers)
+        edge = None if chosen.carriers == AUTO else chosen.carriers
+        pilots = None if chosen.pilots == AUTO else chosen.pilots
+        self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, edge, pilots)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
         if threshold == "stock":
@@ -84,7 +85,7 @@ class OfdmPhy(BurstPhy):
         else:
             mask = layout.mask(packet_len + layout.fill(packet_len) + CRC_LEN)
             frames = self.frames(order="little", multiple=layout.multiple, mask=mask)
-            self.modem: OfdmModem = OfdmModem(frames, layout, threshold)
+            self.modem: OfdmModem = OfdmModem(frames, layout, None if threshold == AUTO else threshold)
 
     def _checked_stock(self) -> StockFrame:
         chosen, symbol = self.options, self.layout.symbol_samples
@@ -93,7 +94,7 @@ class OfdmPhy(BurstPhy):
                 f"phy ofdm: fec = {chosen.fec!r}: the stock receiver gives no soft bits; leave detection_threshold out"
             )
         least = symbol + self.layout.fft_len // 2
-        gap = 2 * symbol if chosen.gap is None else chosen.gap
+        gap = 2 * symbol if chosen.gap == AUTO else chosen.gap
         if gap < least:
             raise ConfigError(f"phy ofdm: gap = {gap}: below {least} the last packet stays in the stock receiver")
         return StockFrame(self.layout, self.packet_len, gap)

@@ -14,25 +14,22 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.burst import Frames, Samples
-from gr_ros2.phy.burst_blocks import BurstOptions
-from gr_ros2.phy.linear import LinearModem, LinearPhy, shape
+from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, shape
 
 _ORDER = {"bpsk": 2, "qpsk": 4, "8psk": 8}
 _PULSE_SYMBOLS = 10
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class PskOptions(BurstOptions):
+class PskOptions(LinearOptions):
     """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
 
     :param modulation: of the payload; the preamble is BPSK always
-    :param sps: samples per symbol, 2..64
     :param rolloff: of the root-raised-cosine pulse, 0.2..1
     """
 
     modulation: Literal["bpsk", "qpsk", "8psk"] = "qpsk"
-    sps: Annotated[int, Field(ge=2, le=64)] = 4
-    rolloff: Annotated[float, Field(ge=0.2, le=1)] = 0.35
+    rolloff: Annotated[float, Field(ge=0.2, le=1, title="Roll-off factor")] = 0.35
 
 
 class PskModem(LinearModem):

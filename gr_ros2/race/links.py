@@ -96,7 +96,7 @@ class LinkReport:
     drops: dict[str, int]
 
 
-class RosLink:
+class RaceRosLink:
     """gr-ros2 between two namespaces: a ROS graph at each end, the radio between them, one way.
 
     :param namespaces: paths, of the sending and the receiving end
@@ -160,7 +160,7 @@ class RosLink:
         """Stop the radio and leave both graphs."""
         self._stack.close()
 
-    def __enter__(self) -> RosLink:
+    def __enter__(self) -> RaceRosLink:
         return self
 
     def __exit__(
@@ -177,7 +177,7 @@ class RosLink:
         """The sink is not observed."""
 
 
-class IpLink:
+class RaceIpLink:
     """IP between two namespaces: a TUN device at each end, each IP packet one frame of its own length, both ways.
 
     :param namespaces: paths, of the sending and the receiving end
@@ -200,7 +200,7 @@ class IpLink:
                 source = TunSource(self._tuns[direction], radio, log)
                 sink = TunSink(self._tuns[1 - direction])
                 link = LoopbackLink(
-                    phy, source, sink, channel=radio.channel(direction), pace="flow", paced=False
+                    phy, source, sink, channel=radio.channel(direction), throttled=False, paced=False
                 )  # the source holds each frame for its own airtime
                 stack.callback(link.stop)
                 link.start()
@@ -221,7 +221,7 @@ class IpLink:
         """Stop the radio and remove the interfaces."""
         self._stack.close()
 
-    def __enter__(self) -> IpLink:
+    def __enter__(self) -> RaceIpLink:
         return self
 
     def __exit__(

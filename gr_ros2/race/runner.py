@@ -17,17 +17,17 @@ from pathlib import Path
 from gr_ros2.errors import RunError
 from gr_ros2.race.contenders import Contender, chosen
 from gr_ros2.race.endpoints import RacePublisher, RaceSubscriber, RaceTopic
-from gr_ros2.race.links import IpLink, LinkReport, RaceRadio, RosLink
+from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
 from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.settings import (
     PHY_NAME,
+    PHY_OPTIONS,
     Condition,
     RaceRecording,
     RaceSettings,
     check,
     conditions,
-    phy_options,
     read_recording,
 )
 from gr_ros2.race.workers import Worker
@@ -94,7 +94,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
 
 
 def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
-    radio = RaceRadio(PHY_NAME, phy_options(settings), condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(PHY_NAME, PHY_OPTIONS, condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)
@@ -102,10 +102,10 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
         if contender.stack == "gr-ros2":
             packet_len = settings.packet_len if contender.settings["compression"] else recording.single_packet_len
             arguments = (radio, paths, (topic.name, topic.type_name), packet_len, contender)
-            air = stack.enter_context(Worker("radio", "", RosLink, *arguments))
+            air = stack.enter_context(Worker("radio", "", RaceRosLink, *arguments))
             topic = RaceTopic(topic.name, topic.type_name, air.call("output_topic"))
         else:
-            air = stack.enter_context(Worker("radio", "", IpLink, radio, paths))
+            air = stack.enter_context(Worker("radio", "", RaceIpLink, radio, paths))
         listener = stack.enter_context(Worker("listener", paths[1], RaceSubscriber, contender, topic))
         talker = stack.enter_context(
             Worker(

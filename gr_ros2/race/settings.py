@@ -15,18 +15,21 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import PacketLen, Seconds
+from gr_ros2.config import PacketLen, Packets, Sampled, Seconds, Text, Traffic
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
+from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.settings import SimSettings
 from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"
+PHY_OPTIONS = {"gap": 112, "detection_threshold": "stock"}
+"""GNU Radio's own blocks, which take frames of any length."""
 SIM_TOPIC = "/robot_1/odom"
 _SIM_ROBOT = 1
 _SIM_START_NS = 1_700_000_000_000_000_000
@@ -39,36 +42,31 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Load = Annotated[float, Field(gt=0, le=100)]
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class RaceSettings:
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
+class RaceSettings(Sampled, Packets, Traffic):
     """One race: every contender at every load and every loss.
 
     :param source: `sim`, the odometry of a simulated robot at 35 Hz, or `bag:PATH`
-    :param topic: of the bag; '' where it has only one
+    :param bag_topic: the topic of the bag that is carried; auto where it has only one
     :param peers: names of ``CONTENDERS``; [] = all
     :param loss: probability that a frame is lost, 0..1, in each direction
     :param load: of the link by the recording as it is, 1 = all of its capacity
-    :param sample_rate: samples/s instead of ``load``, 0 = chosen by it
+    :param sample_rate: samples/s instead of ``load``; auto = chosen by it
     :param duration_s: s of the recording
     :param packet_len: bytes of gr-ros2's packets; of `gr-ros2-plain` they are as long as a message needs
     :param match_s: s that both ends have to find each other
     :param drain_s: s that what is on its way has after the last message was published
-    :param gap: samples between two frames
     :param seed: of the simulator, the losses and gr-ros2's sender
     """
 
-    source: str = "sim"
-    topic: str = ""
+    bag_topic: Text = AUTO
     peers: tuple[str, ...] = ()
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2)
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
-    sample_rate: Seconds = 0.0
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     packet_len: PacketLen = 64
-    gap: int = 112
     match_s: Seconds = 30.0
     drain_s: Seconds = 10.0
-    seed: Annotated[int, Field(ge=0)] = 0
 
 
 @plain_dataclass(frozen=True)
@@ -120,23 +118,14 @@ def check(settings: RaceSettings) -> None:
     racing = chosen(settings.peers).values()
     if any(contender.stack == "zenoh" for contender in racing) and find_spec("zenoh") is None:
         raise BackendMissingError("zenoh is not installed: pip install eclipse-zenoh==1.10.2, or race other --peers")
-    if settings.source != "sim" and not settings.source.removeprefix("bag:").strip():
-        raise ConfigError(f"source = {settings.source!r}: the path of the bag is missing; write bag:PATH")
-    if settings.source != "sim" and not settings.source.startswith("bag:"):
-        raise ConfigError(f"source = {settings.source!r}: write sim or bag:PATH")
-    PHY.load(PHY_NAME)(settings.packet_len, 1.0, **phy_options(settings))
-
-
-def phy_options(settings: RaceSettings) -> dict[str, Any]:
-    """Of the PHY, beside packet length and sample rate: GNU RaceRadio's own blocks, which take frames of any length."""
-    return {"gap": settings.gap, "detection_threshold": "stock"}
+    PHY.load(PHY_NAME)(settings.packet_len, 1.0, **PHY_OPTIONS)
 
 
 def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Condition]:
     """Every load with every loss, the lightest first."""
-    phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0, **phy_options(settings))
+    phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0, **PHY_OPTIONS)
     needed = recording.hz * phy.airtime_samples()
-    if settings.sample_rate:
+    if settings.sample_rate != AUTO:
         rates = {needed / settings.sample_rate: settings.sample_rate}
     else:
         rates = {load: needed / load for load in sorted(settings.load)}
@@ -165,16 +154,14 @@ def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
     :raises ConfigError: where it has no such topic, too little on it, or messages that do not fit
     :raises BagError: where it cannot be read
     """
-    if settings.source == "sim":
-        path = record_sim(folder, settings)
-    else:
-        path = Path(settings.source.removeprefix("bag:").strip()).expanduser()
+    path = settings.bag_path or record_sim(folder, settings)
     contents = bag_contents(path)
     found = {name: topic.info.type_name for name, topic in contents.topics.items()}
-    topic = f"/{settings.topic.lstrip('/')}" if settings.topic else next(iter(found), "")
-    if topic not in found or (len(found) > 1 and not settings.topic):
+    asked = settings.bag_topic
+    topic = next(iter(found), "") if asked == AUTO else f"/{asked.lstrip('/')}"
+    if topic not in found or (len(found) > 1 and asked == AUTO):
         has = "; ".join([", ".join(found) or "it has none", *contents.remarks])
-        raise ConfigError(f"topic = {settings.topic!r}: name one that {path} has: {has}")
+        raise ConfigError(f"topic = {asked!r}: name one that {path} has: {has}")
     payloads: list[bytes] = []
     stamps: list[int] = []
     for message in read_bag(path, [topic]):

@@ -8,69 +8,43 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import (
-    ChannelConfig,
-    DiagnosticsConfig,
-    PacketLen,
-    PhyConfig,
-    SinkConfig,
-    SourceConfig,
-    WireVersion,
-    build,
-)
+from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, WireVersion, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.registry import Registry, check_outputs
+from gr_ros2.setting import AUTO
 from gr_ros2.settings_file import ENDS, SHARED_KEYS, read_settings, with_shared
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
-class LinkConfig:
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
+class LinkConfig(AnyLink):
     """One robot's end: its ROS graph -> RosSource -> PHY -> front end, and back the same way.
 
     :param name: what errors and the status line call it
     :param registry: CSV path, relative to the YAML file, or the name of a built-in one: the topics that are sent; with
         version 0 the same at every robot, with version 1 each announces its own, and '' sends none
-    :param packet_len: bytes on the wire, 14..4095; the same at every robot
-    :param version: of the wire format: 1 repairs, announces topics and can be sealed, 0 is the paper's; the same at
-        every robot
-    :param key: file of the fleet's keys (gr-ros2 key new), relative to the YAML file; '' sends packets that anybody can
-        read and forge
-    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
-    :param state: file that counts this robot's starts (version 1); '' takes one in the user's state folder
     :param ros_source: the sending block; its robot_id must be another at every robot
-    :param ros_sink: the receiving block; its robot_id -1 means this robot's, except with a front end that loops back
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
     :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings
         (docs/how-to/radios.md)
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
-    :param localhost_only: DDS stays on the loopback interface; None takes what the environment of ROS says
     """
 
     registry: str = ""
-    name: Annotated[str, Field(min_length=1)] = "link"
-    packet_len: PacketLen = 220
+    name: Text = "link"
     version: WireVersion = 1
-    key: str = ""
-    seal: Literal["encrypt", "authenticate"] = "encrypt"
-    state: str = ""
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
-    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
-    phy: PhyConfig = Field(default_factory=PhyConfig)
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
-    record: str = ""
+    record: Annotated[str, Field(title="Recording of what is received")] = ""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
-    localhost_only: bool | None = None
 
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:
@@ -86,8 +60,8 @@ class LinkConfig:
         ):
             if name not in table:
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
-        if self.phy.sample_rate == 0 and PHY.load(self.phy.name).has_samples:
-            raise ValueError("phy.sample_rate = 0: a link needs one; set it to what the radio can do, samples/s")
+        if self.phy.sample_rate == AUTO and PHY.load(self.phy.name).has_samples:
+            raise ValueError("phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s")
         self.ros_source.src_id()
         return self
 

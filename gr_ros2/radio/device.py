@@ -17,12 +17,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Count, Seconds
+from gr_ros2.config import STRICT, Count, Seconds, Text
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
-from gr_ros2.radio.front_end import STRICT, FrontEnd, FrontEndOptions, Hertz
+from gr_ros2.radio.front_end import FrontEnd, FrontEndOptions, Hertz
 from gr_ros2.radio.stream_events import GapCounter
+from gr_ros2.setting import AUTO, Auto
 
 TOLERANCE = 1e-4
 """How far from the sample rate and frequency asked for a device may be; the PHYs are made for clocks within 100 ppm."""
@@ -45,14 +46,14 @@ Direction = Literal["tx", "rx"]
 class DeviceOptions(FrontEndOptions):
     """Settings of every radio.
 
-    :param args: which device, in the words of its driver; '' takes the first found
+    :param args: which device, in the words of its driver; auto takes the first found
     :param frequency: Hz, to send at, and to receive at unless ``frequency_rx`` says otherwise
-    :param frequency_rx: Hz, to receive at; None = ``frequency``
+    :param frequency_rx: Hz, to receive at; auto = ``frequency``
     :param gain_tx: dB, of the transmitter; 0 unless set, so that nothing loud happens unasked
     :param gain_rx: dB, of the receiver
-    :param antenna_tx: port to send from, '' = the device's default
-    :param antenna_rx: port to receive from, '' = the device's default
-    :param bandwidth: Hz, of the analogue filters, 0 = the device's choice
+    :param antenna_tx: port to send from, auto = the device's default
+    :param antenna_rx: port to receive from, auto = the device's default
+    :param bandwidth: Hz, of the analogue filters, auto = the device's choice
     :param level: root mean square of a burst's samples, 1 = full scale of the converter. OFDM has peaks 12 dB above it,
         with ``scramble: false`` even 17 dB
     :param lead: zero samples before each burst, while the amplifier settles
@@ -63,25 +64,25 @@ class DeviceOptions(FrontEndOptions):
         of the burst has come through its buffers; nothing is sent in it either
     """
 
-    frequency: Annotated[float, Field(gt=0, le=300e9)]
-    args: str = ""
-    frequency_rx: Annotated[float, Field(gt=0, le=300e9)] | None = None
-    gain_tx: Decibels = 0.0
-    gain_rx: Decibels = 30.0
-    antenna_tx: str = ""
-    antenna_rx: str = ""
-    bandwidth: Hertz = 0.0
-    level: Annotated[float, Field(gt=0, le=1)] = 0.1
-    lead: Count = 32
-    tail: Count = 64
-    multiple: Annotated[int, Field(ge=1, le=1 << 22)] = 1
+    frequency: Annotated[float, Field(gt=0, le=300e9, title="Frequency (Hz)")]
+    args: Annotated[Text, Field(title="Device arguments")] = AUTO
+    frequency_rx: Annotated[float, Field(gt=0, le=300e9, title="Receive frequency (Hz)")] | Auto = AUTO
+    gain_tx: Annotated[Decibels, Field(title="Transmit gain (dB)")] = 0.0
+    gain_rx: Annotated[Decibels, Field(title="Receive gain (dB)")] = 30.0
+    antenna_tx: Annotated[Text, Field(title="Transmit antenna")] = AUTO
+    antenna_rx: Annotated[Text, Field(title="Receive antenna")] = AUTO
+    bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
+    level: Annotated[float, Field(gt=0, le=1, title="Burst level (share of full scale)")] = 0.1
+    lead: Annotated[Count, Field(title="Zeros before a burst (samples)")] = 32
+    tail: Annotated[Count, Field(title="Zeros behind a burst (samples)")] = 64
+    multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
     half_duplex: bool = False
-    turnaround_s: Seconds = 0.005
+    turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.005
 
     @property
     def receive_frequency(self) -> float:
         """Hz."""
-        return self.frequency if self.frequency_rx is None else self.frequency_rx
+        return self.frequency if self.frequency_rx == AUTO else self.frequency_rx
 
 
 class DeviceFrontEnd(FrontEnd):
@@ -122,6 +123,11 @@ class DeviceFrontEnd(FrontEnd):
     def receive_frequency(self) -> float:
         frequency: float = self.options.receive_frequency
         return frequency
+
+    @property
+    def device_args(self) -> str:
+        """``args`` as a driver takes them: '' for the first device found."""
+        return "" if self.options.args == AUTO else str(self.options.args)
 
     @abstractmethod
     def _open_transmitter(self) -> Any:
@@ -200,7 +206,9 @@ class DeviceFrontEnd(FrontEnd):
         """
         key = f"antenna_{direction}"
         antenna: str = getattr(self.options, key)
-        if antenna and antenna not in known:
+        if antenna == AUTO:
+            return ""
+        if antenna not in known:
             raise RadioError(f"front_end {self.name}: {key} = {antenna!r}: the device has {', '.join(known)}")
         return antenna
 
@@ -211,7 +219,7 @@ class DeviceFrontEnd(FrontEnd):
         """
         options = self.options
         wanted = options.frequency if direction == "tx" else options.receive_frequency
-        key = "frequency" if direction == "tx" or options.frequency_rx is None else "frequency_rx"
+        key = "frequency" if direction == "tx" or options.frequency_rx == AUTO else "frequency_rx"
         if not abs(got - wanted) <= TOLERANCE * wanted:
             raise self._unlike(f"is tuned to {got:,.0f} Hz, not to {wanted:,.0f}", key)
 

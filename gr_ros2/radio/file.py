@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import STRICT
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
-from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
+from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 
 _STEP_S = 0.005
@@ -39,10 +40,10 @@ class FileOptions(FrontEndOptions):
     :param repeat: begin again at its end
     """
 
-    write: str = ""
-    read: str = ""
-    speed: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    repeat: bool = False
+    write: Annotated[str, Field(title="Recording of what is sent")] = ""
+    read: Annotated[str, Field(title="Recording to replay")] = ""
+    speed: Annotated[float, Field(ge=0, le=1000, title="Replay speed (times real time)")] = 1.0
+    repeat: Annotated[bool, Field(title="Repeat the replay")] = False
 
     @model_validator(mode="after")
     def _something(self) -> FileOptions:

@@ -9,17 +9,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Annotated, Any, ClassVar
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Seconds, build
+from gr_ros2.config import STRICT, Seconds, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
 
-STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 AGAIN_MS = 1
 """ms after which GNU Radio calls a source again that had nothing to give; otherwise it waits 250."""
-Hertz = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Hertz = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -29,7 +28,7 @@ class FrontEndOptions:
     :param guard_s: s of silence after each packet
     """
 
-    guard_s: Seconds = 0.0
+    guard_s: Annotated[Seconds, Field(title="Silence after a packet (s)")] = 0.0
 
 
 class FrontEnd(ABC):

@@ -26,6 +26,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.radio import Radio
+from gr_ros2.setting import AUTO, Auto
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +70,8 @@ class RobotLink(Flowgraph):
 
     def _open(self, middleware: Middleware | None, observer: LinkObserver | None) -> None:
         config = self.config
-        self.phy = configured(config.phy, config.packet_len, config.phy.sample_rate)
+        rate = config.phy.sample_rate
+        self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
         self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
         self._stack.callback(self.front_end.close)
         self.radio = Radio(
@@ -132,7 +134,7 @@ class RobotLink(Flowgraph):
         opened = {place: self._graph(*place) for place in dict.fromkeys(places)}
         return opened[places[0]], opened[places[1]]
 
-    def _graph(self, name: str, domain_id: int) -> Middleware:
+    def _graph(self, name: str, domain_id: int | Auto) -> Middleware:
         graph = join_graph(
             name, domain_id=domain_id, node_name=self.node_name, localhost_only=self.config.localhost_only
         )
@@ -142,7 +144,7 @@ class RobotLink(Flowgraph):
     def _sink_config(self) -> SinkConfig:
         """The sink's settings; on a medium that others share it knows its own packets."""
         sink = self.config.ros_sink
-        if sink.robot_id == -1:
+        if sink.robot_id == AUTO:
             return replace(sink, robot_id=self.config.ros_source.src_id())
         return sink
 

@@ -23,10 +23,12 @@ from gnuradio import blocks, iio
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import STRICT
 from gr_ros2.errors import RadioError
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
-from gr_ros2.radio.front_end import STRICT, Hertz
+from gr_ros2.radio.front_end import Hertz
+from gr_ros2.setting import AUTO, Auto
 
 SLOWEST, FASTEST = 521e3, 61.44e6
 """samples/s; below 2.083 million with the decimating filter that GNU Radio's block loads by itself."""
@@ -49,14 +51,14 @@ class PlutoOptions(DeviceOptions):
     """Settings of this front end.
 
     :param gain_tx: dB, 0 = full power, down to -89.75; -40 unless set
-    :param bandwidth: Hz, of the transmitter's analogue filter, 0 = ``sample_rate``; the receiver's stays as it is
-    :param buffer_rx: samples the receiver hands over at a time, 0 = 5 ms
+    :param bandwidth: Hz, of the transmitter's analogue filter, auto = ``sample_rate``; the receiver's stays as it is
+    :param buffer_rx: samples the receiver hands over at a time, auto = 5 ms of them
     """
 
-    gain_tx: Annotated[float, Field(ge=-_LARGEST_ATTENUATION, le=0)] = -40.0
-    gain_rx: Annotated[float, Field(ge=-3, le=76)] = 30.0
-    bandwidth: Hertz = 0.0
-    buffer_rx: Annotated[int, Field(ge=0, le=1 << 22)] = 0
+    gain_tx: Annotated[float, Field(ge=-_LARGEST_ATTENUATION, le=0, title="Transmit gain (dB)")] = -40.0
+    gain_rx: Annotated[float, Field(ge=-3, le=76, title="Receive gain (dB)")] = 30.0
+    bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
+    buffer_rx: Annotated[int, Field(ge=1, le=1 << 22, title="Receive buffer (samples)")] | Auto = AUTO
 
 
 class PlutoFrontEnd(DeviceFrontEnd):
@@ -74,12 +76,12 @@ class PlutoFrontEnd(DeviceFrontEnd):
             raise RadioError(
                 f"front_end pluto: phy.sample_rate = {rate:,.0f}: a Pluto has {SLOWEST:,.0f} to {FASTEST:,.0f}"
             )
-        if any(getattr(options, name) for name in self.refuses):
+        if any(getattr(options, name) != AUTO for name in self.refuses):
             raise RadioError("front_end pluto: a Pluto has one port to send and one to receive; leave antennas out")
-        block = iio.fmcomms2_sink_fc32(options.args, _CHANNELS, self.layout.total, False)
+        block = iio.fmcomms2_sink_fc32(self.device_args, _CHANNELS, self.layout.total, False)
         block.set_filter_params(*_AUTOMATIC_FILTER)
         block.set_samplerate(int(rate))
-        block.set_bandwidth(int(options.bandwidth or rate))
+        block.set_bandwidth(int(rate if options.bandwidth == AUTO else options.bandwidth))
         block.set_frequency(int(options.frequency))
         block.set_attenuation(0, -options.gain_tx)
         self._check_settings("tx")
@@ -87,7 +89,8 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     def _open_receiver(self) -> Any:
         rate, options = self.phy.sample_rate, self.options
-        block = iio.fmcomms2_source_fc32(options.args, _CHANNELS, options.buffer_rx or max(1024, int(rate * 0.005)))
+        size = max(1024, int(rate * 0.005)) if options.buffer_rx == AUTO else options.buffer_rx
+        block = iio.fmcomms2_source_fc32(self.device_args, _CHANNELS, size)
         self._receiving = block  # for `close`, should it not be as it ought to be
         block.set_filter_params(*_AUTOMATIC_FILTER)
         block.set_samplerate(int(rate))
@@ -104,14 +107,14 @@ class PlutoFrontEnd(DeviceFrontEnd):
         if self._receiving is not None:
             with suppress(RuntimeError):  # from GNU Radio 3.10.9 on, of one that does not run or was stopped already
                 self._receiving.stop()
-            # Kept for ever: its destructor waits for a thread of its own that never ends when it was not started, or
+            # Never deleted: its destructor waits for a thread of its own that never ends when it was not started, or
             # ran for less than a second.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._receiving))
         super().close()
 
     @contextmanager
     def one_line(self) -> Iterator[None]:
-        with _stderr_own_process(), super().one_line():
+        with _stderr_deferred(), super().one_line():
             yield
 
     def _check_settings(self, direction: Direction) -> None:
@@ -128,7 +131,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
     def _read(self, device: str, channel: str, attribute: str, *, output: bool) -> float:
         """A setting as the device has it, 0 where it does not tell."""
         kind = (iio.data_type_t.DOUBLE, iio.attr_type_t.CHANNEL)
-        asked = iio.attr_source(self.options.args, device, channel, attribute, _EVERY_MS, 1, *kind, output, 0)
+        asked = iio.attr_source(self.device_args, device, channel, attribute, _EVERY_MS, 1, *kind, output, 0)
         asked.set_log_level("error")
         told = blocks.vector_sink_b(_DOUBLE.size)
         graph = Flowgraph("gr_ros2_pluto_setting", f"front_end {self.name}")
@@ -141,7 +144,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
 
 @contextmanager
-def _stderr_own_process() -> Iterator[None]:
+def _stderr_deferred() -> Iterator[None]:
     """Keeps what any thread writes to stderr meanwhile: it comes out afterwards, or is logged after an error."""
     with tempfile.TemporaryFile() as kept, os.fdopen(os.dup(_STDERR), "wb") as real:
         os.dup2(kept.fileno(), _STDERR)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from gr_ros2 import __version__
 from gr_ros2.backlog import Backlog
 from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.files import replacing
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.phy.threads import KeepsThreadState
 
@@ -216,10 +217,5 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def _write_meta(self) -> None:
         """Replace the metadata, which on a full disk stay as they are."""
-        part = self._meta.with_name(f".{self._meta.name}.part")
-        try:
+        with replacing(self._meta) as part:
             part.write_text(json.dumps(self._about.to_json(self._began), indent=1) + "\n", encoding="utf-8")
-            part.replace(self._meta)
-        except OSError:
-            part.unlink(missing_ok=True)
-            raise

@@ -11,6 +11,7 @@ from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.device import DeviceFrontEnd
 from gr_ros2.radio.soapy_sink import SoapySink
+from gr_ros2.setting import AUTO
 
 _CHANNEL = 0
 
@@ -28,11 +29,13 @@ class SoapyFrontEnd(DeviceFrontEnd):
 
     def _open_transmitter(self) -> Any:
         options = self.options
-        block = SoapySink(options.args, self.layout.total, self.phy.sample_rate, self._counted)
+        block = SoapySink(self.device_args, self.layout.total, self.phy.sample_rate, self._counted)
         try:
             self.check_rate(block.sample_rate)
             antenna = self.check_antenna("tx", block.antennas())
-            block.tune(options.frequency, options.gain_tx, options.bandwidth, antenna)
+            block.tune(
+                options.frequency, options.gain_tx, 0.0 if options.bandwidth == AUTO else options.bandwidth, antenna
+            )
             self.check_frequency("tx", block.frequency)
             self.check_gain("tx", block.gain, *block.gains())
         except BaseException:
@@ -42,10 +45,10 @@ class SoapyFrontEnd(DeviceFrontEnd):
 
     def _open_receiver(self) -> Any:
         options = self.options
-        block = soapy.source(options.args, "fc32", 1, "", "", [""], [""])
+        block = soapy.source(self.device_args, "fc32", 1, "", "", [""], [""])
         block.set_sample_rate(_CHANNEL, self.phy.sample_rate)
         self.check_rate(block.get_sample_rate(_CHANNEL))
-        if options.bandwidth:
+        if options.bandwidth != AUTO:
             block.set_bandwidth(_CHANNEL, options.bandwidth)
         if antenna := self.check_antenna("rx", block.list_antennas(_CHANNEL)):
             block.set_antenna(_CHANNEL, antenna)

@@ -29,7 +29,7 @@ _TIMEOUT, _NOT_SUPPORTED, _UNDERFLOW = -1, -5, -7
 _EVENTS = {_UNDERFLOW: "underflows", -6: "late", -3: "corrupted"}
 """What we call what a device tells, by SoapySDR's code."""
 _MOST_EVENTS = 256
-"""At a time, lest a driver that always tells something keep us there."""
+"""Events read at a time, because a driver may report events without end."""
 _AGAIN = (0, _TIMEOUT, _UNDERFLOW)
 """What a call that brings samples may return without having taken any: then it is made again."""
 _CALL_US = 100_000

@@ -12,11 +12,12 @@ from gnuradio import uhd
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import STRICT, Text
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import LENGTH_TAG
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
-from gr_ros2.radio.front_end import STRICT
 from gr_ros2.radio.stream_events import UsrpEvents
+from gr_ros2.setting import AUTO
 
 _CHANNEL = 0
 
@@ -25,14 +26,14 @@ _CHANNEL = 0
 class UhdOptions(DeviceOptions):
     """Settings of this front end.
 
-    :param clock_source: '' = the device's default, or internal, external, mimo, gpsdo
-    :param subdev_tx: frontend to send with, as in ``A:A``, '' = the device's default
-    :param subdev_rx: frontend to receive with, '' = the device's default
+    :param clock_source: auto = the device's default, or internal, external, mimo, gpsdo
+    :param subdev_tx: frontend to send with, as in ``A:A``, auto = the device's default
+    :param subdev_rx: frontend to receive with, auto = the device's default
     """
 
-    clock_source: Annotated[str, Field(examples=["", "internal", "external", "mimo", "gpsdo"])] = ""
-    subdev_tx: str = ""
-    subdev_rx: str = ""
+    clock_source: Annotated[str, Field(examples=[AUTO, "internal", "external", "mimo", "gpsdo"], min_length=1)] = AUTO
+    subdev_tx: Annotated[Text, Field(title="Transmit subdevice")] = AUTO
+    subdev_rx: Annotated[Text, Field(title="Receive subdevice")] = AUTO
 
 
 class UhdFrontEnd(DeviceFrontEnd):
@@ -55,20 +56,20 @@ class UhdFrontEnd(DeviceFrontEnd):
         return dict(self._events.counted)
 
     def _open_transmitter(self) -> Any:
-        return self._set_up(uhd.usrp_sink(self.options.args, _stream(), LENGTH_TAG), "tx")
+        return self._set_up(uhd.usrp_sink(self.device_args, _stream(), LENGTH_TAG), "tx")
 
     def _open_receiver(self) -> Any:
-        return self._set_up(uhd.usrp_source(self.options.args, _stream()), "rx")
+        return self._set_up(uhd.usrp_source(self.device_args, _stream()), "rx")
 
     def _set_up(self, block: Any, direction: Direction) -> Any:
         options, sending = self.options, direction == "tx"
-        if options.clock_source:
+        if options.clock_source != AUTO:
             block.set_clock_source(options.clock_source)
-        if subdev := options.subdev_tx if sending else options.subdev_rx:
+        if (subdev := options.subdev_tx if sending else options.subdev_rx) != AUTO:
             block.set_subdev_spec(subdev)
         block.set_samp_rate(self.phy.sample_rate)
         self.check_rate(block.get_samp_rate())
-        if options.bandwidth:
+        if options.bandwidth != AUTO:
             block.set_bandwidth(options.bandwidth, _CHANNEL)
         if antenna := self.check_antenna(direction, block.get_antennas(_CHANNEL)):
             block.set_antenna(antenna, _CHANNEL)

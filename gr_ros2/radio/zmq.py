@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import STRICT
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
-from gr_ros2.radio.front_end import AGAIN_MS, STRICT, FrontEnd, FrontEndOptions
+from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
 """Magic, who sends (random at each start), number of the burst, samples/s; then complex64, little-endian."""
@@ -81,12 +82,12 @@ class ZmqOptions(FrontEndOptions):
     :param bind: address to publish at: ``5555`` or ``tcp://*:5555`` (all interfaces), ``10.0.0.1:5555``,
         ``ipc:///tmp/a``. Whoever can reach it can listen; there is no encryption
     :param connect: addresses of the other robots, ``10.0.0.2:5555``
-    :param queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
+    :param burst_queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
     """
 
-    bind: OwnAddress
-    connect: Annotated[tuple[Address, ...], Field(min_length=1)]
-    queue: Annotated[int, Field(ge=1, le=10_000)] = 300
+    bind: Annotated[OwnAddress, Field(title="Own address")]
+    connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
+    burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue for a slow peer (bursts)")] = 300
 
 
 class ZmqFrontEnd(FrontEnd):
@@ -98,7 +99,7 @@ class ZmqFrontEnd(FrontEnd):
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
         self._context, self._sockets = zmq.Context(), list[Any]()
-        # With the sockets at hand: a context that is found to be garbage together with them waits for them for ever.
+        # Close the sockets first: a context that is garbage-collected together with them waits for them without end.
         self._let_go = weakref.finalize(self, _let_go, self._context, self._sockets)
         self._counters: Counter[str] = Counter()
         try:
@@ -139,7 +140,7 @@ class ZmqFrontEnd(FrontEnd):
         socket = self._context.socket(kind)
         self._sockets.append(socket)
         socket.linger = 0
-        socket.sndhwm = socket.rcvhwm = self.options.queue
+        socket.sndhwm = socket.rcvhwm = self.options.burst_queue
         socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
         socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
@@ -205,7 +206,7 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):
-            # Waits outside Python's lock, and not for ever: GNU Radio can end this thread only between two calls.
+            # Wait without Python's lock, and for a limited time: GNU Radio can end this thread only between two calls.
             if not self._socket.poll(_POLL_MS):
                 return 0
             self._rest = self._take(self._socket.recv(zmq.NOBLOCK))

@@ -6,6 +6,7 @@ lock and the reading of one position; what it keeps of a message or packet are n
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
@@ -42,6 +43,8 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
+        self._lengths: Counter[int] = Counter()
+        """Packets sent, by their bytes."""
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -58,6 +61,7 @@ class Recorder:
         """What the sender with this source id reports."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
+            self._lengths[len(event.data)] += 1
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
@@ -97,16 +101,22 @@ class Recorder:
         self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
         return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
 
-    def airtime(self, airtime_s: float | None) -> dict[str, float | None]:
-        """Seconds of the PHY: of one packet, and of all packets sent per message and per byte delivered.
+    def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, float | None]:
+        """Seconds of the PHY: of the longest packet, of one packet sent on average, and of all of them per message and
+        per byte delivered.
 
         To be asked after :meth:`finish`.
 
-        :param airtime_s: of one packet, None for a PHY without samples
+        :param of_length: s that a packet of so many bytes takes, or of None the longest; None: a PHY without samples
         """
-        total = None if airtime_s is None else airtime_s * self.ledger.packets()["sent"]
+        longest = total = mean = None
+        if of_length is not None:
+            longest = of_length(None)
+            total = sum(of_length(length) * count for length, count in self._lengths.items())
+            mean = total / self._lengths.total() if total else longest
         return {
-            "airtime_s": airtime_s,
+            "airtime_s": longest,
+            "airtime_mean_s": mean,
             "airtime_per_message_s": total / self._delivered if total is not None and self._delivered else None,
             "airtime_per_byte_s": total / self._delivered_bytes
             if total is not None and self._delivered_bytes

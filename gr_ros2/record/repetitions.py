@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.files import write_text, write_whole
 from gr_ros2.record.result import Result, TopicResult, topic_numbers
 from gr_ros2.record.statistics import CONFIDENCE, Estimate, average
-from gr_ros2.record.trace import write_text, write_whole
 
 REPETITIONS_FILE = "repetitions.json"
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +18,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_vali
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.files import write_text, write_whole
 
 RESULT_FILE = "result.json"
 
@@ -177,16 +177,7 @@ def write_result(result: Result, path: str | Path) -> Path:
         path /= RESULT_FILE
     values = _finite(TypeAdapter(Result).dump_python(result, mode="python", warnings=False))
     text = json.dumps(values, indent=2, allow_nan=False, default=str) + "\n"
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
-    return path
+    return write_whole(path, text, write_text)
 
 
 def read_result(path: str | Path) -> Result:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -26,6 +25,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.files import write_whole
 from gr_ros2.link.events import SentPacket
 from gr_ros2.record.ledger import TopicLedger
 
@@ -324,40 +324,6 @@ def write_csv(table: Any, path: Path) -> None:
     """One table as CSV with a header line; null is an empty field."""
     plain = pa.schema([(c.name, pa.string() if pa.types.is_dictionary(c.type) else c.type) for c in table.schema])
     pa_csv.write_csv(table.cast(plain), path, pa_csv.WriteOptions(quoting_style="needed"))
-
-
-def write_text(text: str, path: Path) -> None:
-    """One text file."""
-    path.write_text(text, encoding="utf-8")
-
-
-def write_whole(path: Path, table: Any, write: Callable[[Any, Path], object]) -> Path:
-    """Write a table or text so that the file appears whole or not at all.
-
-    :raises ConfigError: when it cannot be written
-    """
-    part = path.with_name(f".{path.name}.part")
-    make_folder(path.parent)
-    try:
-        write(table, part)
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
-    return path
-
-
-def make_folder(path: Path) -> Path:
-    """The folder, made if missing.
-
-    :raises ConfigError: when it cannot be made
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
-    return path
 
 
 def _read(path: Path) -> Any:

@@ -53,8 +53,8 @@ def _outcome(result: Result) -> Iterator[str]:
 
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """What carrying everything would have needed, against what the air has."""
-    airtime = result.phy.get("airtime_s")
-    if not airtime or not result.duration_s or result.config.get("pace") == "flow" or not len(packets.packet):
+    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
+    if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
     needed = sum(
         (m.row != LedgerRow.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages()
@@ -83,9 +83,14 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
         f"sink intact, {passed - arrived:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
         "PHY by the end"
     )
-    if result.phy.get("airtime_s") and result.config.get("pace") != "flow" and arrived:
+    if result.phy.get("airtime_s") and result.config.get("time") != "unthrottled" and arrived:
         span = max(result.duration_s, float(np.nanmax(t_received)))
-        used = arrived * result.phy["airtime_s"] / span / result.phy.get("channels", 1)
+        used = (
+            arrived
+            * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"])
+            / span
+            / result.phy.get("channels", 1)
+        )
         text += f"; those that arrived took {_percent(used)} of the air"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)

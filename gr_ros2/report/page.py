@@ -22,10 +22,11 @@ from matplotlib.figure import Figure
 
 from gr_ros2 import __version__
 from gr_ros2.errors import ConfigError
+from gr_ros2.files import write_text, write_whole
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, read_result, topic_numbers
-from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv, write_text, write_whole
+from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2.report.explain import explanation
 from gr_ros2.report.figures import latency_figure, ledger_figure, path_figure, save_figure
 from gr_ros2.report.table import PAPER, Grid, ledger_grid, notes, paper_grid, summary_grid
@@ -239,8 +240,8 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
             "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
         )
     )
-    airtime = result.phy.get("airtime_s")
-    if airtime and result.config.get("pace") != "flow":
+    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
+    if airtime and result.config.get("time") != "unthrottled":
         pictures.append(
             save(
                 airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),

@@ -123,7 +123,7 @@ def airtime_figure(packets: Packets, airtime_s: float, duration_s: float) -> Fig
     """How much of the air was asked for and used: airtime of the packets that left the source, and of those that
     arrived, per time.
 
-    :param airtime_s: s, of one packet
+    :param airtime_s: s, of one packet on average
     :param duration_s: s during which messages were submitted
     """
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")

@@ -7,14 +7,11 @@ ROS has no type for (complex numbers, mappings) appears as text; nothing here kn
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, is_dataclass
+from typing import Any
 
-from annotated_types import Ge, Gt, Le, Lt
-
-from gr_ros2.config import meanings
+from gr_ros2.setting import Setting, members, settings_of
 
 Plain = bool | int | float | str | list[str] | None
 
@@ -46,15 +43,14 @@ def parameters(settings: Any, prefix: str = "") -> Iterator[Parameter]:
 
     :param prefix: with a dot at its end, or ''
     """
-    said, hints = meanings(type(settings)), get_type_hints(type(settings), include_extras=True)
-    for item in fields(settings):
-        name, value = f"{prefix}{item.name}", getattr(settings, item.name)
+    for setting in settings_of(type(settings)):
+        name, value = f"{prefix}{setting.name}", getattr(settings, setting.name)
         if is_dataclass(value):
             yield from parameters(value, f"{name}.")
         elif isinstance(value, Mapping):
-            yield from _entries(value, f"{name}.", said.get(item.name, ""))
+            yield from _entries(value, f"{name}.", setting.meaning)
         else:
-            yield _parameter(name, value, said.get(item.name, ""), hints[item.name])
+            yield _parameter(name, value, setting)
 
 
 def overrides(values: Mapping[str, Any]) -> list[str]:
@@ -72,42 +68,22 @@ def _entries(mapping: Mapping[str, Any], prefix: str, meaning: str) -> Iterator[
             yield Parameter(f"{prefix}{key}", _plain(value), meaning)
 
 
-def _parameter(name: str, value: Any, meaning: str, hint: Any) -> Parameter:
-    hints = list(_parts(hint))
-    limits = [mark for part in hints if get_origin(part) is Annotated for mark in _limits(get_args(part)[1:])]
-    above = [mark.gt for mark in limits if isinstance(mark, Gt)]
-    below = [mark.lt for mark in limits if isinstance(mark, Lt)]
-    rules = [f"above {limit}" for limit in above] + [f"below {limit}" for limit in below]
-    choices = [str(choice) for part in hints if get_origin(part) is Literal for choice in get_args(part)]
+def _parameter(name: str, value: Any, setting: Setting) -> Parameter:
+    above, below, choices = setting.above, setting.below, ", ".join(map(str, setting.choices))
+    rules = [f"{word} {limit:g}" for word, limit in (("above", above), ("below", below)) if limit is not None]
     if choices:
-        rules.append(f"one of {', '.join(choices)}")
-    least = [mark.ge for mark in limits if isinstance(mark, Ge)] + above
-    most = [mark.le for mark in limits if isinstance(mark, Le)] + below
+        rules.append(f"or {choices}" if setting.kinds else f"one of {choices}")
+    least = above if setting.least is None else setting.least
+    most = below if setting.most is None else setting.most
     return Parameter(
         name,
         _plain(value),
-        meaning,
-        float(least[0]) if least else None,  # type: ignore[arg-type]
-        float(most[0]) if most else None,  # type: ignore[arg-type]
+        setting.meaning,
+        None if least is None else float(least),
+        None if most is None else float(most),
         "; ".join(rules),
-        strict=isinstance(value, bool | int | str) and len(hints) == 1 + (get_origin(hint) is Annotated),
+        strict=isinstance(value, bool | int | str) and len(members(setting.hint)) == 1,
     )
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """A type and what it is made of: the members of a union, what is annotated."""
-    yield hint
-    if get_origin(hint) is Annotated:
-        yield from _parts(get_args(hint)[0])
-    elif get_origin(hint) in (Union, UnionType):
-        for part in get_args(hint):
-            yield from _parts(part)
-
-
-def _limits(marks: Sequence[Any]) -> Iterator[Any]:
-    """The bounds among annotations; pydantic's Field carries its own as metadata."""
-    for mark in marks:
-        yield from getattr(mark, "metadata", [mark])
 
 
 def _plain(value: Any) -> Plain:

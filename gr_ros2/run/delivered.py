@@ -16,11 +16,11 @@ from types import TracebackType
 from typing import Literal
 
 from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.files import make_folder
 from gr_ros2.link.events import Delivered
 from gr_ros2.middleware.bag_files import RecordedTopic, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import Qos
-from gr_ros2.record.trace import make_folder
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
 

@@ -93,8 +93,7 @@ class Direction:
             self.source,
             self.sink,
             channel=scenario.channel,
-            pace=scenario.pace,
-            paced=scenario.paced,
+            throttled=scenario.time != "unthrottled",
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)

@@ -15,6 +15,7 @@ from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.wire import Format
 
@@ -27,7 +28,8 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
 
     :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
     """
-    rate = scenario.phy.sample_rate
+    chosen = scenario.phy.sample_rate
+    rate = 0.0 if chosen == AUTO else chosen
     if not rate and PHY.load(scenario.phy.name).has_samples:
         at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
         rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
@@ -43,8 +45,10 @@ def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
     """
     phys = [make_phy(way, registry) for way in directions]
     rate = max(phy.sample_rate for phy in phys)
-    at_rate = (replace(way, phy=replaced(way.phy, sample_rate=rate)) for way in directions)
-    return [phy if phy.sample_rate == rate else make_phy(way, registry) for phy, way in zip(phys, at_rate, strict=True)]
+    return [
+        phy if phy.sample_rate == rate else make_phy(replace(way, phy=replaced(way.phy, sample_rate=rate)), registry)
+        for phy, way in zip(phys, directions, strict=True)
+    ]
 
 
 def offered_packets(scenario: Scenario, registry: Registry) -> float:

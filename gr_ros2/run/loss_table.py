@@ -25,6 +25,7 @@ from typing import Any
 from gr_ros2 import __version__
 from gr_ros2.config import BurstLoss, ChannelConfig, replaced
 from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.files import replacing
 from gr_ros2.phy import Phy
 
 BUILTIN_DIR = Path(__file__).resolve().parent.parent / "losses"
@@ -224,9 +225,8 @@ def write(table: LossTable, path: Path) -> None:
     lines = ",\n  ".join(json.dumps(row) for row in rows)
     text = json.dumps(values, indent=1)[:-2] + f',\n "points": [\n  {lines}\n ]\n}}\n'
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 @cache

@@ -1,7 +1,7 @@
-"""What a run shows to whoever looks on, such as a dashboard: the events of both ends, and the parts while they run.
+"""Observers of a run, such as a dashboard: they receive the events of both ends, and see the parts while they run.
 
-Invariant: the run never depends on an observer, whether that raises, hangs or is slow; without one nothing of this
-costs anything.
+Invariant: the run never depends on an observer, even if it raises, hangs or is slow; without observers there is no
+cost.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 
 _HELD_BYTES = 1 << 25
-"""Of events that an observer in a thread of its own has not heard yet."""
+"""Bytes of events that may wait for an observer with a thread of its own."""
 _EVENT_BYTES = 256
-"""What an event holds beside packet and payload."""
+"""Bytes of an event without packet and payload."""
 _PATIENCE_S = 5.0
-"""s an observer may take to come to the end of what it was told."""
+"""s that an observer may take to process the waiting events."""
 
 
 class LiveLink(Protocol):
@@ -111,7 +111,7 @@ class LateObservers(Observers[RunObserver]):
         self._run: LiveRun | None = None
 
     def invite(self, observer: RunObserver) -> None:
-        """Let one more look on, from now."""
+        """Attach one more observer, from now on."""
         with self._lock:
             guard = Guard(name_of(observer))
             if self._run is not None:
@@ -197,7 +197,7 @@ class ThreadedObserver(Observers[RunObserver]):
             self._guard.miss()
 
     def _give_up(self) -> None:
-        """It hangs: what waits will not be heard."""
+        """The observer hangs: count the waiting events as missed."""
         if self._guard.error is None:
             self._guard.end(RunError(f"it has not come back for {_PATIENCE_S:g} s"))
             self._guard.miss(self._backlog.pending)

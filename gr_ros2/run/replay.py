@@ -67,7 +67,7 @@ def replay(
     contents = bag_contents(source)
     recorded = contents.topics
     scenario = replace(
-        scenario, source=f"bag:{source}", bag_speed=1.0, time="samples" if scenario.time == "real" else scenario.time
+        scenario, source=f"bag:{source}", bag_speed=1.0, time=scenario.time if scenario.simulated else "samples"
     )
     registry = scenario.load_registry()
     names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in recorded}

@@ -16,6 +16,7 @@ from shutil import copyfile
 from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
+from gr_ros2.files import make_folder, write_whole
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -25,7 +26,7 @@ from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
-from gr_ros2.record.trace import Trace, make_folder, write_trace, write_whole
+from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.direction import Direction, open_graph
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
@@ -116,10 +117,10 @@ def run_scenario(
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
-    run_observers = RunObservers(observers, threaded=scenario.time == "real")
+    run_observers = RunObservers(observers, threaded=not scenario.simulated)
     outcome: Outcome | None = None
     try:
-        if scenario.time == "real":
+        if not scenario.simulated:
             with ExitStack() as stack:
                 outcome = _Run(scenario, out, stack, run_observers).execute(on_progress)
         else:
@@ -290,7 +291,7 @@ class _Run:
 
     def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
         """How late the computer was; None where the link waits for it."""
-        if self.scenario.pace == "flow":
+        if self.scenario.time == "unthrottled":
             return None
         parts: dict[str, list[Lateness]] = {"threads": [self.pulse.lateness], "gate": [], "modem": []}
         for way in self.directions:
@@ -330,13 +331,13 @@ class _Run:
         return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        """Let the link deliver what it holds, for at most ``drain_s`` without news in pace `flow`."""
+        """Let the link deliver what it holds, for at most ``drain_s`` without news where it runs unthrottled."""
         limit = time.monotonic() + self.scenario.drain_s
         before = (0, 0)
         while time.monotonic() < limit and self.recorder.ledger.unresolved():
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
-            if self.scenario.pace == "flow" and (now := self.recorder.progress()) != before:
+            if self.scenario.time == "unthrottled" and (now := self.recorder.progress()) != before:
                 before, limit = now, time.monotonic() + self.scenario.drain_s
 
     def _empty(self) -> bool:

@@ -13,24 +13,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import (
-    ChannelConfig,
-    Count,
-    PacketLen,
-    PhyConfig,
-    Seconds,
-    SinkConfig,
-    SourceConfig,
-    WireVersion,
-    build,
-)
+from gr_ros2.config import STRICT, AnyLink, ChannelConfig, OneWay, OverChannel, Seconds, Traffic, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.registry import Registry, check_outputs
+from gr_ros2.setting import Auto
 from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.sim.settings import SimSettings
 
@@ -41,11 +32,29 @@ _OWN_KEYS = ("namespace", "robot_id", "dst_id", *_GRAPH_KEYS)
 _BACK_SEED = 100_003
 """From the seed of one direction's channel to the other's; no two repetitions of an experiment are so far apart."""
 
-_BAG = "bag:"
+
+Time = Literal["real", "unthrottled", "samples", "packets"]
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Back:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Experiment:
+    """What is run, once or several times.
+
+    :param description: one line
+    :param repetitions: runs, with seeds seed, seed + 1, ...; in a sweep of every cell
+    :param time: what the clock of a run follows. `real`: the wall clock, packets pass at the pace of the air;
+        `unthrottled`: the wall clock, packets pass as fast as the flowgraph runs, which measures its speed; `samples`:
+        simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`: simulated
+        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md)
+    """
+
+    description: str = ""
+    repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
+    time: Time = "real"
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Back(OneWay):
     """The way back of a two-way scenario, at the same time on a second channel (full duplex).
 
     What is not set is as on the way there, with the two graphs swapped; of ``channel`` the seed differs.
@@ -55,85 +64,40 @@ class Back:
     :param channel: what lies between them
     """
 
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
-    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
 
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Reports:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Reports(OverChannel):
     """What receivers say of what they hear, on a channel of their own (version 1).
 
     :param channel: what lies between them and the sender; what is not set is as on the way there, but for the seed
     :param delay_s: s that a report takes beside its airtime
     """
 
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
     delay_s: Seconds = 0.0
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
-class Scenario:
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Scenario(Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
-    :param name: what the result and the tables call it
-    :param registry: CSV path, relative to the YAML file (on the command line: to the current directory), or the
-        name of a built-in one such as `table4`
-    :param description: one line
-    :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator; its seed is the scenario's unless given
-    :param packet_len: bytes on the wire, 14..4095, the same on both ends
-    :param version: of the wire format: 0 the paper's, 1 with repair, announcements and reports
-    :param ros_source: the sending block
-    :param ros_sink: the receiving block
-    :param phy: which physical layer, and how fast
-    :param channel: what lies between transmitter and receiver; its seed is the scenario's unless given
-    :param back: the way back, where both robots talk; None = one way only
-    :param reports: the way back for reports alone (version 1, simulated time); None = there is none
+    :param back: the way back, where both robots talk; null = one way only
+    :param reports: the way back for reports alone (version 1, simulated time); null = there is none
     :param receivers: channels of further receivers of the same sender, in simulated time; what is not set in one is as
         in ``channel``, but for the seed
-    :param duration_s: s during which messages are submitted; 0 = until the bag ends
-    :param drain_s: s the link may go on delivering after that
     :param seed: of the simulator, the channel and the sender
-    :param repetitions: runs, with seeds seed, seed + 1, ...
-    :param pace: `airtime` lets samples pass at their sample rate, as on the air; `flow` as fast as the flowgraph runs
-    :param paced: the PHY grants the source one packet at a time; false offers every packet at once, as the paper does
-    :param time: what the run's clock follows: `real` the wall clock; `samples` the samples of the flowgraph, which runs
-        as fast as it can; `packets` the packets alone, which are lost as measured on the flowgraph
-    :param localhost_only: DDS stays on the loopback interface
     """
 
-    name: Annotated[str, Field(min_length=1)]
-    registry: Annotated[str, Field(min_length=1)]
-    description: str = ""
-    source: str = "sim"
-    bag_speed: Seconds = 1.0
+    bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     sim: SimSettings = Field(default_factory=SimSettings)
-    packet_len: PacketLen = 220
-    version: WireVersion = 0
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
-    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
-    phy: PhyConfig = Field(default_factory=PhyConfig)
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
     back: Back | None = None
     reports: Reports | None = None
     receivers: tuple[ChannelConfig, ...] = ()
-    duration_s: Seconds = 15.0
-    drain_s: Seconds = 2.0
-    seed: Count = 0
-    repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
-    pace: Literal["airtime", "flow"] = "airtime"
-    paced: bool = True
-    time: Literal["real", "samples", "packets"] = "real"
-    localhost_only: bool = True
+    localhost_only: bool | Auto = True
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
-        if self.source != "sim" and not self.source.removeprefix(_BAG).strip():
-            raise ValueError(f"source = {self.source!r}: the path of the bag is missing; write bag:PATH")
-        if self.source != "sim" and not self.source.startswith(_BAG):
-            raise ValueError(f"source = {self.source!r}: write sim or bag:PATH")
         if self.source == "sim" and self.duration_s == 0:
             raise ValueError("duration_s = 0: the simulator has no end; set duration_s above 0")
         for key, name, table in (
@@ -149,7 +113,7 @@ class Scenario:
             raise ValueError("reports: version 0 has none, and with back they go along; leave reports out")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
-        if (self.reports is not None or self.receivers) and self.time == "real":
+        if (self.reports is not None or self.receivers) and not self.simulated:
             raise ValueError("reports and receivers are for simulated time; set time to samples or packets")
         return self
 
@@ -174,9 +138,9 @@ class Scenario:
         return there, replace(there, **back)
 
     @property
-    def bag_path(self) -> Path | None:
-        """The recording to play, None when the simulator is the source."""
-        return Path(self.source.removeprefix(_BAG).strip()).expanduser() if self.source.startswith(_BAG) else None
+    def simulated(self) -> bool:
+        """Whether its clock is simulated, so that a run takes as long as it takes to compute."""
+        return self.time in ("samples", "packets")
 
     def load_registry(self) -> Registry:
         """The registry both ends work with.

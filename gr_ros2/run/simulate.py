@@ -26,6 +26,7 @@ from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.v1.settings import NOBODY
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -33,6 +34,7 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.settings import SimSettings
 from gr_ros2.wire import BROADCAST
@@ -62,6 +64,8 @@ class AirtimeEnded:
 
 TimedEvent = tuple[float, "LinkDirection | Branch", SenderEvent | ReceiverEvent | AirtimeEnded]
 """When, s after the start; in which direction, or at which further receiver; and what."""
+Airtime = Callable[[int | None], float]
+"""s that a packet of so many bytes is on the air; of None: the longest."""
 Medium = Callable[[bytes, float], Iterable[bytes]]
 """What becomes of a packet whose airtime is over now: what comes out of the receiver."""
 
@@ -71,7 +75,7 @@ class Simulated:
     """What came out.
 
     :param duration_s: s during which messages were offered
-    :param airtime_s: of one packet, s; 0 for a PHY without samples
+    :param airtime_s: of the longest packet, s; 0 for a PHY without samples
     :param packets: as in ``result.json``
     """
 
@@ -141,7 +145,7 @@ def simulate(
     :param codec: of both ends; None makes it where ``compression`` is on
     :param on_packet: called with every packet that leaves the source
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
-    :raises ConfigError: when the scenario cannot be set up, or has no times (pace ``flow``)
+    :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
     registry = scenario.load_registry()
     phy = phy or make_phy(scenario, registry)
@@ -149,13 +153,13 @@ def simulate(
     topics = {src_id: source_names(scenario, registry).values()}
     recorder = Recorder(registry, {src_id: scenario.ros_source.namespace}, topics)
     losses = PduLosses(scenario.channel)
-    ends = make_ends([scenario], registry, codec)
-    way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime(), messages or offered(scenario, registry))
+    ends = make_ends([scenario], registry, codec, any_length=phy.any_length)
+    way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime, messages or offered(scenario, registry))
     way.air = lambda data, now: [data] if losses.passes(now) else ()
     ways = [way]
     if scenario.reports is not None:
         heard = PduLosses(scenario.reports.channel)
-        ways += report_ways(scenario, ends[:2], phy.airtime(), [lambda data, now: [data] if heard.passes(now) else ()])
+        ways += report_ways(scenario, ends[:2], phy.airtime, [lambda data, now: [data] if heard.passes(now) else ()])
     for timed_event in EventLoop(ways).run():
         tell(recorder, timed_event, overhead_s)
         if on_packet is not None and isinstance(timed_event[2], SentPacket):
@@ -188,22 +192,26 @@ class End:
     src_id: int = -1
 
 
-def make_ends(ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None) -> list[End]:
+def make_ends(
+    ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None, *, any_length: bool = False
+) -> list[End]:
     """The ends of a link: the first sends, the others hear it; where there are two ways, the second sends too.
 
     :param ways: one scenario per direction
     :param codec: of all messages; None makes it where ``compression`` is on
+    :param any_length: whether the PHY carries shorter packets in less time
     """
     there, back = ways[0], ways[1] if len(ways) > 1 else None
     reports = there.reports is not None or back is not None
     own_id = there.ros_source.src_id()
-    ends = [_end(registry, there, back, codec, Start(there.seed + 1, reports=reports))]
+    start = Start(there.seed + 1, reports=reports, any_length=any_length)
+    ends = [_end(registry, there, back, codec, start)]
     for number in range(1 + len(there.receivers)):
         sink = there.ros_sink
-        if reports and back is None and sink.robot_id in (-1, own_id):
+        if reports and back is None and sink.robot_id in (AUTO, own_id):
             sink = replace(sink, robot_id=_free_id(own_id, number))
         hears = replace(there, ros_sink=sink)
-        ends.append(_end(registry, back, hears, codec, Start(there.seed + 1, reports=reports)))
+        ends.append(_end(registry, back, hears, codec, start))
     return ends
 
 
@@ -219,7 +227,8 @@ def _end(
     told: list[SenderEvent] = []
     rng = None if out is None else random.Random(out.seed)
     endpoint = make_endpoint(registry, source, sink, start=start, codec=codec, rng=rng, observer=told.append)
-    src_id = source.src_id() if source is not None else -1 if sink is None else sink.robot_id
+    own = NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id
+    src_id = own if source is None else source.src_id()
     return End(endpoint, told, src_id)
 
 
@@ -245,25 +254,28 @@ class Branch:
 class LinkDirection:
     """One direction of a link: what is offered to the end that sends, its turn on the air, and the end that hears it.
 
-    :param airtime: of one packet, s; 0 for a PHY without samples
+    :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without samples
     :param messages: in the order of time
     :param src_id: of the end that sends; None: the scenario's source
     :param delay_s: s from the end of a packet's airtime to its arrival
-    :raises ConfigError: for pace ``flow``, which has no times
+    :raises ConfigError: for time ``unthrottled``, which has no times
     """
 
     def __init__(
         self,
         scenario: Scenario,
         ends: tuple[End, End],
-        airtime: float,
+        airtime: Airtime,
         messages: Iterator[Offered],
         *,
         src_id: int | None = None,
         delay_s: float = 0.0,
     ) -> None:
-        if scenario.pace != "airtime":
-            raise ConfigError(f"pace = {scenario.pace!r}: only pace airtime can be simulated")
+        if scenario.time == "unthrottled":
+            raise ConfigError(
+                "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
+                "be simulated; set time to real, samples or packets"
+            )
         self.sender, self.receiver = ends
         self.number = 0
         self.src_id = scenario.ros_source.src_id() if src_id is None else src_id
@@ -281,8 +293,9 @@ class LinkDirection:
         """s during which messages were offered; where the scenario leaves that to its bag, known at the end."""
         self._messages = messages
         self._coming = next(messages, None)
-        self._clock: AirtimeClock[bytes] | None = AirtimeClock(airtime) if airtime else None
-        self._paced = scenario.paced and self._clock is not None
+        self._airtime = airtime
+        self._clock: AirtimeClock[bytes] | None = AirtimeClock(airtime(None)) if airtime(None) else None
+        self._paced = self._clock is not None
         self._drain = scenario.drain_s
         self._until = scenario.duration_s
         self._delay_s = delay_s
@@ -346,7 +359,7 @@ class LinkDirection:
     def _send(self, now: float) -> Iterator[TimedEvent]:
         while (data := self.sender.endpoint.next_packet(now)) is not None:
             if self._clock is not None:
-                self._clock.offer(data, now)
+                self._clock.offer(data, now, self._airtime(len(data)))
             else:
                 yield from self._told(now)
                 yield from self._land(data, now)
@@ -375,7 +388,9 @@ class LinkDirection:
         return inf if self.over and not answers else soonest
 
 
-def report_ways(scenario: Scenario, ends: Sequence[End], airtime: float, airs: Sequence[Medium]) -> list[LinkDirection]:
+def report_ways(
+    scenario: Scenario, ends: Sequence[End], airtime: Airtime, airs: Sequence[Medium]
+) -> list[LinkDirection]:
     """The ways by which receivers report to the one that they hear.
 
     :param ends: it, and the receivers

@@ -91,7 +91,7 @@ def run_simulated(
         link_observers = Observers[LinkObserver]()
         recorded = link_observers.add(recorder, needed=True)
         link_observers.add(run_observers)
-        ends = make_ends(ways, registry)
+        ends = make_ends(ways, registry, any_length=all(phy.any_length for phy in phys))
         directions = [
             _Direction(way, registry, phy, (first, second))
             for way, phy, (first, second) in zip(ways, phys, (ends[:2], ends[1::-1]), strict=False)
@@ -188,7 +188,7 @@ class _Direction:
     """
 
     def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
-        self.way = LinkDirection(scenario, ends, phy.airtime(), offered(scenario, registry))
+        self.way = LinkDirection(scenario, ends, phy.airtime, offered(scenario, registry))
         self._scenario, self._registry = scenario, registry
         self._losses = PduLosses(scenario.channel)
         self._lost_by_phy: Counter[str] = Counter()
@@ -290,7 +290,7 @@ def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End
         return []
     channel = scenario.reports.channel
     channels = [replaced(channel, seed=channel.seed + number) for number in range(len(ends) - 1)]
-    return report_ways(scenario, ends, phy.airtime(), [_Air(scenario, phy, each).pass_one for each in channels])
+    return report_ways(scenario, ends, phy.airtime, [_Air(scenario, phy, each).pass_one for each in channels])
 
 
 def _all_events(loop: EventLoop, directions: Sequence[_Direction]) -> Iterator[TimedEvent]:

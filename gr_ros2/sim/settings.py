@@ -10,21 +10,27 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.config import Seeded
+
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class SimSettings:
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
+class SimSettings(Seeded):
     """Robots, world, rates and noise.
 
-    :param seed: of the world, the routes and all noise
+    :param seed: of the world, the routes and all noise; in a scenario that of the scenario unless it is set
     :param robots: number of robots; they are called robot_1, robot_2, ...
     :param size_m: side of the square room, m
     :param obstacles: boxes and pillars in it; fewer where the room has no place for all
     :param max_speed: m/s
-    :param odom_rate: Hz, as all rates
-    :param map_rate: 0 = once at the start
+    :param scan_rate: laser scans, Hz
+    :param odom_rate: odometry, Hz
+    :param imu_rate: Hz
+    :param cmd_vel_rate: velocity commands, Hz
+    :param clock_rate: Hz
+    :param map_rate: maps, Hz; 0 = once at the start
     :param beams: of a laser scan, over the full turn
     :param scan_range: farthest range the scanner measures, m; beyond it a beam reads +inf (REP 117)
     :param map_cells: cells along each side of the map
@@ -39,7 +45,6 @@ class SimSettings:
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
-    seed: Annotated[int, Field(ge=0)] = 0
     robots: Annotated[int, Field(ge=1, le=8)] = 2
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12

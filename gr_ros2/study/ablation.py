@@ -44,8 +44,8 @@ def variants(scenario: Scenario) -> list[Variant]:
     found = [Variant(WHOLE)]
     if source.compression:
         found.append(Variant("no-compression", ("ros_source.compression=false", "ros_sink.compression=false")))
-    if scenario.paced:
-        found.append(Variant("no-pull", ("paced=false",)))
+    if source.packet_rate != 0:
+        found.append(Variant("no-pull", ("ros_source.packet_rate=0",)))
     if source.scheduler == "freshness":
         found.append(Variant("no-freshness", ("ros_source.scheduler=paper",)))
     registry = scenario.load_registry().with_options(source.topic_options)

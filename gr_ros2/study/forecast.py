@@ -24,6 +24,7 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import offered, simulate
+from gr_ros2.setting import AUTO
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -180,7 +181,7 @@ class Planner:
     def __init__(self, scenario: Scenario) -> None:
         if not PHY.load(scenario.phy.name).has_samples:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
-        if scenario.time == "real":
+        if not scenario.simulated:
             # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
         self.scenario = scenario
@@ -241,8 +242,8 @@ class Planner:
             )
         if source.scheduler != "freshness":
             yield "ros_source.scheduler=freshness", replace(base, ros_source=replace(source, scheduler="freshness"))
-        if not base.paced:
-            yield "paced=true", replace(base, paced=True)
+        if source.packet_rate == 0:
+            yield "ros_source.packet_rate=auto", replace(base, ros_source=replace(source, packet_rate=AUTO))
         for packet_len in self._packet_lens():
             yield (
                 f"packet_len={packet_len}",
@@ -293,20 +294,24 @@ class Planner:
         duration = scenario.duration_s or self._messages[-1].t
         messages = [message for message in self._messages if message.t <= duration]
         shares: Counter[int] = Counter()
-        padded = 0
+        padded = sent_bytes = 0
+        spent = 0.0
         cut = False
 
         wire = scenario.ros_source.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, cut
+            nonlocal padded, sent_bytes, spent, cut
             cut = cut or any(entry.total > 1 for entry in sent.entries)
-            layout = wire.layout(sent.packet, scenario.packet_len)
+            own_airtime = phy.airtime(len(sent.data))
+            spent += own_airtime
+            sent_bytes += len(sent.data)
+            layout = wire.layout(sent.packet, len(sent.data))
             padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
-                    shares[span.entry.topic_id] += airtime * span.size / whole  # type: ignore[assignment]
+                    shares[span.entry.topic_id] += own_airtime * span.size / whole  # type: ignore[assignment]
 
         run = simulate(scenario, phy=phy, messages=iter(messages), codec=codec, on_packet=share, overhead_s=OVERHEAD_S)
         names = source_names(scenario, self.registry)
@@ -328,15 +333,14 @@ class Planner:
                     result=result,
                 )
             )
-        packets = run.stats.packets
         delivered = sum(topic.result.delivered for topic in topics)
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
             capacity=1 / airtime,
-            used=min(packets * airtime / duration, 1.0),
-            air_bytes_per_message=packets * scenario.packet_len / delivered if delivered else None,
-            pad=padded / (packets * scenario.packet_len) if packets else 0.0,
+            used=min(spent / duration, 1.0),
+            air_bytes_per_message=sent_bytes / delivered if delivered else None,
+            pad=padded / sent_bytes if sent_bytes else 0.0,
             pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
             air={kind: count / max(sum(run.stats.sent.values()), 1) for kind, count in run.stats.air.items()},

@@ -39,8 +39,11 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
     ("name", "overrides"),
     [
         ("paper-direct", []),
-        ("paper-ofdm", ["phy.sample_rate=0", "paced=true", "drain_s=60"]),
-        ("paper-ofdm", ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "paced=true", "drain_s=60"]),
+        ("paper-ofdm", ["phy.sample_rate=auto", "ros_source.packet_rate=auto", "drain_s=60"]),
+        (
+            "paper-ofdm",
+            ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "ros_source.packet_rate=auto", "drain_s=60"],
+        ),
     ],
 )
 def test_every_message_arrives_unaltered(tmp_path: Path, name: str, overrides: list[str]) -> None:

@@ -101,7 +101,7 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
         assert hasattr(BLOCKS[name][0], callback.split("(")[0])
 
 
-def test_the_phys_blocks_are_as_their_settings_say() -> None:
+def test_the_blocks_are_as_their_settings_say() -> None:
     tool = Path(__file__).resolve().parents[2] / "tools" / "write-grc"
     done = subprocess.run([sys.executable, tool, "--check"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -225,10 +225,10 @@ def test_grc_knows_the_range_of_a_radios_settings(platform: Platform, setting: s
 
 
 def test_grc_offers_clock_sources_and_takes_others(platform: Platform) -> None:
-    for source in ("", "external", "another"):
+    for source in ("auto", "external", "another"):
         assert not complaints(platform, "uhd_radio.grc", ["radio"], "clock_source", source)
     offered = next(item for item in description("ros2_radio_uhd")["parameters"] if item["id"] == "clock_source")
-    assert {"", "internal", "external", "gpsdo"} <= set(offered["options"])
+    assert {"auto", "internal", "external", "gpsdo"} <= set(offered["options"])
 
 
 def compiled(path: Path, folder: Path) -> ModuleType:

@@ -8,20 +8,21 @@ import pytest
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.rcl import told, translated
+from gr_ros2.setting import Auto
 
 NAME = "ROS_LOCALHOST_ONLY"
 
 
 @pytest.mark.parametrize("before", [None, "0", "1"])
-@pytest.mark.parametrize("localhost_only", [True, False, None])
+@pytest.mark.parametrize("localhost_only", [True, False, "auto"])
 def test_the_environment_says_it_for_a_moment_only(
-    monkeypatch: pytest.MonkeyPatch, before: str | None, localhost_only: bool | None
+    monkeypatch: pytest.MonkeyPatch, before: str | None, localhost_only: bool | Auto
 ) -> None:
     monkeypatch.delenv(NAME, raising=False)
     if before is not None:
         monkeypatch.setenv(NAME, before)
     with pytest.raises(ValueError, match="inside"), told(localhost_only):
-        assert os.environ.get(NAME) == {True: "1", False: "0", None: before}[localhost_only]
+        assert os.environ.get(NAME) == {True: "1", False: "0", "auto": before}[localhost_only]
         raise ValueError("inside")
     assert os.environ.get(NAME) == before
 

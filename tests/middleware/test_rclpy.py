@@ -25,6 +25,7 @@ from std_msgs.msg import Header, String
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.rclpy import RclpyMiddleware, message_class
+from gr_ros2.setting import Auto
 from tests.domains import domain
 from tests.waiting import wait_for
 
@@ -281,7 +282,7 @@ def test_node_is_listed_on_its_domain_only(start: Start, host: rclpy.node.Node) 
 
 def test_domain_from_the_environment(start: Start, host: rclpy.node.Node, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
-    start(node_name="by_environment", domain_id=-1)
+    start(node_name="by_environment", domain_id="auto")
     wait_for(lambda: "by_environment" in host.get_node_names())
 
 
@@ -413,9 +414,9 @@ middleware.advertise("/chatter", "{STRING}", Qos()).publish(b"\\0\\1\\0\\0\\1\\0
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("localhost_only", [True, False, None])
+@pytest.mark.parametrize("localhost_only", [True, False, "auto"])
 def test_localhost_only_is_what_a_context_begins_with_and_nobody_else(
-    start: Start, monkeypatch: pytest.MonkeyPatch, localhost_only: bool | None
+    start: Start, monkeypatch: pytest.MonkeyPatch, localhost_only: bool | Auto
 ) -> None:
     found: list[str] = []
     begin = rclpy.context.Context.init

@@ -17,6 +17,7 @@ from gr_ros2.middleware.type_definitions import (
     type_hash,
     typestores,
 )
+from gr_ros2.setting import AUTO, Auto
 
 NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
@@ -51,17 +52,17 @@ def test_names_as_ros_has_them() -> None:
 
 
 def test_domain_from_argument_and_environment() -> None:
-    assert ros_graph.resolve_domain_id(-1, {}) == 0
-    assert ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": ""}) == 0
-    assert ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": "42"}) == 42
+    assert ros_graph.resolve_domain_id("auto", {}) == 0
+    assert ros_graph.resolve_domain_id("auto", {"ROS_DOMAIN_ID": ""}) == 0
+    assert ros_graph.resolve_domain_id("auto", {"ROS_DOMAIN_ID": "42"}) == 42
     assert ros_graph.resolve_domain_id(7, {"ROS_DOMAIN_ID": "42"}) == 7
     for text in ("233", "-1", "1.0", "four"):
         with pytest.raises(ConfigError, match="ROS_DOMAIN_ID"):
-            ros_graph.resolve_domain_id(-1, {"ROS_DOMAIN_ID": text})
+            ros_graph.resolve_domain_id("auto", {"ROS_DOMAIN_ID": text})
 
 
 def test_discovery_options_are_those_of_rcl() -> None:
-    def options(localhost_only: bool | None = None, **environment: str) -> tuple[str, tuple[str, ...]]:
+    def options(localhost_only: bool | Auto = AUTO, **environment: str) -> tuple[str, tuple[str, ...]]:
         found = ros_graph.discovery_options(localhost_only, environment)
         return found.range, found.peers
 

@@ -117,7 +117,7 @@ def test_lengths_that_are_fixed_take_no_other_packet(name: str) -> None:
 def test_a_single_packet_comes_out_by_itself(name: str, options: dict[str, Any]) -> None:
     source, sink = Probe(), Probe()
     draw = random.Random(1)
-    with LoopbackLink(make(name, options), source, sink, pace="flow") as link:
+    with LoopbackLink(make(name, options), source, sink, throttled=False) as link:
         for number in range(1, 6):
             source.post(draw.randbytes(64))
             wait_for(lambda number=number: sink.handled == number, "the packet just sent")
@@ -128,7 +128,7 @@ def test_a_single_packet_comes_out_by_itself(name: str, options: dict[str, Any])
 def test_all_zeros_and_all_ones_pass(name: str) -> None:
     source, sink = Probe(), Probe()
     sent = [bytes(64), b"\xff" * 64] * 5
-    with LoopbackLink(make(name, {}), source, sink, pace="flow"):
+    with LoopbackLink(make(name, {}), source, sink, throttled=False):
         for packet in sent:
             source.post(packet)
         wait_for(lambda: sink.handled == len(sent), "every packet")
@@ -138,7 +138,7 @@ def test_all_zeros_and_all_ones_pass(name: str) -> None:
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_the_symbols_of_the_last_packet_can_be_seen(name: str) -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make(name, {}), source, sink, pace="flow", instrumented=True) as link:
+    with LoopbackLink(make(name, {}), source, sink, throttled=False, instrumented=True) as link:
         assert link.symbols() is None
         source.post(bytes(range(64)))
         wait_for(lambda: sink.handled == 1, "the packet")
@@ -206,7 +206,7 @@ def test_a_lora_burst_that_takes_too_much_memory_is_refused_with_a_remedy() -> N
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_a_pdu_that_is_no_packet_is_counted_and_not_sent(name: str) -> None:
     source, sink = Probe(), Probe()
-    link = LoopbackLink(make(name, {}), source, sink, pace="flow")
+    link = LoopbackLink(make(name, {}), source, sink, throttled=False)
     with link:
         source.post(b"")
         source.post(bytes(65))

@@ -173,7 +173,7 @@ def test_with_the_least_gap_single_packets_come_out_at_once(options: dict[str, A
     phy = make(14, gap=24 * options.get("oversampling", 2), **options)
     source, sink, draw = Probe(), Probe(), random.Random(1)
     channel = ChannelConfig(snr_db=20, frequency_offset=0.004, epsilon=1.00001, seed=1)
-    with LoopbackLink(phy, source, sink, channel=channel, pace="flow"):
+    with LoopbackLink(phy, source, sink, channel=channel, throttled=False):
         for number in range(1, 11):
             source.post(draw.randbytes(14))
             wait_for(lambda number=number: sink.handled == number, "the packet just sent")
@@ -203,7 +203,7 @@ def test_every_byte_value_passes() -> None:
     phy = make(128)
     source, sink = Probe(), Probe()
     sent = [bytes(range(128)), bytes(range(128, 256)), bytes(128), b"\xff" * 128]
-    with LoopbackLink(phy, source, sink, pace="flow"):
+    with LoopbackLink(phy, source, sink, throttled=False):
         for packet in sent:
             source.post(packet)
         wait_for(lambda: sink.handled == len(sent), "every packet")
@@ -250,7 +250,7 @@ def test_with_the_carrier_known_clocks_may_differ(ppm: int) -> None:
 @with_the_module
 def test_a_pdu_that_is_no_packet_is_counted_and_not_sent() -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make(), source, sink, pace="flow") as link:
+    with LoopbackLink(make(), source, sink, throttled=False) as link:
         source.post(bytes(63))
         source.post(bytes(64))
         wait_for(lambda: sink.handled == 1, "the right one")

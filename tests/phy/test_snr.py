@@ -129,7 +129,7 @@ def test_a_flowgraph_tells_it_where_the_phy_knows_it(name: str, options: dict[st
     phy: Phy = made(name, options)
     channel = ChannelConfig(snr_db=14.0, frequency_offset=0.001, seed=1) if phy.has_samples else ChannelConfig()
     source, sink = Probe(), Probe()
-    with LoopbackLink(phy, source, sink, channel=channel, pace="flow") as link:
+    with LoopbackLink(phy, source, sink, channel=channel, throttled=False) as link:
         assert link.snr_db is None
         for number in range(COUNT):
             source.post(bytes([number] * 64))

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from gr_ros2.race.contenders import ADDRESSES, MTU
-from gr_ros2.race.links import IpLink, RaceRadio
+from gr_ros2.race.links import RaceIpLink, RaceRadio
 from gr_ros2.race.namespaces import Namespace, inside
 from gr_ros2.race.tun import INTERFACE, QUEUE_BYTES
 from tests.race.support import needs_namespaces
@@ -33,16 +33,16 @@ def udp(namespace: Namespace, address: str) -> socket.socket:
 
 
 @pytest.fixture
-def linked() -> Iterator[tuple[IpLink, socket.socket, socket.socket]]:
+def linked() -> Iterator[tuple[RaceIpLink, socket.socket, socket.socket]]:
     with ExitStack() as stack:
         spaces = [stack.enter_context(Namespace()) for _ in ADDRESSES]
-        air = stack.enter_context(IpLink(RADIO, (spaces[0].path, spaces[1].path)))
+        air = stack.enter_context(RaceIpLink(RADIO, (spaces[0].path, spaces[1].path)))
         ends = [stack.enter_context(udp(*pair)) for pair in zip(spaces, ADDRESSES, strict=True)]
         yield air, ends[0], ends[1]
 
 
 def test_datagrams_cross_both_ways_and_every_byte_is_counted(
-    linked: tuple[IpLink, socket.socket, socket.socket],
+    linked: tuple[RaceIpLink, socket.socket, socket.socket],
 ) -> None:
     air, near, far = linked
     for size in (1, 700, MTU - HEADERS):
@@ -60,7 +60,7 @@ def test_datagrams_cross_both_ways_and_every_byte_is_counted(
 
 
 def test_what_the_air_cannot_take_waits_in_a_bounded_queue_and_is_counted_beyond_it(
-    linked: tuple[IpLink, socket.socket, socket.socket],
+    linked: tuple[RaceIpLink, socket.socket, socket.socket],
 ) -> None:
     air, near, far = linked
     size, sent = 700, 40
@@ -81,7 +81,7 @@ def test_nothing_is_left_in_a_namespace_when_the_air_is_closed() -> None:
         return [name for _, name in socket.if_nameindex()]
 
     with Namespace() as one, Namespace() as other:
-        with IpLink(RADIO, (one.path, other.path)):
+        with RaceIpLink(RADIO, (one.path, other.path)):
             assert INTERFACE in inside(one.path, names)
         assert [inside(space.path, names) for space in (one, other)] == [["lo"], ["lo"]]
     assert INTERFACE not in names()

@@ -50,7 +50,7 @@ def test_the_sample_rate_follows_from_the_load_and_the_load_from_the_sample_rate
 
 def test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "bag", {"/a": [text(n) for n in range(50)], "/b": [text(n) for n in range(9)]})
-    recording = read_recording(RaceSettings(source=source, topic="/a", duration_s=2), tmp_path)
+    recording = read_recording(RaceSettings(source=source, bag_topic="/a", duration_s=2), tmp_path)
     assert (recording.topic, recording.type_name) == ("/a", "std_msgs/msg/String")
     assert recording.payloads == tuple(text(n) for n in range(20))
     assert recording.hz == pytest.approx(10)
@@ -59,7 +59,7 @@ def test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("topics", "topic", "problem"),
     [
-        ({"/a": [text(1), text(2)], "/b": [text(1)]}, "", r"topic = '': name one that .* has: /a, /b"),
+        ({"/a": [text(1), text(2)], "/b": [text(1)]}, "auto", r"topic = 'auto': name one that .* has: /a, /b"),
         ({"/a": [text(1), text(2)]}, "/c", r"topic = '/c': name one that .* has: /a"),
         ({"/a": [text(1)]}, "/a", "/a has 1 messages in 15 s; 2 are needed"),
         ({"/a": [text(1, 2000), text(2, 2000)]}, "/a", "messages of 2009 B; the race takes up to 1300 B"),
@@ -70,7 +70,7 @@ def test_a_bag_that_cannot_race_is_refused(
 ) -> None:
     source = write_bag(tmp_path / "bag", topics)
     with pytest.raises(ConfigError, match=problem):
-        read_recording(RaceSettings(source=source, topic=topic), tmp_path)
+        read_recording(RaceSettings(source=source, bag_topic=topic), tmp_path)
 
 
 @pytest.mark.parametrize(

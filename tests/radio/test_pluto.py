@@ -19,7 +19,7 @@ pytest.importorskip("gnuradio.iio", reason="needs gr-iio")
 
 from gr_ros2.errors import RadioError
 from gr_ros2.radio.link import RobotLink
-from gr_ros2.radio.pluto import _stderr_aside
+from gr_ros2.radio.pluto import _stderr_deferred
 from tests.radio.pluto import PHY, RX, Pluto
 from tests.radio.robots import ROOT, config, link_command
 
@@ -132,7 +132,7 @@ def test_what_libiio_writes_is_kept(caplog: pytest.LogCaptureFixture, capfd: pyt
     assert "front_end pluto: while it was opened: " in caplog.text
     assert capfd.readouterr().err == ""
     # What came of an opening that went well is not lost.
-    with _stderr_aside():
+    with _stderr_deferred():
         os.write(2, b"of another thread\n")
         assert capfd.readouterr().err == ""
     assert capfd.readouterr().err == "of another thread\n"

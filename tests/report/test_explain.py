@@ -41,7 +41,7 @@ def test_what_the_sources_graph_lost_is_told(tmp_path: Path) -> None:
 
 def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5})
+    slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5, "airtime_mean_s": 0.5})
     assert f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times what the link has" in explanation(slow, run.trace)[1]
 
 

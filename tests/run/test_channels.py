@@ -28,7 +28,7 @@ def pdr(name: str, *changes: str) -> float:
 
 def test_noise_hides_packets_from_the_stock_receiver() -> None:
     assert 0.3 < pdr("channel-awgn") < 0.75
-    assert pdr("channel-awgn", "phy.options.detection_threshold=null") > 0.97
+    assert pdr("channel-awgn", "phy.options.detection_threshold=auto") > 0.97
 
 
 @pytest.mark.parametrize("name", ["channel-multipath", "channel-cfo"])

@@ -21,11 +21,11 @@ def test_the_built_in_ones() -> None:
     assert {f"channel-{name}" for name in channels} <= set(BUILTIN)
     assert all(BUILTIN[f"channel-{name}"].channel != ChannelConfig(seed=0) for name in channels)
     demo, direct, ofdm = BUILTIN["demo"], BUILTIN["paper-direct"], BUILTIN["paper-ofdm"]
-    assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", 0, 1.2)
+    assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", "auto", 1.2)
     assert (direct.packet_len, direct.sim.odom_rate, direct.duration_s, direct.phy.name) == (64, 30, 15, "direct")
     assert (ofdm.packet_len, ofdm.sim.odom_rate, ofdm.duration_s, ofdm.phy.sample_rate) == (64, 35, 38, 100_000)
-    assert (ofdm.paced, ofdm.drain_s, ofdm.ros_source.queue_depth) == (False, 0, 0)
-    assert BUILTIN["paper-ofdm-paced"].paced
+    assert (ofdm.ros_source.packet_rate, ofdm.drain_s, ofdm.ros_source.queue_depth) == (0, 0, 0)
+    assert BUILTIN["paper-ofdm-paced"].ros_source.packet_rate == "auto"
     assert BUILTIN["paper-ofdm-paced"].ros_source.queue_depth > 0
 
 
@@ -39,7 +39,7 @@ def test_each_is_ready_to_run(name: str) -> None:
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
     domains = {scenario.ros_source.domain_id, scenario.ros_sink.domain_id}
     if name == "one-graph":
-        assert domains == {-1}, "that of the shell"
+        assert domains == {"auto"}, "that of the shell"
     else:
         assert len(domains) == 2
         assert min(domains) > 0
@@ -82,7 +82,7 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
         there.ros_sink.domain_id,
         there.ros_source.domain_id,
     )
-    assert (back.ros_source.src_id(), back.ros_sink.robot_id) == (2, -1)  # a robot's own settings stay its own
+    assert (back.ros_source.src_id(), back.ros_sink.robot_id) == (2, "auto")  # a robot's own settings stay its own
     assert back.ros_source.compression
     assert (there.ros_sink.publisher_depth, back.ros_sink.publisher_depth) == (1000, 7)
     assert back.ros_source.registry == there.registry
@@ -105,9 +105,10 @@ def test_override_values_are_yaml() -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("foo=1", "unknown key foo; known are name, registry"),
+        ("foo=1", "unknown key foo; known are name, packet_len, registry"),
         ("phy.foo=1", "unknown key phy.foo; known are name, sample_rate"),
-        ("phy.sample_rate=-1", "phy.sample_rate = -1: .* greater than or equal to 0"),
+        ("phy.sample_rate=-1", "phy.sample_rate = -1: write auto"),
+        ("phy.sample_rate=-2", "phy.sample_rate = -2: must be greater than 0, or 'auto'"),
         ("packet_len=9", "^demo: packet_len = 9: [^;]*$"),
         ("seed=x", "^demo: seed = 'x': [^;]*$"),
         ("sim.robots=0", "sim.robots = 0"),
@@ -142,7 +143,7 @@ def test_override_values_are_yaml() -> None:
         ("back=5", "back = 5"),
         ("back={ros_source: 5}", "back.ros_source = 5"),
         ("back={ros_source: {namespace: /robot_1}}", "back.ros_source: source id 1 is that of ros_source"),
-        ("back={ros_source: {colour: 1}}", "unknown key back.ros_source.colour; known are registry"),
+        ("back={ros_source: {colour: 1}}", "unknown key back.ros_source.colour; known are packet_len, registry"),
         ("back={ros_sink: {packet_len: 9}}", "back.ros_sink.packet_len = 9: both ends share it"),
         (".packet_len=1", "write key=value"),
     ],

@@ -14,6 +14,7 @@ from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.record.trace import Floats, Trace
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.run.simulate import End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
 
@@ -135,6 +136,23 @@ def test_a_link_that_carries_everything_carries_everything() -> None:
         assert topic.latency_s.p50 <= plain[name].latency_s.p50 + 1e-9
 
 
+def test_with_version_1_packets_take_as_much_air_as_they_need() -> None:
+    """Where the link has room; a backlog fills packets anyway."""
+
+    def airtime_per_message(lengths: str) -> float:
+        radio = f"phy.options={{payload_modulation: bpsk, lengths: {lengths}}}"
+        settings = ("version=1", radio, "phy.sample_rate=400000", 'ros_source.repair="off"')
+        there = scenario("six-topics-paced", *settings, duration=2.0)
+        phy = make_phy(there, there.load_registry())
+        done = simulate(there, phy=phy)
+        found = done.recorder.airtime(phy.airtime)
+        assert (found["airtime_mean_s"] == found["airtime_s"]) == (lengths == "fixed")
+        assert found["airtime_per_message_s"] is not None
+        return found["airtime_per_message_s"]
+
+    assert airtime_per_message("any") < 0.75 * airtime_per_message("fixed")
+
+
 def test_messages_abandoned_midway_have_their_own_row_and_the_ledger_adds_up() -> None:
     deadline = "ros_source.topic_options={odom: {queue: deadline, deadline_s: 0.4}}"
     odom = only(run("narrow-ofdm-paced", deadline, "ros_source.compression=false", "ros_sink.compression=false"))
@@ -161,8 +179,8 @@ def test_the_time_of_the_computer_is_added_to_every_latency() -> None:
 
 
 def test_what_has_no_times_is_refused() -> None:
-    with pytest.raises(ConfigError, match="pace = 'flow'"):
-        run("paper-ofdm-paced", "pace=flow")
+    with pytest.raises(ConfigError, match="time = 'unthrottled'"):
+        run("paper-ofdm-paced", "time=unthrottled")
 
 
 class Answering(EndpointV0):
@@ -187,8 +205,10 @@ def test_an_end_may_answer_what_it_hears() -> None:
     codecs = message_codec(back.ros_source, registry), message_codec(there.ros_sink, registry)
     other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
     ways = [
-        LinkDirection(there, (one, other), 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])),
-        LinkDirection(back, (other, one), 0.01, iter(())),
+        LinkDirection(
+            there, (one, other), lambda _: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
+        ),
+        LinkDirection(back, (other, one), lambda _: 0.01, iter(())),
     ]
     for way in ways:
         way.air = lambda data, now: [data]  # noqa: ARG005

@@ -239,8 +239,6 @@ def test_a_run_that_is_interrupted_leaves_nothing_in_the_way_of_the_next(tmp_pat
 
 
 def test_what_cannot_be_simulated_is_refused() -> None:
-    with pytest.raises(ConfigError, match="pace = 'flow'"):
-        run("paper-ofdm-paced", "samples", "pace=flow")
     with pytest.raises(ConfigError, match=r"channel.epsilon = 1.001.*time to samples"):
         run("channel-clock-offset", "packets")
     with pytest.raises(ConfigError, match="time = 'never'"):

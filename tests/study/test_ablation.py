@@ -23,7 +23,7 @@ def named(name: str, *overrides: str) -> list[str]:
 def test_each_part_that_is_on_has_a_variant() -> None:
     assert named("six-topics-paced") == ["whole", "no-compression", "no-pull", "no-freshness", "no-latest"]
     assert named("paper-ofdm-paced") == ["whole", "no-compression", "no-pull", "no-freshness"]
-    assert named("demo", "paced=false", "ros_source.topic_options.odom.depth=1") == ["whole", "no-latest"]
+    assert named("demo", "ros_source.packet_rate=0", "ros_source.topic_options.odom.depth=1") == ["whole", "no-latest"]
     with pytest.raises(ConfigError, match="scenario paper-ofdm: nothing to switch off"):
         named("paper-ofdm")
 
@@ -50,7 +50,7 @@ def test_every_run_differs_in_its_part_alone(tmp_path: Path) -> None:
     queues = {f"ros_source.topic_options.{topic}.queue" for topic in ("scan", "odom", "imu", "cmd_vel", "map", "clock")}
     assert differing == [
         {"ros_source.compression", "ros_sink.compression"},
-        {"paced"},
+        {"ros_source.packet_rate"},
         {"ros_source.scheduler"},
         queues,
     ]

@@ -29,8 +29,8 @@ def test_a_list_is_run_at_every_point_of_the_grid_and_says_what_it_leaves_as_it_
     made = plan(tmp_path, list=entries, grid={"packet_len": [64, 128]})
     assert made.keys == ["phy.name", "phy.options", "phy.sample_rate", "packet_len"]
     assert [tuple(cell.values.values()) for cell in made.cells] == [
-        ("direct", "{}", 0.0, 64),
-        ("direct", "{}", 0.0, 128),
+        ("direct", "{}", "auto", 64),
+        ("direct", "{}", "auto", 128),
         ("gfsk", '{"sps": 4}', 1e5, 64),
         ("gfsk", '{"sps": 4}', 1e5, 128),
     ]
@@ -66,7 +66,10 @@ def test_overrides_of_the_command_line_win_over_the_file_and_not_over_the_sweep(
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"grid": {"channel.snr": [1]}}, r"cell 1 of 1 \(channel.snr=1\): .*unknown key channel.snr; known are snr_db"),
+        (
+            {"grid": {"channel.snr": [1]}},
+            r"cell 1 of 1 \(channel.snr=1\): .*unknown key channel.snr; known are seed",
+        ),
         (
             {"grid": {"channel.packet_loss": [0.5, 2]}},
             r"cell 2 of 2 \(channel.packet_loss=2\): .*channel.packet_loss = 2: .*less than or equal to 1",
@@ -93,7 +96,7 @@ def test_overrides_of_the_command_line_win_over_the_file_and_not_over_the_sweep(
         ({"value": "beauty"}, "value = 'beauty': no such number; known are pdr, goodput_Bps"),
         ({"repetitions": 0}, "repetitions = 0"),
         ({"time": "fast"}, "time = 'fast'"),
-        ({"colour": "red"}, "unknown key colour; known are scenario"),
+        ({"colour": "red"}, "unknown key colour; known are description"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_before_anything_runs(

@@ -43,6 +43,7 @@ from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.settings import NOBODY, Settings
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import Registry
+from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
     REPORT_LEN,
@@ -123,7 +124,9 @@ class Endpoint:
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
         self._trailer = self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
-        self.window = RepairWindow(settings.repair or "idle", self._room, settings.expected_loss)
+        self.window = RepairWindow(
+            "idle" if settings.repair == AUTO else settings.repair, self._room, settings.expected_loss
+        )
         self.neighbours = Neighbours(
             (settings.src_id, boot), settings, self.keys, heard=heard or {}, save=save, inbox=self._inbox
         )
@@ -234,18 +237,17 @@ class Endpoint:
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if self._credits == 0 or now < self._slot or not self._speaks:
+        if self.out_of_credit or now < self._slot or not self._speaks:
             return None
         data = self._compose(now)
         if data is None:
             return None
-        if self._credits is not None:
+        if self._credits is not None and not self.unpaced:
             if self._busy_since < inf:
                 self._intervals.append(now - self._busy_since)
             self._credits -= 1
             self._busy_since = now if not self._credits and not self.outbox.idle else inf
-        rate = self.settings.packet_rate
-        if rate > 0:
+        if rate := self._rate:
             # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
             self._slot = max(self._slot, now - 1 / rate) + 1 / rate
         return data
@@ -257,12 +259,22 @@ class Endpoint:
 
     def credit(self, packets: int = 1) -> None:
         """The PHY can take so many further packets."""
-        self._credits = (self._credits or 0) + packets
+        self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
 
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit."""
-        return self._credits == 0
+        return self._credits == 0 and not self.unpaced
+
+    @property
+    def unpaced(self) -> bool:
+        """Whether every packet leaves as soon as there is one, whatever the PHY grants."""
+        return self.settings.packet_rate == 0
+
+    @property
+    def _rate(self) -> float:
+        """Packets/s at most, 0 without limit."""
+        return 0.0 if self.settings.packet_rate == AUTO else self.settings.packet_rate
 
     def follow(
         self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
@@ -280,14 +292,14 @@ class Endpoint:
     @property
     def interval(self) -> float:
         """s from one packet to the next while busy; 0 where not known."""
-        if self.settings.packet_rate > 0:
-            return 1 / self.settings.packet_rate
+        if self._rate:
+            return 1 / self._rate
         return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
 
     @property
     def paced(self) -> bool:
         """Whether something says when there is a slot, and so when one is idle."""
-        return self._credits is not None or self.settings.packet_rate > 0
+        return self._rate > 0 or (self._credits is not None and not self.unpaced)
 
     # ---- receiving
 
@@ -320,7 +332,7 @@ class Endpoint:
     def next_departure(self) -> float | None:
         """When ``next_packet`` may have something, if nothing is called before."""
         now = self._now
-        if self._credits == 0 or not self._speaks:
+        if self.out_of_credit or not self._speaks:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
@@ -466,9 +478,6 @@ class Endpoint:
         stats = self.sent
         stats.air[kind] += 1
         stats.packets += 1
-        if parts:
-            stats.entries += len(parts)
-            stats.payload_bytes += sum([len(part.payload) for part in packet.entries])
         self._tell(SentPacket(data, packet, parts, now, kind))
         return data
 
@@ -482,7 +491,9 @@ class Endpoint:
         return self.settings.hop if self.settings.dst_id != BROADCAST else 0
 
     def _mode(self) -> RepairMode:
-        return self.settings.repair or ("thrifty" if self.window.receivers() else "idle")
+        if self.settings.repair != AUTO:
+            return self.settings.repair
+        return "thrifty" if self.window.receivers() else "idle"
 
     # ---- what arrives
 

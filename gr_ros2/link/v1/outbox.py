@@ -37,6 +37,7 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
 from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry
+from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
@@ -297,9 +298,9 @@ class Outbox:
         for topic in self._topics or ():
             options = topic.options
             reliable = options.reliability
-            ordered = self._ordered.get(topic.topic_id, True) if reliable is None else reliable == "reliable"
+            ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
             ordered = ordered and self._queues[topic.topic_id].policy != "latest"
-            depth = options.depth if options.depth is not None else self._depths.get(topic.topic_id, 0)
+            depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
             codec = "" if self._codec is None else options.codec
             qos = QOS_NAMES.index(options.qos)
             name, kind = topic.name, topic.type_name
@@ -313,8 +314,8 @@ class Outbox:
 
     def depth(self, topic_id: int) -> int:
         """Messages of a topic that may wait, 0 unbounded."""
-        depth = None if self._topics is None else self._topics[topic_id].options.queue_depth
-        return self._settings.queue_depth if depth is None else depth
+        depth = AUTO if self._topics is None else self._topics[topic_id].options.queue_depth
+        return self._settings.queue_depth if depth == AUTO else depth
 
     def _admit(self, message: Message) -> None:
         self._drop(self._queues[message.topic_id].admit(message, self.depth(message.topic_id)))
@@ -365,6 +366,8 @@ class Outbox:
                 queue.popleft()
                 self._left(message, queue, now)
         self._turns.sent(self._holder)
+        self.stats.entries += len(picks)
+        self.stats.payload_bytes += sum([taken for _, taken in picks])
         lives = tuple({id(message.life): message.life for message, _ in picks}.values())
         ranks = [message.qos for message, _ in picks]
         qos = min(ranks, key=lambda qos: RANK[qos])

@@ -43,7 +43,7 @@ MAP = 64
 """Packets that a report tells of."""
 
 TURN = 3
-"""Every so manieth repair is for short messages, while a long one is alive."""
+"""One repair in this many is for short messages, while a long one is alive."""
 _GOLDEN = (5**0.5 - 1) / 2
 _DECAY = 0.98
 _DELAYS = 16

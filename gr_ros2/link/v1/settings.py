@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
+from gr_ros2.setting import AUTO, Auto
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
 NOBODY = -1
@@ -25,7 +26,7 @@ class Settings:
     :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
     :param dst_id: whom packets are for, 255 everybody
     :param hop: hop count of addressed packets
-    :param repair: what idle slots carry; None takes ``thrifty`` where reports come and ``idle`` where none do
+    :param repair: what idle slots carry; auto takes ``thrifty`` where reports come and ``idle`` where none do
     :param expected_loss: share of packets lost, as long as no report tells
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether a report takes a slot from what is received
@@ -38,7 +39,7 @@ class Settings:
     :param max_sources: robots heard at a time
     :param min_fragment: bytes of a message below which no fragment begins in a packet that others share
     :param flush_timeout_s: s that a partly filled packet waits for company
-    :param packet_rate: packets/s, 0 unpaced or paced by credits
+    :param packet_rate: packets/s at most; auto as credits come, where they do; 0 unpaced
     :param queue_depth: messages waiting per topic; 0 unbounded
     :param depth: newer messages after which one of a topic without lifespan is not repaired any more, while nobody
         reports
@@ -49,7 +50,7 @@ class Settings:
     fixed: bool = True
     dst_id: int = BROADCAST
     hop: int = 1
-    repair: RepairMode | None = None
+    repair: RepairMode | Auto = AUTO
     expected_loss: float = 0.2
     hears: bool = True
     half_duplex: bool = False
@@ -62,7 +63,7 @@ class Settings:
     max_sources: int = 16
     min_fragment: int = 16
     flush_timeout_s: float = 0.0
-    packet_rate: float = 0.0
+    packet_rate: float | Auto = AUTO
     queue_depth: int = 100
     depth: int = 16
 
@@ -74,18 +75,20 @@ class Settings:
 
 
 def settings_of(
-    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False
+    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False, fixed: bool = True
 ) -> Settings:
     """The settings of an end from those of its blocks.
 
     :param hears: whether it receives and can say what
+    :param fixed: whether every packet has to be as long as the longest
     :raises ConfigError: neither names the robot, and it would have something to say
     """
     send = SourceConfig() if source is None else source
     take = SinkConfig() if sink is None else sink
     return Settings(
-        src_id=take.robot_id if source is None else source.src_id(),
+        src_id=(NOBODY if take.robot_id == AUTO else take.robot_id) if source is None else source.src_id(),
         packet_len=take.packet_len if source is None else source.packet_len,
+        fixed=fixed,
         dst_id=send.dst_id,
         hop=send.hop,
         repair=send.repair,

@@ -10,6 +10,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 from gr_ros2.record.statistics import Estimate
+from gr_ros2.setting import AUTO
 from gr_ros2.study.sweep.definition import SweepCell, SweepPlan, label
 from gr_ros2.study.sweep.summaries import ALL, Summary
 
@@ -60,10 +61,16 @@ def choose_axes(plan: SweepPlan) -> Axes:
     keys = [key for key in plan.keys if len(places(plan, key)) > 1] or list(plan.keys[:1])
     numeric = [key for key in keys if _numeric(plan, key)]
     candidates = [*(key for key in numeric if key == _SNR), *numeric, *keys]
-    x = sweep.x or next(key for key in candidates if key != sweep.y or len(keys) == 1)
+    x = sweep.x if sweep.x != AUTO else next(key for key in candidates if key != sweep.y or len(keys) == 1)
     rest = [key for key in keys if key != x]
-    y = sweep.y or next((key for key in numeric if key != x and key not in sweep.by), None)
-    by = sweep.by or tuple(key for key in rest if key not in numeric and key != sweep.y) or tuple(rest[:1])
+    y: str | None = (
+        sweep.y if sweep.y != AUTO else next((key for key in numeric if key != x and key not in sweep.by), None)
+    )
+    by = (
+        sweep.by
+        if sweep.by != (AUTO,)
+        else tuple(key for key in rest if key not in numeric and key != sweep.y) or tuple(rest[:1])
+    )
     return Axes(x, by, y)
 
 

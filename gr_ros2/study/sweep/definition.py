@@ -11,16 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import ChannelConfig, build, read_yaml, replaced
+from gr_ros2.config import ChannelConfig, Text, build, read_yaml, replaced
 from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.run.load import make_phy, source_names
-from gr_ros2.run.scenario import Scenario, dump, load_scenario
+from gr_ros2.run.scenario import Experiment, Scenario, Time, dump, load_scenario
+from gr_ros2.setting import AUTO
 from gr_ros2.settings_file import BUILTIN_DIR as SCENARIO_DIR
 from gr_ros2.settings_file import find_registry
 
@@ -54,34 +55,30 @@ Keys = Annotated[tuple[str, ...], BeforeValidator(lambda keys: (keys,) if isinst
 """One key or several."""
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
-class Sweep:
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
+class Sweep(Experiment):
     """One scenario at many settings. The cells are every entry of ``list`` at every point of ``grid``.
 
     :param scenario: a built-in name, or the path of a file seen from the sweep's
-    :param description: one line
     :param set: settings of all cells, over the scenario's
     :param grid: dotted key -> the values it takes; all combinations are run
     :param list: mappings of settings that belong together, each run in turn
     :param repetitions: runs of every cell, with seeds one apart
-    :param time: the runs' clock: simulated by samples or packets, or real
-    :param x: key along the horizontal axis; '' chooses channel.snr_db or else the first that has numbers
-    :param y: key up the vertical axis of the heat map; '' chooses the next one that has numbers
-    :param by: keys that make a curve each; [] chooses those that are no numbers, or else the next one
+    :param x: key along the horizontal axis; auto chooses channel.snr_db or else the first that has numbers
+    :param y: key up the vertical axis of the heat map; auto chooses the next one that has numbers
+    :param by: keys that make a curve each; auto chooses those that are no numbers, or else the next one
     :param value: what the figures show, a name of ``VALUES``
     :param topic: of which topic, an absolute name; '' all together
     """
 
     scenario: Annotated[str, Field(min_length=1)]
-    description: str = ""
     set: dict[str, Any] = Field(default_factory=dict)
     grid: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
     list: tuple[dict[str, Any], ...] = ()
-    repetitions: Annotated[int, Field(ge=1)] = 1
-    time: Literal["samples", "packets", "real"] = "samples"
-    x: str = ""
-    y: str = ""
-    by: Keys = ()
+    time: Time = "samples"
+    x: Text = AUTO
+    y: Text = AUTO
+    by: Keys = (AUTO,)
     value: str = PDR
     topic: str = ""
 
@@ -96,8 +93,8 @@ class Sweep:
             if swept.count(key) > 1:
                 raise ValueError(f"{key} stands in grid and in list; take it out of one of them")
         for name, keys in (("x", (self.x,)), ("y", (self.y,)), ("by", self.by)):
-            for key in filter(None, keys):
-                if key not in swept:
+            for key in keys:
+                if key not in (AUTO, *swept):
                     raise ValueError(f"{name} = {key!r} is not swept; swept are {', '.join(swept)}")
         if self.value not in VALUES:
             raise ValueError(f"value = {self.value!r}: no such number; known are {', '.join(VALUES)}")
@@ -156,7 +153,7 @@ class SweepPlan:
     @property
     def real_time(self) -> bool:
         """Whether a run of it needs a machine for itself."""
-        return any(scenario.time == "real" for cell in self.cells for scenario in cell.runs)
+        return any(not scenario.simulated for cell in self.cells for scenario in cell.runs)
 
 
 def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> SweepPlan:

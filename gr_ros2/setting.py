@@ -1,0 +1,161 @@
+"""What a settings class says of each of its fields: meaning, default, range, choices, label.
+
+Invariant: what shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads them here, so
+that a new setting is one field of a dataclass and its line in the docstring.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields
+from types import NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.fields import FieldInfo
+
+Auto = Literal["auto"]
+AUTO: Final = "auto"
+"""The value of a setting that is derived from others, or left to a device; the setting's meaning says how."""
+
+REQUIRED: Final = object()
+"""The default of a setting that has none."""
+
+_UNITS = {"s": "s", "hz": "Hz", "db": "dB", "m": "m", "len": "bytes"}
+"""Unit of a setting by the end of its name."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One field of a settings class.
+
+    :param name: of the field
+    :param hint: its type, with what is annotated
+    :param default: ``REQUIRED`` where it has none
+    :param meaning: what the docstrings of its class and the bases of it say
+    :param title: label in plain words, with the unit of a number in brackets
+    :param choices: all texts and numbers that it may be, or the words beside its range, such as ``auto``
+    :param suggested: values to choose from that are not all there are
+    :param least: smallest number allowed; None without
+    :param most: largest number allowed; None without
+    :param above: numbers have to be above this; None without
+    :param below: numbers have to be below this; None without
+    """
+
+    name: str
+    hint: Any
+    default: Any
+    meaning: str
+    title: str
+    choices: tuple[Any, ...] = ()
+    suggested: tuple[Any, ...] = ()
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    @property
+    def derives(self) -> bool:
+        """Whether it may be ``auto``, whatever the default."""
+        return AUTO in (self.default, *self.choices)
+
+    @property
+    def optional(self) -> bool:
+        """Whether it may be null, which says that there is none."""
+        return NoneType in members(self.hint)
+
+    @property
+    def limits(self) -> tuple[str, str]:
+        """What stands before and behind a name in an expression of its range, ``0 <= `` and `` < 255``, '' without."""
+        low = f"{_number(self.above)} < " if self.above is not None else ""
+        high = f" < {_number(self.below)}" if self.below is not None else ""
+        low = f"{_number(self.least)} <= " if self.least is not None else low
+        return low, f" <= {_number(self.most)}" if self.most is not None else high
+
+    @property
+    def kinds(self) -> tuple[Any, ...]:
+        """The types it may have beside its choices, without what is annotated: ``(int,)``, ``(str,)``."""
+        return tuple(kind for kind in members(self.hint) if get_origin(kind) is not Literal and kind is not NoneType)
+
+
+def settings_of(cls: type[Any]) -> list[Setting]:
+    """Every field of a settings class, in their order."""
+    said, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
+    return [_setting(item, hints[item.name], said.get(item.name, ""), called) for item in fields(cls)]
+
+
+def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> Setting:
+    marks = list(_marks(hint))
+    bounds = [bound for mark in marks for bound in getattr(mark, "metadata", [mark])]
+    about = [mark for mark in marks if isinstance(mark, FieldInfo)]
+    default = item.default
+    if isinstance(default, FieldInfo):
+        default = default.get_default(call_default_factory=True)
+    if default is MISSING or type(default).__name__ == "PydanticUndefinedType":
+        default = REQUIRED
+    return Setting(
+        item.name,
+        hint,
+        default,
+        meaning,
+        called.get(item.name) or label(item.name),
+        tuple(value for kind in members(hint) if get_origin(kind) is Literal for value in get_args(kind)),
+        tuple(value for mark in about for value in mark.examples or ()),
+        next((bound.ge for bound in bounds if isinstance(bound, Ge)), None),  # type: ignore[arg-type]
+        next((bound.le for bound in bounds if isinstance(bound, Le)), None),  # type: ignore[arg-type]
+        next((bound.gt for bound in bounds if isinstance(bound, Gt)), None),  # type: ignore[arg-type]
+        next((bound.lt for bound in bounds if isinstance(bound, Lt)), None),  # type: ignore[arg-type]
+    )
+
+
+def label(name: str) -> str:
+    """A setting's name in words: ``flush_timeout_s`` as ``Flush timeout (s)``."""
+    words, _, end = name.rpartition("_")
+    if words and end in _UNITS:
+        return f"{words.replace('_', ' ').capitalize()} ({_UNITS[end]})"
+    return name.replace("_", " ").capitalize()
+
+
+def meanings(cls: type[Any]) -> dict[str, str]:
+    """What the docstrings of a settings class and its bases say of each setting, one line each."""
+    said: dict[str, str] = {}
+    for part in reversed(cls.__mro__):  # what a class says of a setting goes before what its base says
+        text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
+        said |= {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
+    return said
+
+
+def titles(cls: type[Any]) -> dict[str, str]:
+    """The labels that a settings class and its bases give with ``Field(title=…)``."""
+    return {
+        name: mark.title
+        for part in reversed(cls.__mro__)
+        for name, hint in get_type_hints(part, include_extras=True).items()
+        for mark in _marks(hint)
+        if isinstance(mark, FieldInfo) and mark.title
+    }
+
+
+def members(hint: Any) -> tuple[Any, ...]:
+    """The types that a type is made of: the members of a union; otherwise itself, without what is annotated."""
+    if get_origin(hint) is Annotated:
+        return members(get_args(hint)[0])
+    if get_origin(hint) in (Union, UnionType):
+        return tuple(kind for part in get_args(hint) for kind in members(part))
+    return (hint,)
+
+
+def _marks(hint: Any) -> Iterator[Any]:
+    """What is annotated, at any depth of a union."""
+    if get_origin(hint) is Annotated:
+        inner, *marks = get_args(hint)
+        yield from marks
+        yield from _marks(inner)
+    elif get_origin(hint) in (Union, UnionType):
+        for part in get_args(hint):
+            yield from _marks(part)
+
+
+def _number(value: float | None) -> str:
+    return repr(value)
