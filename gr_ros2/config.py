@@ -13,7 +13,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.config_errors import explain
@@ -266,6 +266,12 @@ class SourceConfig(Queued, EndConfig):
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
     repair: Repairs | Auto = AUTO
     expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
+
+    @field_validator("repair", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: object) -> object:
+        """YAML 1.1 reads an unquoted ``off`` as false."""
+        return "off" if value is False else value
 
     @model_validator(mode="after")
     def _fits(self) -> SourceConfig:

@@ -150,6 +150,13 @@ def test_a_configured_robot_id_wins_over_the_namespace() -> None:
     assert SourceConfig(namespace="/robot_1", robot_id=9).src_id() == 9
 
 
+@pytest.mark.parametrize("text", ["off", "'off'"])
+def test_repair_is_switched_off_with_and_without_quotes(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "source.yaml"
+    path.write_text(f"{{namespace: /robot_1, repair: {text}}}")
+    assert build(SourceConfig, read_yaml(path)).repair == "off"
+
+
 def test_several_errors_are_all_named() -> None:
     error = refused(SourceConfig, hop=99, dst_id=999, colour="red")
     assert all(part in error for part in ("hop = 99", "dst_id = 999", "unknown key colour"))

@@ -72,7 +72,7 @@ def test_messages_come_back_until_it_is_stopped(
     assert (running.returncode, errors) == (0, "")
     first, *_, last = output.splitlines()
     assert re.fullmatch(
-        r"robot 1 on sim: psk at 1,000,000 samples/s, one packet per 1\.41 ms, runs on .+; Ctrl-C ends it", first
+        r"robot 1 on sim: psk at 1,000,000 samples/s, one packet per 1\.48 ms, runs on .+; Ctrl-C ends it", first
     )
     assert last.split("; ")[1].startswith("sent ")
     assert (tmp_path / "packets.pcapng").stat().st_size > 5 * 2 * 4 * 64
