@@ -169,7 +169,7 @@ class ThreadedObserver(Observers[RunObserver]):
         self.instruments = observer.instruments
         self._observer, self._guard = self._guarded[0]
         self._backlog = Backlog(f"gr-ros2-{self.name}"[:40], _HELD_BYTES)
-        self._over = False
+        self._over = self._hangs = False
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         self._pass_on(_size(event), self._observer.sender_event, src_id, event)
@@ -187,7 +187,7 @@ class ThreadedObserver(Observers[RunObserver]):
     def run_ended(self, result: Result | None) -> None:
         self._over = True
         self._backlog.offer(0, self._guard.last, self._observer.run_ended, result)
-        if not self._backlog.close(_PATIENCE_S if self._guard.error is None else 0):
+        if not self._backlog.close(0 if self._hangs else _PATIENCE_S):
             self._give_up()
 
     def _pass_on(self, size: int, call: Callable[..., object], *arguments: object) -> None:
@@ -198,6 +198,7 @@ class ThreadedObserver(Observers[RunObserver]):
 
     def _give_up(self) -> None:
         """The observer hangs: count the waiting events as missed."""
+        self._hangs = True
         if self._guard.error is None:
             self._guard.end(RunError(f"it has not come back for {_PATIENCE_S:g} s"))
             self._guard.miss(self._backlog.pending)

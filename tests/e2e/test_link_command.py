@@ -90,7 +90,7 @@ def test_it_ends_after_a_duration(config: Path) -> None:
     [
         ("front_end.name=rtl", "front_end.name = 'rtl': no such front_end; known are sim, zmq", 2),
         ("front_end={name: sim, gain: 3}", "front_end sim: unknown key gain", 2),
-        ("phy.sample_rate=auto", "phy.sample_rate = 0: a link needs one", 2),
+        ("phy.sample_rate=auto", "phy.sample_rate = auto: a link needs one", 2),
         ("front_end={name: soapy, args: driver=none, frequency: 1e8}", "front_end soapy: args = 'driver=none'", 1),
     ],
 )

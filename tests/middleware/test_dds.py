@@ -319,7 +319,7 @@ def test_padding_is_zeros_up_to_three(join: Callable[..., DdsMiddleware]) -> Non
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0", b"\xff\xff\0\0\1\2\3\4"], ids=["empty", "header only", "no CDR"])
 def test_what_is_no_cdr_is_refused(join: Callable[..., DdsMiddleware], payload: bytes) -> None:
     publisher = join().advertise("/a", STRING, RELIABLE)
-    with pytest.raises(MiddlewareError, match="no CDR"):
+    with pytest.raises(MiddlewareError, match="is not CDR"):
         publisher.publish(payload)
 
 
