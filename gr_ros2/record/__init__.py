@@ -1,1 +1,1 @@
-"""What a run leaves behind: the ledger of its messages, their times, its numbers; as values and as files."""
+"""The data of a run: the ledger of its messages, their times and its numbers, as values and as files."""

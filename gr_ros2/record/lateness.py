@@ -1,8 +1,8 @@
-"""What a run that keeps up with a clock says of the computer: how late it was, and what was lost after that.
+"""How late the computer was in a run that follows the wall clock, and which messages were lost after late moments.
 
-Invariants: lateness is measured, never inferred from losses; a loss is said to follow a late moment where its message
-was submitted in that moment or up to ``AFTER_S`` after it, which is an observation and no proof: the share of all
-messages that do stands beside it.
+Invariants: lateness is measured, never inferred from losses; a loss follows a late moment if its message was submitted
+in that moment or up to ``AFTER_S`` after it. This does not prove a cause; the result therefore also gives the share of
+all messages that were submitted at such times.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from gr_ros2.record.result import LatenessResult
 from gr_ros2.record.trace import Floats, Trace
 
 AFTER_S = 1.0
-"""s. Queues that ran full in a late moment are empty again by then, and what was incomplete has been given up."""
+"""s. After this time, queues that became full in a late moment are empty again, and incomplete messages have been given
+up."""
 
 
 def modem_lateness(passed_at: Sequence[float], received_at: Floats) -> Lateness:
-    """How much longer than the quickest packet others took from the gate to the sink.
+    """How much longer packets took from the gate to the sink than the fastest packet.
 
     :param passed_at: s, when each packet of a source passed the gate
-    :param received_at: s, when each reached the sink, NaN for those that did not; those of the first so many count
+    :param received_at: s, when each packet reached the sink, NaN for packets that did not. If the two lengths differ,
+        the rest of the longer one is ignored
     """
     count = min(len(passed_at), len(received_at))
     passed, received = np.array(passed_at[:count]), received_at[:count]
@@ -39,10 +41,10 @@ def modem_lateness(passed_at: Sequence[float], received_at: Floats) -> Lateness:
 
 
 def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: float, trace: Trace) -> LatenessResult:
-    """All parts joined, and the messages that were submitted in late moments or after them.
+    """The lateness of all parts together, and the messages that were submitted in late moments or after them.
 
-    :param parts: what was measured of each, by name; one of which nothing was measured is left out
-    :param begin: s, when submission began; the trace counts from there
+    :param parts: measurements of each part, by name; a part without measurements is left out
+    :param begin: s, when submission began; the times of the trace count from there
     :param end: s, when the run was over
     """
     measured = {name: list(several) for name, several in parts.items()}

@@ -1,12 +1,12 @@
-"""The loss ledger: both ends of a link joined, so that every sent message ends in exactly one row.
+"""The loss ledger joins the reports of both ends of a link, so that every sent message ends in exactly one row.
 
-Invariants: the rows of a topic add up to what was sent on it, always; a message counts as delivered once, and only when
-a delivery with its very bytes was seen (those the link's codec is to give back: gaps zero, fields quantised); a
-repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; memory holds payload
-digests only of messages whose fate is open, and about 33 bytes of each message besides.
+Invariants: the rows of a topic always add up to the number of messages sent on it; a message counts as delivered once,
+and only when a delivery with exactly its bytes was seen (the bytes that the link's codec must return: gaps zero, fields
+quantised); a repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; payload
+digests are kept only for messages whose result is open; each message takes about 33 bytes in addition.
 
-Events must come in causal order: what a packet carries is told before its reception is, and a packet's reception
-(:meth:`Ledger.packet_received`) before what the receiver makes of it. The ledger may be fed from several threads.
+Events must be reported in causal order: the contents of a packet before its reception, and the reception of a packet
+(:meth:`Ledger.packet_received`) before the receiver events that result from it. Several threads may report events.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 _OPEN = 255
 
 REORDER_WINDOW = 1024
-"""A packet this many packets older than the newest received one will not arrive any more."""
+"""A packet that is this many packets older than the newest received packet will not arrive any more."""
 
 
 @dataclass(slots=True)
 class TopicLedger:
-    """What became of one topic of one source. The arrays run in parallel, one item per message handed to the source, by
-    submission.
+    """The results of one topic of one source. The arrays are parallel, with one item per message handed to the source,
+    in the order of submission.
 
-    :param sent: messages for this link: handed to the source, or lost by its ROS graph before; repeats excluded
-    :param corrupt: deliveries that match no message; 0 unless something is badly wrong
-    :param repeats_delivered: deliveries of repeats whose message had its row already
+    :param sent: messages for this link: handed to the source, or lost before by its ROS graph; repeats excluded
+    :param corrupt: deliveries that match no message; a number above 0 indicates a serious fault
+    :param repeats_delivered: deliveries of repeats whose message already had its row
     :param rows: ledger row -> messages
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
     :param size: serialized bytes; 0 where refused before it was queued
     :param serial: the sender's number of the message
-    :param row: the ledger row it ended in, as its place in ``list(codes)``; _OPEN while its fate is open
+    :param row: the ledger row it ended in, as its index in ``list(codes)``; _OPEN while its result is open
     :param codes: ledger row -> its code in ``row``
     """
 
@@ -72,7 +72,7 @@ class TopicLedger:
     codes: dict[str, int] = field(default_factory=dict)
 
     def book(self, position: int, row: str) -> None:
-        """The message at this place of the arrays ends in this row."""
+        """Enter the message at this position of the arrays in this row."""
         name = str(row)
         self.rows[name] += 1
         self.row[position] = self.codes.setdefault(name, len(self.codes))
@@ -80,10 +80,10 @@ class TopicLedger:
 
 @dataclass(slots=True, eq=False)
 class _OpenMessage(Tracked):
-    """A message whose fate is open.
+    """A message whose result is open.
 
-    :ivar position: its place in the topic's arrays
-    :ivar received: of its fragments
+    :ivar position: its index in the topic's arrays
+    :ivar received: number of its fragments that were received
     :ivar last_packet: number of the last packet with one of its fragments
     """
 
@@ -109,7 +109,7 @@ class _SourceBook:
 
 
 class Ledger:
-    """Joins what the senders and the receiver of one link report."""
+    """Joins the reports of the senders and of the receiver of one link."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -124,7 +124,7 @@ class Ledger:
     # -- feeding ------------------------------------------------------------------------------------------------
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender with this source id reports."""
+        """Take an event of the sender with this source id."""
         with self._lock:
             if self._finished:
                 return
@@ -141,9 +141,9 @@ class Ledger:
                 self._refused(source, event)
 
     def packet_received(self, data: bytes) -> tuple[int, int] | None:
-        """Bytes the PHY handed to the sink, whatever they are.
+        """Take bytes that the PHY handed to the sink, valid or not.
 
-        :return: source and number, from 0 per source, of the packet sent with these bytes; None where none was
+        :return: source and number, from 0 per source, of the packet sent with these bytes; None if there is none
         """
         with self._lock:
             if self._finished:
@@ -156,10 +156,10 @@ class Ledger:
         return None
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> float | None:
-        """What the receiver reports.
+        """Take an event of the receiver.
 
-        :param now: s, on the clock of the sender's events; of a delivery: when the message was republished
-        :return: s, when the message delivered was submitted; None where there is none, or none that is known yet
+        :param now: s, on the clock of the sender's events; for a delivery: when the message was republished
+        :return: s, when the delivered message was submitted; None for other events, and where the message is not known
         """
         with self._lock:
             if self._finished:
@@ -173,10 +173,10 @@ class Ledger:
         return None
 
     def finish(self, drained: bool = False) -> list[TopicLedger]:
-        """Close the books. What the run's threads report later is no part of it and is ignored.
+        """Close the ledger. Later reports of the run's threads are ignored.
 
-        :param drained: nothing is left in the PHY, so what was sent and has not arrived is lost
-        :return: one ledger per source and topic that occurred, by source and topic id
+        :param drained: nothing is left in the PHY, so packets that were sent and have not arrived are lost
+        :return: one ledger per source and topic that occurred, in the order of source and topic id
         :raises RunError: when the events contradict each other, or rows do not add up
         """
         with self._lock:
@@ -191,8 +191,8 @@ class Ledger:
 
     def packets(self) -> dict[str, int]:
         """Packet counts: ``sent``; ``received`` (decoded by the sink); ``crc_failed``; ``malformed`` (every other
-        refusal of the decoder), and each refusal by its own name as ``rejected_<kind>``; where some were spent on
-        something else than new messages, ``air_<kind>`` for each of :data:`gr_ros2.link.events.AirKind`."""
+        refusal of the decoder); and each refusal by its own name as ``rejected_<kind>``. If some packets did not carry
+        new messages, also ``air_<kind>`` for each of :data:`gr_ros2.link.events.AirKind`."""
         with self._lock:
             crc_failed = self._rejected["crc"]
             rejected = sum(self._rejected.values())
@@ -214,8 +214,8 @@ class Ledger:
             return sum(topic.sent for topic in topics), sum(arrived(topic.rows) for topic in topics)
 
     def rows(self) -> dict[tuple[int, int], Counter[str]]:
-        """Where every message sent so far stands, by source and topic id: as if the books were closed now, with the
-        PHY still holding what has not arrived. The rows add up to what was sent."""
+        """The rows of all messages sent so far, by source and topic id, as if the ledger were closed now. Packets that
+        have not arrived count as still in the PHY. The rows add up to the number of messages sent."""
         with self._lock:
             rows = {key: Counter(topic.rows) for key, topic in self._topics.items()}
             for source in self._sources.values():
@@ -224,7 +224,7 @@ class Ledger:
             return rows
 
     def unresolved(self) -> int:
-        """Messages accepted by the senders whose fate is open: neither delivered, refused nor given up."""
+        """Messages accepted by the senders whose result is open: not delivered, not refused and not given up."""
         with self._lock:
             return sum(not message.reason for source in self._sources.values() for message in source.messages.open)
 
@@ -276,7 +276,7 @@ class Ledger:
         source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
 
     def _retire(self, source: _SourceBook, newer: _OpenMessage) -> None:
-        """Settle what had this message's key before and cannot arrive any more: keys have come round since."""
+        """Close older messages with the same key that cannot arrive any more. Keys are reused after a while."""
         assert newer.key is not None
         horizon = source.last_received - REORDER_WINDOW
         for message in source.messages.under(*newer.key):
@@ -307,7 +307,7 @@ class Ledger:
         return message.t_sent
 
     def _lost(self, event: Lost) -> None:
-        """Note the reason. It stands unless a delivery proves it wrong."""
+        """Store the reason. It is used unless the message is delivered after all."""
         source = self._sources.get(event.src_id)
         if source is None or source.messages.repeats(event):
             return
@@ -329,7 +329,7 @@ class Ledger:
         source.messages.close(message)
 
     def _match_late(self) -> None:
-        """Deliveries that matched nothing when they came: by their bytes alone, against all that is still open."""
+        """Match deliveries that had no message when they came: by their bytes only, with all messages still open."""
         for src_id, topic_id, digest, now in self._unmatched:
             source = self._sources.get(src_id)
             message = next(iter(source.messages.alike(topic_id, digest)), None) if source is not None else None
@@ -354,7 +354,8 @@ class Ledger:
 
 
 def _arrived(source: _SourceBook, digest: bytes) -> int:
-    """A packet of this source came in: the first one with these bytes that was sent after the newest received.
+    """Take the arrival of a packet of this source. It is the first packet with these bytes that was sent after the
+    newest received packet; if there is none, the oldest packet with these bytes.
 
     :return: its number
     """
@@ -379,9 +380,12 @@ def _arrived(source: _SourceBook, digest: bytes) -> int:
 
 
 def _final_row(source: _SourceBook, message: _OpenMessage, drained: bool) -> str:
-    """Where a message stands of which the ends have said no more: not taken if every packet of it arrived intact, yet
-    the sink neither delivered it nor gave it up (not for us, …); in flight if it waits at the source, in the PHY, or
-    behind the last packet that arrived; given up where its sender repairs what is lost."""
+    """The row of a message for which no further event came.
+
+    It is not taken if all its packets arrived intact, but the sink neither delivered it nor gave it up (for example,
+    it was not for this receiver). It is in flight if it waits at the source or in the PHY, or if its last packet is
+    newer than the last packet that arrived. Otherwise it is given up where its sender repairs losses, and its fragments
+    are lost where the sender does not."""
     if message.reason:
         return message.reason
     if not message.all_sent:

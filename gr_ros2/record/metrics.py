@@ -1,4 +1,4 @@
-"""What an experiment reports about one topic, from the joined times of its messages.
+"""The metrics of one topic, computed from the submission and delivery times of its messages.
 
 Invariants: a number that does not apply is None, never a guess; negative latencies (clock skew) are kept and counted;
 all times are seconds on one clock.
@@ -17,7 +17,7 @@ from gr_ros2.record.ledger import TopicLedger
 Floats = npt.NDArray[np.float64]
 
 CDF_POINTS = 101
-"""Quantiles a stored CDF has: 0 %, 1 %, … 100 %."""
+"""Number of quantiles in a stored CDF: 0 %, 1 %, … 100 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def topic_metrics(ledger: TopicLedger, duration_s: float, t_end: float) -> Topic
     """All numbers of one topic.
 
     :param duration_s: s during which messages were submitted
-    :param t_end: s on the ledger's clock, where the age stops being watched: the end of submission
+    :param t_end: s on the ledger's clock, end of the observation of the age: the end of submission
     """
     t_sent, t_delivered = np.frombuffer(ledger.t_sent), np.frombuffer(ledger.t_delivered)
     done = ~np.isnan(t_delivered)
@@ -84,7 +84,7 @@ def topic_metrics(ledger: TopicLedger, duration_s: float, t_end: float) -> Topic
 
 
 def latency(latencies: Floats) -> Latency | None:
-    """Median, p95, p99 and maximum; None of no samples."""
+    """Median, p95, p99 and maximum; None without samples."""
     if not len(latencies):
         return None
     p50, p95, p99, top = (float(value) for value in np.percentile(latencies, [50, 95, 99, 100]))
@@ -92,16 +92,16 @@ def latency(latencies: Floats) -> Latency | None:
 
 
 def latency_cdf(latencies: Floats) -> tuple[float, ...]:
-    """The latencies below which 0 %, 1 %, … 100 % of the samples lie; () of no samples."""
+    """The latencies below which 0 %, 1 %, … 100 % of the samples lie; () without samples."""
     if not len(latencies):
         return ()
     return tuple(float(value) for value in np.percentile(latencies, np.linspace(0, 100, CDF_POINTS)))
 
 
 def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
-    """Mean and peak of the age of information, exactly, over its :func:`age_sawtooth`.
+    """Exact mean and peak of the age of information, computed from its :func:`age_sawtooth`.
 
-    :return: None where nothing was delivered, or only at the very end of the watch
+    :return: None where nothing was delivered before the end of the observation
     """
     start, until, newest = age_sawtooth(t_sent, t_delivered, t_end)
     if not len(start):
@@ -112,13 +112,13 @@ def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
 
 
 def age_sawtooth(t_sent: Floats, t_delivered: Floats, t_end: float) -> tuple[Floats, Floats, Floats]:
-    """The age of information is a sawtooth: it rises with slope 1 and falls to ``t_delivered - t_sent`` whenever a
-    message newer than all before is delivered.
+    """The age of information is a sawtooth. It rises with slope 1 and falls to ``t_delivered - t_sent`` when a message
+    is delivered that is newer than all messages before.
 
     :param t_sent: s, when each delivered message was submitted, in any order
     :param t_delivered: s, when it was delivered
-    :param t_end: s, end of the watch
-    :return: of each tooth its start, its end, and the submission time of the newest message delivered by then
+    :param t_end: s, end of the observation
+    :return: for each tooth its start, its end, and the submission time of the newest message delivered by then
     """
     order = np.argsort(t_delivered, kind="stable")
     times, newest = t_delivered[order], np.maximum.accumulate(t_sent[order])

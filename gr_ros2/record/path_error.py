@@ -1,7 +1,7 @@
 """How far a received path is from the transmitted one.
 
 Invariants: distances are metres in the plane (x, y); a path with no points has no error (None); a path with one point,
-or of no length, is that point all along.
+or with length 0, is treated as that point everywhere.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ GRID_POINTS = 1000
 
 
 def path_error(sent: npt.ArrayLike, received: npt.ArrayLike, points: int = GRID_POINTS) -> float | None:
-    """Both paths interpolated to a common arc-length grid (0..1 of each one's length), mean distance, m.
+    """Mean distance of both paths, m, after interpolation to a common arc-length grid (0..1 of each path's length).
 
-    Time plays no part: a path received late or subsampled has no error while it keeps to the same line (the paper,
-    section 6).
+    Time has no effect: a path that is received late or subsampled has no error as long as it follows the same line
+    (the paper, section 6).
 
     :param sent: positions, shape (n, 2) or wider; only the first two columns count
     :param received: likewise, in the order of reception
@@ -38,9 +38,9 @@ def rms_error(
     received: npt.ArrayLike,
     points: int = GRID_POINTS,
 ) -> float | None:
-    """RMS distance at equal times, m: both paths linear between their points, over the span of time they share.
+    """RMS distance at equal times, m. Both paths are linear between their points; only the time they share counts.
 
-    Unlike :func:`path_error` this grows with latency: it says how far off the receiver's picture is.
+    Unlike :func:`path_error` this grows with latency: it shows how wrong the position known to the receiver is.
 
     :param t_sent: s, when each transmitted position was submitted
     :param t_received: s on the same clock, when each received position was delivered
@@ -71,7 +71,7 @@ def _timed(times: npt.ArrayLike, path: npt.ArrayLike) -> tuple[Floats, Floats]:
 def _along(path: Floats, grid: Floats) -> Floats:
     """Positions at fractions of the path's length."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    moved = np.append(True, steps > 0)  # np.interp wants the arc length to increase
+    moved = np.append(True, steps > 0)  # np.interp requires an increasing arc length
     length = np.append(0.0, np.cumsum(steps))[moved]
     return _interpolate(grid * length[-1], length, path[moved])
 

@@ -1,8 +1,8 @@
-"""Positions out of serialized messages: which types carry one, and where.
+"""Reads positions from serialized messages: which types have a position, and in which field.
 
 Invariant: only types of ROS 2 Humble whose position is one point in metres count (no latitude and longitude); a payload
-that does not deserialize, or whose position is no finite number or beyond ``FARTHEST_M``, has no position and is
-counted by who asked.
+has no position if it cannot be deserialized, or if its position is not finite or is beyond ``FARTHEST_M``; the caller
+counts such payloads.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _POSITION_AT = {
 }
 
 FARTHEST_M = 1e9
-"""A coordinate beyond this, twice the way to the Moon, is no position of a robot; and it would hide every other point
-in a path's figures and means."""
+"""A coordinate beyond this, more than twice the distance to the Moon, is not a position of a robot. It would also hide
+every other point in a path's figures and means."""
 
 PositionReader = Callable[[bytes], tuple[float, float] | None]
 
@@ -42,8 +42,8 @@ def humble_types() -> Typestore:
 
 
 def position_reader(type_name: str) -> PositionReader | None:
-    """A function from a serialized message to its (x, y) in metres, or to None where the bytes are no such message
-    or have no such position.
+    """A function from a serialized message to its (x, y) in metres. The function returns None if the bytes are not a
+    message of this type or have no valid position.
 
     :param type_name: ``package/msg/Type``
     :return: None where the type has no position

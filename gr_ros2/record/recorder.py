@@ -1,7 +1,7 @@
-"""Watches one run and turns what it saw into results: the loss ledger, the paths and the numbers of every topic.
+"""Observes one run and computes its results: the loss ledger, the paths and the numbers of every topic.
 
-Invariant: it only watches; it is fed from the run's own threads and holds none of them up for longer than the ledger's
-lock and the reading of one position; what it keeps of a message or packet are numbers in arrays.
+Invariant: it only observes; the run's own threads call it, and it delays none of them for longer than the ledger's lock
+and the reading of one position; it stores only numbers in arrays for each message and packet.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from gr_ros2.registry import Registry, Topic
 
 
 class Recorder:
-    """Everything both ends of a run report, joined.
+    """Joins the reports of both ends of a run.
 
     :param registry: names and types of the topic ids
     :param namespaces: namespace of each source id on the ROS graph, for the names of its topics
     :param topic_ids: topics of each source id to report even if nothing was sent on them, None = the whole registry
     :param latency_clock: time base of the submission times: submit, stamp_wall or stamp_sim
-    :param on_delivery: called with every delivery, when it came, and when the message was submitted, s on the run's
-        clock; None for a repeat, and where no such message is known
+    :param on_delivery: called with every delivery, its time, and the time when the message was submitted, s on the
+        run's clock; the latter is None for a repeat, and where no such message is known
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Recorder:
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
         self._lengths: Counter[int] = Counter()
-        """Packets sent, by their bytes."""
+        """Number of packets sent, by their length in bytes."""
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -58,7 +58,7 @@ class Recorder:
         self._readers: dict[int, PositionReader] = {key: read for key, read in readers.items() if read is not None}
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender with this source id reports."""
+        """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
             self._lengths[len(event.data)] += 1
@@ -67,7 +67,8 @@ class Recorder:
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports; of a delivery once it is republished, at ``now`` on the sender's clock."""
+        """Take an event of the receiver, at ``now`` on the sender's clock. A delivery is reported once it is
+        republished."""
         if isinstance(event, Received | Rejected):
             packet = self.ledger.packet_received(event.data)
             if packet is not None:
@@ -84,12 +85,12 @@ class Recorder:
         return self.ledger.totals()
 
     def finish(self, duration_s: float, t_end: float, drained: bool = False) -> tuple[TopicResult, ...]:
-        """Close the books.
+        """Close the ledger and compute the numbers.
 
         :param duration_s: s during which messages were submitted
         :param t_end: s on the run's clock, end of submission
-        :param drained: nothing is left in the PHY: what was sent and did not arrive is lost
-        :return: one result per topic of the registry and source, and per source that was heard besides
+        :param drained: nothing is left in the PHY: packets that were sent and did not arrive are lost
+        :return: one result per reported topic of each source, and one per further topic that occurred in the run
         :raises RunError: when the ledger does not add up
         """
         books = {(book.src_id, book.topic_id): book for book in self.ledger.finish(drained)}
@@ -102,12 +103,13 @@ class Recorder:
         return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
 
     def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, float | None]:
-        """Seconds of the PHY: of the longest packet, of one packet sent on average, and of all of them per message and
+        """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
         per byte delivered.
 
-        To be asked after :meth:`finish`.
+        To be called after :meth:`finish`.
 
-        :param of_length: s that a packet of so many bytes takes, or of None the longest; None: a PHY without samples
+        :param of_length: s that a packet of this many bytes takes, or the longest packet for None; None stands for a
+            PHY without samples
         """
         longest = total = mean = None
         if of_length is not None:
@@ -124,11 +126,11 @@ class Recorder:
         }
 
     def received_at(self, src_id: int) -> Floats:
-        """s on the run's clock, when each packet of a source reached the sink; NaN for those that did not."""
+        """s on the run's clock, when each packet of a source reached the sink; NaN for packets that did not."""
         return self._packets[src_id].received_at()
 
     def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
-        """Every message, packet and position. To be asked after :meth:`finish`.
+        """Every message, packet and position. To be called after :meth:`finish`.
 
         :param t0: s on the run's clock, when submission began
         :param t_end: s on the run's clock, when it ended

@@ -1,7 +1,7 @@
-"""One experiment several times: the folders of its runs, and how far its headline numbers vary.
+"""One experiment several times: the folders of its runs, and how much its headline numbers vary.
 
-Invariants: repetition k, from 0, lies in the folder `rep-k`; the numbers are those of the runs' own results; intervals
-are Student's for the mean, at 95 %, and None where fewer than two runs have the number.
+Invariants: repetition k, from 0, is in the folder `rep-k`; the numbers are those of the runs' own results; intervals
+are Student's t intervals for the mean, at 95 %, and None where fewer than two runs have the number.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class TopicSummary:
 
 
 def repetition_folder(out: Path, k: int) -> Path:
-    """Where repetition k of an experiment lies."""
+    """The folder of repetition k of an experiment."""
     return out / f"rep-{k}"
 
 
 def run_folders(path: Path) -> list[Path]:
     """The runs in a folder: its repetitions in their order, or else the folder itself.
 
-    :raises ConfigError: when it holds repetitions, and the list of them is damaged
+    :raises ConfigError: when it holds repetitions and their list is damaged
     """
     listed = path / REPETITIONS_FILE
     if not listed.is_file():
@@ -97,7 +97,7 @@ def write_repetitions(results: Sequence[Result], out: Path) -> Path:
 
 
 def _numbers(result: Result, wanted: TopicResult) -> dict[str, Any]:
-    """The numbers of one topic of one source, {} where this result has no such topic."""
+    """The numbers of one topic of one source, {} where this result does not have the topic."""
     same = (topic for topic in result.topics if (topic.topic, topic.src_id) == (wanted.topic, wanted.src_id))
     return next((topic_numbers(topic, ()) for topic in same), {})
 

@@ -1,7 +1,7 @@
-"""`result.json`: what an experiment found, as values and as a file.
+"""`result.json`: the result of an experiment, as values and as a file.
 
 Invariants: a number that does not apply is null, never NaN and never invented; the file appears whole or not at all;
-reading gives back what was written, and refuses anything else with one line that says why. Keys this version does
+reading returns what was written, and refuses any other file with one line that says why. Keys that this version does
 not know are ignored when reading, so that results of later versions can still be tabulated.
 """
 
@@ -53,12 +53,12 @@ class TopicResult:
     :param latency_clock: submit, stamp_wall or stamp_sim; None where there is no latency
     :param path_error_m: mean distance of the paths along their length, None where the type has no position
     :param rms_error_m: RMS distance at equal times, likewise
-    :param sent: messages for this link: handed to the source, or lost by its ROS graph before (``lost_on_graph``)
+    :param sent: messages for this link: handed to the source, or lost before by its ROS graph (``lost_on_graph``)
     :param ledger: row -> messages; the rows add up to ``sent``
-    :param left_out_sent, left_out_received: messages sent, and messages received, that are in no path and in no error
-        of it: their position is not finite or beyond 1e9 m, or cannot be read
-    :param corrupt: deliveries that match no message sent; 0 unless something is badly wrong
-    :param repeats_delivered: deliveries of repeats, which count nowhere else
+    :param left_out_sent, left_out_received: messages sent, and messages received, that are left out of the path and of
+        its errors: their position is not finite, is beyond 1e9 m, or cannot be read
+    :param corrupt: deliveries that match no message sent; a number above 0 indicates a serious fault
+    :param repeats_delivered: deliveries of repeats; they are not counted in any other number
     :param latency_cdf_s: the latencies at 0 %, 1 %, … 100 %, empty where nothing was delivered
     """
 
@@ -91,14 +91,14 @@ class TopicResult:
 
 @dataclass(frozen=True, config=_READ)
 class LatenessResult:
-    """How late the computer was, in a run that keeps up with a clock; see :mod:`gr_ros2.record.lateness`.
+    """How late the computer was in a run that follows the wall clock; see :mod:`gr_ros2.record.lateness`.
 
-    :param worst_s: s by part: ``threads``, ``gate``, ``modem``
-    :param moments: times that something was late by 50 ms or more
-    :param share: of the run's time that these moments cover
+    :param worst_s: greatest lateness, s, by part: ``threads``, ``gate``, ``modem``
+    :param moments: number of times that a part was late by 50 ms or more
+    :param share: share of the run's time that these moments cover
     :param lost: messages submitted that did not arrive and are not in flight
-    :param lost_after: of those, how many were submitted in such a moment or within a second after it
-    :param sent, sent_after: the same of all messages submitted
+    :param lost_after: how many of those were submitted in such a moment or within a second after it
+    :param sent, sent_after: the same counts for all messages submitted
     """
 
     worst_s: dict[str, _Number]
@@ -112,9 +112,9 @@ class LatenessResult:
 
 @dataclass(frozen=True, config=_READ)
 class ReceiverResult:
-    """What a further receiver of the same sender got.
+    """The topics at a further receiver of the same sender.
 
-    :param number: from 2; the first one's topics are those of the result itself
+    :param number: from 2; the topics of the first receiver are in the result itself
     """
 
     number: _Count
@@ -128,14 +128,14 @@ class Result:
     :param duration_s: s during which messages were submitted
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
-    :param phy: name, channels (one per direction), sample_rate, runs_on (what worked on samples), airtime_s (of one
+    :param phy: name, channels (one per direction), sample_rate, runs_on (what processed the samples), airtime_s (of one
         packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
     :param lateness: None where the run's clock waits for the computer
-    :param incomplete: what was written or shown beside this result and is not whole, such as a capture on a full disk:
-        one line each, with why and how much is missing. The numbers here are whole all the same.
+    :param incomplete: other outputs of the run that are not complete, such as a capture on a full disk: one line each,
+        with the reason and how much is missing. The numbers of this result are complete in any case.
     :param receivers: further receivers of the same sender
     """
 
@@ -183,7 +183,7 @@ def write_result(result: Result, path: str | Path) -> Path:
 def read_result(path: str | Path) -> Result:
     """Read the file, or the ``result.json`` of a folder.
 
-    :raises ConfigError: when it is missing, damaged, half-written or no result; says where
+    :raises ConfigError: when it is missing, damaged, half-written or not a result; says where
     """
     path = Path(path)
     if path.is_dir():
@@ -204,7 +204,7 @@ def read_result(path: str | Path) -> Result:
 
 
 def _finite(value: Any) -> Any:
-    """The same with every number that is not finite as null, and numpy's numbers as Python's."""
+    """The same value with None in place of numbers that are not finite, and Python numbers in place of numpy's."""
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

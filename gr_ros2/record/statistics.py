@@ -1,4 +1,4 @@
-"""How far a mean or a share may be off, from the runs that were made.
+"""Confidence intervals of a mean or a share, from the runs that were made.
 
 Invariants: all intervals are for 95 %; a number that does not apply is None.
 """
@@ -16,7 +16,7 @@ _Z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A number with its interval; ``low`` and ``high`` are None where a single run says nothing of it."""
+    """A number with its interval. ``low`` and ``high`` are None where a single run gives no interval."""
 
     value: float
     low: float | None = None
@@ -24,9 +24,9 @@ class Estimate:
 
 
 def share(successes: int, trials: int) -> Estimate | None:
-    """A share and its Wilson score interval, 0..1, which holds at 0 and 1 too; None without trials.
+    """A share and its Wilson score interval, 0..1, which is also valid at 0 and 1; None without trials.
 
-    It takes trials for independent: losses that come in bursts make it too narrow.
+    The interval assumes independent trials: it is too narrow if losses come in bursts.
     """
     if not trials:
         return None
@@ -34,12 +34,12 @@ def share(successes: int, trials: int) -> Estimate | None:
     scale = 1 + _Z**2 / trials
     middle = (found + _Z**2 / (2 * trials)) / scale
     reach = _Z * sqrt(found * (1 - found) / trials + _Z**2 / (4 * trials**2)) / scale
-    # Rounding must not leave the share itself, or 0..1, outside.
+    # In spite of rounding errors, the interval must contain the share and stay within 0..1.
     return Estimate(found, max(min(middle - reach, found), 0.0), min(max(middle + reach, found), 1.0))
 
 
 def average(values: Sequence[float]) -> Estimate | None:
-    """The mean over runs and Student's t interval; None without runs, no interval with one."""
+    """The mean over runs and Student's t interval; None without runs, no interval with one run."""
     if not values:
         return None
     if len(values) == 1:
@@ -64,7 +64,7 @@ def t_quantile(freedom: int) -> float:
 
 
 def _within(t: float, freedom: int) -> float:
-    """P(-t < T < t), the finite series for whole degrees of freedom (Abramowitz and Stegun 26.7.3 and 26.7.4)."""
+    """P(-t < T < t), by the finite series for integer degrees of freedom (Abramowitz and Stegun 26.7.3 and 26.7.4)."""
     angle = atan(t / sqrt(freedom))
     odd = freedom % 2
     term = total = cos(angle) if odd else 1.0

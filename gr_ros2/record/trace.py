@@ -1,12 +1,12 @@
-"""What happened in a run, message by message and packet by packet: three tables beside `result.json`.
+"""The trace of a run, message by message and packet by packet: three tables beside `result.json`.
 
     messages.csv, messages.parquet   one line per message submitted, in the order of submission
     packets.parquet                  one line per entry of every packet sent, in the order of sending
     paths.parquet                    one line per position sent or received, where a topic has positions
 
-Invariants: times are s since submission began, on the run's clock; what did not happen is null (a message that was not
-delivered has no t_delivered); a file appears whole or not at all; reading refuses anything else with one line that
-names the file. While a run lasts a message costs about 33 bytes and an entry 16, in arrays.
+Invariants: times are s since submission began, on the run's clock; the time of an event that did not happen is null (a
+message that was not delivered has no t_delivered); a file appears whole or not at all; reading refuses any other file
+with one line that names it. During a run a message takes about 33 bytes and an entry 16 bytes, in arrays.
 """
 
 from __future__ import annotations
@@ -86,19 +86,20 @@ class Track:
     left_out: int = 0
 
     def add(self, t: float, x: float, y: float) -> None:
-        """One more position. The last array counts: :meth:`points` may be called at any time, from another thread."""
+        """Add a position. ``y`` is appended last, and its length counts: :meth:`points` may be called at any time, from
+        another thread."""
         self.t.append(t)
         self.x.append(x)
         self.y.append(y)
 
     def points(self) -> tuple[Floats, Floats]:
-        """Times, shape (n,), and positions, shape (n, 2): those that are complete now."""
+        """Times, shape (n,), and positions, shape (n, 2), of all points that are complete now."""
         count = len(self.y)
         return _copied(self.t, count), np.column_stack([_copied(self.x, count), _copied(self.y, count)])
 
 
 class PacketLog:
-    """The packets of one source. Fed by its sender and by the receiver, each in its own thread."""
+    """The packets of one source. Its sender and the receiver report to it, each in its own thread."""
 
     def __init__(self) -> None:
         self._t_sent, self._t_received = array("d"), array("d")
@@ -109,7 +110,7 @@ class PacketLog:
 
     def sent(self, event: SentPacket) -> None:
         """A packet left the sender."""
-        for entry, written in zip(event.entries, event.packet.entries, strict=False):  # a repair has none of its own
+        for entry, written in zip(event.entries, event.packet.entries, strict=False):  # a repair packet has no entries
             self._serial.append(-1 if entry.repeat else entry.serial)
             self._topic_id.append(entry.topic_id)
             self._name.append(written.name)
@@ -125,12 +126,15 @@ class PacketLog:
         self._t_received[number] = now
 
     def received_at(self) -> Floats:
-        """s on the run's clock, when each packet reached the sink; NaN for those that did not."""
+        """s on the run's clock, when each packet reached the sink; NaN for packets that did not."""
         return _copied(self._t_received, len(self._t_received))
 
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
-        """The columns of table `packets`; the topics by name."""
-        # A run that is stopped may still be sending: these are the packets that are complete now.
+        """The columns of table `packets`, with topic names.
+
+        :param name_of: topic name at the source, by topic id
+        """
+        # A run that is stopped may still be sending. Only packets that are complete now are used.
         count = _copied(self._entries, len(self._entries)).astype(np.int64)
         packet = np.repeat(np.arange(len(count)), count)
         packets, entries = len(count), len(packet)
@@ -152,7 +156,8 @@ class PacketLog:
 
 @dataclass(frozen=True)
 class Messages:
-    """The messages of one topic of one source as parallel arrays, by submission; NaN where a time is null."""
+    """The messages of one topic of one source as parallel arrays, in the order of submission; NaN where a time is
+    null."""
 
     topic: str
     src_id: int
@@ -170,7 +175,7 @@ class Messages:
 
 @dataclass(frozen=True)
 class Packets:
-    """One item per entry of every packet sent, as parallel arrays, by time; NaN where a time is null.
+    """One item per entry of every packet sent, as parallel arrays, in the order of time; NaN where a time is null.
 
     :param packet: number of the packet, from 0 over all sources
     """
@@ -192,7 +197,7 @@ class Packets:
 
 @dataclass(frozen=True)
 class Path2D:
-    """A transmitted path and what was received of it, shape (n, 2), m, each in its own order of time."""
+    """A transmitted path and the path that was received, shape (n, 2), m, each in its own order of time."""
 
     topic: str
     published_as: str
@@ -204,14 +209,14 @@ class Path2D:
 class Trace:
     """The tables of one run.
 
-    :param t_end: s, when submission ended; ages are watched until then
+    :param t_end: s, when submission ended; ages are observed until then
     """
 
     tables: Mapping[str, Any]
     t_end: float
 
     def messages(self) -> Iterator[Messages]:
-        """Topic by topic, in the order in which they first sent."""
+        """The messages, topic by topic, in the order in which the topics first sent."""
         table = self.tables[MESSAGES]
         columns = {name: _array(table, name) for name in table.column_names}
         keys = list(zip(columns["topic"].tolist(), columns["src_id"].tolist(), strict=True))
@@ -234,7 +239,7 @@ class Trace:
         return Packets(np.cumsum(new) - 1, *(_array(table, name) for name in names))
 
     def paths(self) -> Iterator[Path2D]:
-        """Topic by topic."""
+        """The paths, topic by topic."""
         table = self.tables[PATHS]
         topics, others, ends = (_array(table, name) for name in ("topic", "published_as", "end"))
         xy = np.column_stack([_array(table, "x"), _array(table, "y")])
@@ -253,13 +258,13 @@ def make_trace(
     t0: float,
     t_end: float,
 ) -> Trace:
-    """The tables of a run that is over.
+    """The tables of a finished run.
 
     :param books: the closed ledger of every topic
     :param logs: packets by source id
     :param tracks: paths sent and received, by source and topic id
-    :param name_of: topic name at the source, of source and topic id
-    :param published_as: topic name at the sink by that at the source; a missing one is the same
+    :param name_of: topic name at the source, by source and topic id
+    :param published_as: topic name at the sink by the name at the source; a missing topic has the same name at both
     :param t0: s on the run's clock, when submission began
     :param t_end: s on the run's clock, when it ended
     """
@@ -283,8 +288,9 @@ def make_trace(
 
 
 def write_trace(trace: Trace, directory: Path) -> list[Path]:
-    """Write the files of this module's first lines into a folder; their paths.
+    """Write the files that are listed at the top of this module into a folder.
 
+    :return: their paths
     :raises ConfigError: when they cannot be written
     """
     written = []
@@ -298,7 +304,7 @@ def write_trace(trace: Trace, directory: Path) -> list[Path]:
 def read_trace(directory: Path) -> Trace:
     """Read the Parquet files of a run.
 
-    :raises ConfigError: when one is missing, damaged, half-written or something else; names it
+    :raises ConfigError: when a file is missing, damaged, half-written or not a table of a run; names the file
     """
     tables, ends = {}, set()
     for name, schema in SCHEMAS.items():
@@ -328,7 +334,7 @@ def write_csv(table: Any, path: Path) -> None:
 
 def _read(path: Path) -> Any:
     try:
-        # Not read_table, which takes folders called key=value for columns.
+        # Not read_table: it interprets folders called key=value as columns.
         with pa_parquet.ParquetFile(path, page_checksum_verification=True) as file:
             return file.read()
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
@@ -356,10 +362,10 @@ def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]
 
 
 def _copied(values: array[Any], count: int) -> npt.NDArray[Any]:
-    """The first ``count`` values, though another thread may be appending.
+    """A copy of the first ``count`` values, safe while another thread appends.
 
-    Slicing is one step of the interpreter. An array that numpy reads itself cannot grow meanwhile, and the thread that
-    appends would fail.
+    Slicing is one step of the interpreter. If numpy read the array itself, the array could not grow at the same time,
+    and the thread that appends would fail.
     """
     return np.frombuffer(values[:count], dtype=values.typecode)
 

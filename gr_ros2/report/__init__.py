@@ -1,1 +1,1 @@
-"""What a person reads of runs: tables, figures, explanations, pages. Made from the files of a run alone."""
+"""Reports of runs for human readers: tables, figures, explanations and pages, made from the files of a run alone."""

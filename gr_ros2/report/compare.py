@@ -1,6 +1,6 @@
-"""Runs side by side: one table with a column per run, and figures with a curve per run.
+"""Comparison of runs: one table with a column per run, and figures with a curve per run.
 
-Invariant: only numbers of the runs' own files; where a run has no such topic or number stands a dash.
+Invariant: all numbers come from the runs' own files; a dash means that a run does not have the topic or the number.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ _DASH = "–"
 
 
 def compare_grid(runs: Sequence[Run]) -> Grid:
-    """A section per topic, a column per run; the link's own numbers last. Numbers no run has are left out."""
+    """A section per topic and a column per run. The numbers of the link come last. Numbers that no run has are left
+    out."""
     by_topic = [{topic.topic: topic for topic in run.result.topics} for run in runs]
     sections = []
     for name in dict.fromkeys(name for topics in by_topic for name in topics):
@@ -78,7 +79,7 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
 def write_comparison(runs: Sequence[Run], out: Path, first: Sequence[Grid] = ()) -> list[Path]:
     """Write ``compare.html``, its figures and the table of all numbers.
 
-    :param first: tables to stand before the one of all numbers
+    :param first: tables that are placed before the table of all numbers
     :return: the files written, the page first
     :raises ConfigError: when they cannot be written
     """

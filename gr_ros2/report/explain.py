@@ -1,7 +1,7 @@
-"""Why a run came out as it did, in sentences computed from its ledger and its trace.
+"""Explains the result of a run, in sentences computed from its ledger and its trace.
 
-Invariant: every number of a sentence is counted or divided here from what was recorded; a sentence whose numbers do not
-apply is left out.
+Invariant: every number in a sentence is computed here from the recorded data; a sentence whose numbers do not apply is
+left out.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from gr_ros2.report.figures import row_order
 from gr_ros2.report.table import milliseconds
 
 _TREND = 1.5
-"""A latency that changed by less than this factor from the first to the last deliveries is called steady."""
+"""A latency that changes by less than this factor from the first to the last deliveries counts as unchanged."""
 
 
 def explanation(result: Result, trace: Trace) -> list[str]:
-    """Sentences: where messages went, what the air could carry, what became of packets, how latency moved."""
+    """Sentences about the messages, the capacity of the link, the packets, the latency and the computer's lateness."""
     packets = trace.packets()
     return [
         *_outcome(result),
@@ -52,7 +52,7 @@ def _outcome(result: Result) -> Iterator[str]:
 
 
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
-    """What carrying everything would have needed, against what the air has."""
+    """Compare the packet rate that all messages would have needed with the capacity of the link."""
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
@@ -77,7 +77,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
         return
     here = np.flatnonzero(~np.isnan(t_received))
     arrived = len(here)
-    passed = int(here[-1]) + 1 if arrived else 0  # what left later may still be on its way
+    passed = int(here[-1]) + 1 if arrived else 0  # later packets may still be on their way
     text = (
         f"Of {len(t_sent):,} packets that left the source, {arrived:,} ({_percent(arrived / len(t_sent))}) reached the "
         f"sink intact, {passed - arrived:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
@@ -103,7 +103,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
 
 
 def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
-    """Where those in flight were."""
+    """Where the messages in flight were at the end."""
     left: dict[tuple[int, int], int] = {}
     for src_id, serial, total in _messages_sent(packets)[0]:
         left[src_id, serial] = total
@@ -127,7 +127,7 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
 
 
 def _trend(trace: Trace) -> Iterator[str]:
-    """Whether messages waited longer and longer."""
+    """Whether the latency increased during the run."""
     t_sent = np.concatenate([m.t_sent[m.delivered] for m in trace.messages()] or [np.empty(0)])
     t_delivered = np.concatenate([m.t_delivered[m.delivered] for m in trace.messages()] or [np.empty(0)])
     if len(t_sent) < 10:
@@ -172,7 +172,7 @@ def _entries_per_message(packets: Packets, topic: str) -> float:
 
 
 def _messages_sent(packets: Packets) -> tuple[list[tuple[int, int, int]], Ints, Ints]:
-    """Of every message of which an entry left: (source, serial, total), entries that left, entries that arrived."""
+    """For every message with at least one entry sent: (source, serial, total), entries sent, entries that arrived."""
     real = packets.serial >= 0
     keys = np.column_stack([packets.src_id[real], packets.serial[real], packets.total[real]])
     unique, place = np.unique(keys, axis=0, return_inverse=True)
@@ -183,8 +183,8 @@ def _messages_sent(packets: Packets) -> tuple[list[tuple[int, int, int]], Ints, 
 
 
 def _fragments(packets: Packets, passed: int) -> tuple[float, int, int]:
-    """Of the messages that left whole within the first packets, so many: mean fragments, how many arrived complete,
-    how many there were."""
+    """For the messages that were sent completely within the first ``passed`` packets: their mean number of fragments,
+    how many arrived complete, and how many there were."""
     early = packets.packet < passed
     keys, sent, arrived = _messages_sent(
         replace(packets, **{name: values[early] for name, values in vars(packets).items()})
@@ -197,7 +197,7 @@ def _fragments(packets: Packets, passed: int) -> tuple[float, int, int]:
 
 
 def _percent(share: float) -> str:
-    """With as many digits as tell it from 0 and from 100 %."""
+    """A percentage with as many digits as are needed to distinguish it from 0 and from 100 %."""
     for digits in range(3):
         text = f"{share:.{digits}%}"
         if share in (0, 1) or float(text[:-1]) not in (0, 100):

@@ -1,7 +1,7 @@
-"""The pictures of an experiment: the paper's figure 7 (paths) and figure 6 (latency), the loss ledger; as PNG and SVG.
+"""The figures of an experiment: the paper's figure 7 (paths) and figure 6 (latency), the loss ledger; as PNG and SVG.
 
-Invariants: figures are objects of their own; nothing of matplotlib's global state is changed, so they can be drawn in
-any thread, with or without a display; a ledger row has the same colour in every picture.
+Invariants: figures are independent objects; matplotlib's global state is not changed, so figures can be drawn in any
+thread, with or without a display; a ledger row has the same colour in every figure.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ COLOURS = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
     *("#88ccee", "#882255", "#44aa99", "#ddcc77", "#332288", "#aa4499", "#999933", "#661100"),
 )
-"""Of topics and runs in their order; told apart by colour-blind readers as far as sixteen can be."""
+"""Colours of topics and runs, in their order. Colour-blind readers can distinguish them as well as is possible with
+sixteen colours."""
 
 _RASTER_ABOVE = 20_000
-"""Points above which a line is a picture inside the SVG, which otherwise grows without bound."""
+"""Number of points above which a line is stored as a bitmap in the SVG. Otherwise the file would become too large."""
 
 
 def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, received_name: str) -> Figure:
@@ -53,7 +54,7 @@ def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, re
     axes.plot(
         *other.T, color=_RECEIVED, linewidth=0.9, label=f"received {received_name} ({len(other)})", rasterized=raster
     )
-    # The red line is thin and its marks shrink with their number, so that the blue below stays visible.
+    # The red line is thin, and its marks are smaller if there are many, so that the blue line below stays visible.
     axes.plot(
         *other.T,
         marker="o",
@@ -79,7 +80,7 @@ def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, re
 
 
 def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
-    """Figure 6: the share of delivered messages that took at most so long.
+    """Figure 6: the cumulative distribution of the latency of delivered messages.
 
     :param curves: name -> latencies in s, all samples or evenly spaced quantiles; empty ones are left out
     """
@@ -111,7 +112,7 @@ def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
 
 
 def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
-    """Where the sent messages went, one bar of 100 % per name, one colour per ledger row, with the counts.
+    """The ledger rows of the sent messages: one bar of 100 % per name, one colour per row, with the counts.
 
     :param ledgers: name -> ledger row -> messages; names without messages are left out
     """
@@ -140,7 +141,7 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
 
 
 def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
-    """The ledger rows that occurred: delivered and repaired first, in_flight last, the others by name between them."""
+    """The ledger rows that occurred: delivered and repaired first, then the others by name, in_flight last."""
     found = {row for ledger in ledgers for row, count in ledger.items() if count}
     return sorted(
         found, key=lambda row: (row != LedgerRow.DELIVERED, row != LedgerRow.REPAIRED, row == LedgerRow.IN_FLIGHT, row)
@@ -148,7 +149,7 @@ def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
 
 
 def row_colour(row: str) -> str:
-    """The colour of a ledger row; of one this version does not know, always the same one."""
+    """The colour of a ledger row. A row that this version does not know also has a fixed colour."""
     return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]
 
 
@@ -161,7 +162,7 @@ def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
     try:
         Path(directory).mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_figure(paths[0], dpi=150)
-        figure.set_layout_engine("none")  # the layout stays, and half of the time is not spent on it again
+        figure.set_layout_engine("none")  # keep the layout: computing it again would take half of the time
         FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
     except OSError as error:
         raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error

@@ -1,8 +1,8 @@
 """The report of one or several runs: one HTML file that needs no network, its figures as PNG and SVG, and a table of
 all numbers as CSV and Parquet.
 
-Invariant: everything comes out of the runs' own files (`result.json` and the tables of :mod:`gr_ros2.record.trace`), so
-that it can be made again at any time; files that contradict each other are refused.
+Invariant: everything comes from the runs' own files (`result.json` and the tables of :mod:`gr_ros2.record.trace`), so a
+report can be made again at any time; files that contradict each other are refused.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, del
 
 REPORT_FILE = "report.html"
 SUMMARY = "summary"
-"""Stem of the table with one line per run and topic."""
+"""File name, without suffix, of the table with one line per run and topic."""
 
 _TEMPLATES = Path(__file__).resolve().parent / "templates"
 _LARGEST_SVG = 1_000_000
-"""Bytes; a larger drawing goes into the HTML as PNG."""
+"""Bytes. A larger drawing is embedded in the HTML as PNG."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: where it lies, what to call it, and its files."""
+    """One run: its folder, its name in the report, and its files."""
 
     directory: Path
     label: str
@@ -66,7 +66,7 @@ class Picture:
     wide: bool = False
 
     def data_uri(self) -> str:
-        """The picture itself, to stand in HTML."""
+        """The picture itself as a data URI, for embedding in HTML."""
         svg = self.svg.stat().st_size <= _LARGEST_SVG
         kind, path = ("svg+xml", self.svg) if svg else ("png", self.png)
         return f"data:image/{kind};base64,{b64encode(path.read_bytes()).decode('ascii')}"
@@ -85,10 +85,10 @@ class Section:
 
 
 def read_runs(directories: Iterable[str | Path]) -> list[Run]:
-    """Read run folders; one that holds repetitions counts as those. A run is called after its scenario, or after its
-    folder where that is ambiguous.
+    """Read run folders. A folder with repetitions stands for the folders of its repetitions. The label of a run is its
+    scenario, or its folder where the scenario is ambiguous.
 
-    :raises ConfigError: when a folder is missing, or a file of it is missing, damaged or half-written; names it
+    :raises ConfigError: when a folder is missing, or one of its files is missing, damaged or half-written; names it
     """
     paths = [folder for directory in directories for folder in run_folders(Path(directory))]
     found = []
@@ -109,7 +109,7 @@ def read_runs(directories: Iterable[str | Path]) -> list[Run]:
 def write_report(runs: Sequence[Run], out: Path) -> list[Path]:
     """Write ``report.html``, its figures and the table of all numbers.
 
-    :param out: folder, made if missing; the folder of a single run itself will do
+    :param out: folder, made if missing; it may be the folder of a single run itself
     :return: the files written, the report first
     :raises ConfigError: when they cannot be written
     """
@@ -124,17 +124,19 @@ def write_report(runs: Sequence[Run], out: Path) -> list[Path]:
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[Section], runs: Sequence[Run]) -> list[Path]:
-    """Write an HTML page, and the table of all numbers beside it; all files, the page first.
+    """Write an HTML page, and the table of all numbers in the same folder.
 
-    :raises ConfigError: when it cannot be written
+    :return: the files written, the page first
+    :raises ConfigError: when they cannot be written
     """
     return render_page(path, title, lead, sections, _write_summary(runs, path.parent))
 
 
 def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], tables: Sequence[Path]) -> list[Path]:
-    """Write an HTML page with its pictures inside; all files, the page first.
+    """Write an HTML page with its pictures inside.
 
-    :param tables: files with the numbers, already written beside it
+    :param tables: files with the numbers, already written to the same folder
+    :return: all files of the page, the page first
     :raises ConfigError: when it cannot be written
     """
     environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
@@ -162,14 +164,14 @@ def save(figure: Figure, out: Path, name: str, caption: str, wide: bool = False)
 
 
 def latencies(runs: Sequence[Run]) -> dict[str, Sequence[float]]:
-    """Every latency, s, by run and topic; by whichever of them tells the curves apart."""
+    """Every latency, s, by the name of its curve: the run, the topic, or both, as needed to distinguish the curves."""
     curves = {}
     for run in runs:
         topics = run.messages()
         for m in topics:
             name = m.topic if len(runs) == 1 else run.label if len(topics) == 1 else f"{run.label} {m.topic}"
             curves[name] = (m.t_delivered - m.t_sent)[m.delivered]
-    return curves  # type: ignore[return-value]  # arrays are sequences enough
+    return curves  # type: ignore[return-value]  # arrays are used as sequences
 
 
 def stem(label: str) -> str:
@@ -178,7 +180,7 @@ def stem(label: str) -> str:
 
 
 def lead_of(run: Run) -> str:
-    """What was run, in one line."""
+    """A description of the run in one line."""
     result = run.result
     parts = [
         str(result.config.get("description") or result.scenario),
@@ -297,12 +299,12 @@ def _write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
 
 
 def _check(run: Run) -> None:
-    """The trace and the result tell of the same run."""
+    """Check that the trace and the result are of the same run."""
     counts: dict[tuple[str, int], Messages] = {(m.topic, m.src_id): m for m in run.trace.messages()}
     for topic in run.result.topics:
         messages = counts.get((topic.topic, topic.src_id))
         sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
-        # Of what did not reach the link nothing but its number is known.
+        # Messages that were lost before the link are only counted. They are not in the trace.
         submitted = topic.sent - topic.ledger.get(LedgerRow.LOST_ON_GRAPH, 0)
         if (sent, delivered) != (submitted, topic.delivered):
             raise ConfigError(

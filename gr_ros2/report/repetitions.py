@@ -1,4 +1,4 @@
-"""The headline numbers of one experiment made several times, as a grid."""
+"""The headline numbers of one experiment that was run several times, as a grid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gr_ros2.report.table import Grid, number
 
 @dataclass(frozen=True)
 class _Headline:
-    """How a number of a topic is shown: its heading, with so many digits, in units of 1 / scale."""
+    """How a number of a topic is shown: its heading, its digits after the decimal point, and its factor ``scale``."""
 
     heading: str
     digits: int
@@ -29,7 +29,7 @@ _HEADLINES = {
     "age_mean_s": _Headline("Mean age [ms]", 1, 1e3),
     "path_error_m": _Headline("Path error [m]", 3),
 }
-"""By their names in the tables of a report."""
+"""By the names of the numbers in ``repetitions.json``."""
 
 
 def repetition_grid(results: Sequence[Result]) -> Grid:

@@ -1,6 +1,6 @@
-"""Results as tables: the paper's table 6, delivery and latency, and the loss ledger. Returned, never printed.
+"""Results as tables: the paper's table 6, delivery and latency, and the loss ledger. The functions do not print.
 
-Invariant: a number that does not apply shows as a dash.
+Invariant: a number that does not apply is shown as a dash.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from gr_ros2.record.result import Result, TopicResult
 
 _DASH = "–"
 PAPER = "the paper"
-"""How the tables call the authors' own run."""
+"""Name of the authors' own run in the tables."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table as text, for the terminal and for HTML alike.
+    """A table as text, for both the terminal and HTML.
 
-    :param texts: so many columns from the left are text, the others numbers
+    :param texts: number of columns from the left that are text; the others are numbers
     :param sections: lines by section
     """
 
@@ -62,7 +62,7 @@ def summary_grid(results: Sequence[Result]) -> Grid:
 
 
 def paper_grid(results: Sequence[Result]) -> Grid:
-    """The paper's table 6 and below each of its lines the odometry of the runs over the same kind of PHY."""
+    """The paper's table 6. Below each of its lines is the odometry of the runs with the same kind of PHY."""
     sections = []
     for phy, (config, duration, sent, received, pdr, goodput) in PAPER_TABLE_6.items():
         theirs = (config, PAPER, f"{duration:.1f}", str(sent), str(received), f"{pdr:.2f}", f"{goodput:.1f}")
@@ -77,7 +77,7 @@ def paper_grid(results: Sequence[Result]) -> Grid:
 
 
 def ledger_grid(result: Result) -> Grid:
-    """Where the sent messages of each topic went; rows that are zero for every topic are left out."""
+    """The ledger rows of the sent messages of each topic. Rows that are zero for every topic are left out."""
     topics = list(_at_every_receiver(result))
     found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
     first = [LedgerRow.DELIVERED, *(row for row in (LedgerRow.REPAIRED,) if row in found)]
@@ -87,7 +87,7 @@ def ledger_grid(result: Result) -> Grid:
 
 
 def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
-    """Every topic with what to call it, those of further receivers behind those of the first."""
+    """Every topic with its name in the tables. Topics of further receivers follow those of the first receiver."""
     yield from ((topic.topic, topic) for topic in result.topics)
     for receiver in result.receivers:
         yield from ((f"{topic.topic} at receiver {receiver.number}", topic) for topic in receiver.topics)
@@ -95,7 +95,7 @@ def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
 
 def as_table(grid: Grid) -> Table:
     """A grid for the terminal."""
-    # Narrow, so that ten columns fit a terminal of 80 characters.
+    # The table is narrow, so that ten columns fit a terminal of 80 characters.
     table = Table(box=box.SIMPLE_HEAD, title=grid.title, title_justify="left", pad_edge=False, collapse_padding=True)
     for place, heading in enumerate(grid.headings):
         if place < grid.texts:
@@ -120,7 +120,7 @@ def ledger_table(result: Result) -> Table:
 
 
 def notes(result: Result) -> list[str]:
-    """What a reader of the tables must not miss, one line each: often nothing."""
+    """Important remarks for a reader of the tables, one line each; often empty."""
     lines = [f"{topic.topic}: {topic.corrupt} messages arrived altered" for topic in result.topics if topic.corrupt]
     lines += [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
     lines += [
@@ -151,7 +151,7 @@ def _table_6(result: Result, topic: TopicResult) -> tuple[str, ...]:
 
 
 def milliseconds(seconds: float | None) -> str:
-    """ms with three digits."""
+    """A time in ms with about three significant digits."""
     if seconds is None:
         return _DASH
     value = seconds * 1000

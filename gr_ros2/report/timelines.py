@@ -1,7 +1,7 @@
-"""The pictures of an experiment over time: delivery, age, airtime, and the first packets one by one.
+"""The figures of an experiment over time: delivery, age, airtime, and the first packets one by one.
 
-Invariants: times are s since submission began; where there is nothing to draw the picture says so, it is never empty;
-an interval in which nothing was sent has no PDR.
+Invariants: times are s since submission began; a figure with no data says so and is never empty; an interval in which
+nothing was sent has no PDR.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from gr_ros2.record.trace import Floats, Ints, Messages, Packets
 from gr_ros2.report.figures import COLOURS
 
 _BINS = 40
-"""About so many intervals a run is cut into."""
+"""Approximate number of intervals into which a run is divided."""
 _FIRST_S, _FIRST_PACKETS = 2.0, 150
-"""The packets drawn one by one: those of so many s, at most so many."""
+"""Limits of the packets that are drawn one by one: the first s of sending, and the number of packets."""
 _FAR_APART = 10
-"""Runs whose peak ages differ by more than this factor share an axis only on a logarithmic scale."""
+"""If the peak ages of runs differ by more than this factor, their common axis is logarithmic."""
 _LOST = "#d62728"
 
 
 @dataclass(frozen=True)
 class Deliveries:
-    """What counts for delivery over time: every message's times (NaN where there is none) and size."""
+    """The data for delivery over time: times (NaN where there is none) and size of every message."""
 
     t_sent: Floats
     t_delivered: Floats
@@ -40,7 +40,8 @@ class Deliveries:
 
     @staticmethod
     def of(messages: Sequence[Messages]) -> Deliveries:
-        """Of one or several topics. A message refused before it was queued counts at the time of the one before."""
+        """The data of one or several topics. A message refused before it was queued gets the time of the message
+        before."""
         if not messages:
             return Deliveries(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
         order = np.argsort(np.concatenate([m.serial for m in messages]), kind="stable")
@@ -70,7 +71,7 @@ def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float, title: s
         sent, _ = np.histogram(line.t_sent, edges)
         delivered, _ = np.histogram(line.t_sent[done], edges)
         some = sent > 0
-        # The first lines are the widest, so that those that lie on each other can all be seen.
+        # The first lines are the widest, so that all lines are visible where they overlap.
         wide = 1.2 + 0.8 * (len(lines) - 1 - place)
         mark = {"marker": ".", "markersize": 4 + wide}
         above.plot(middles[some], delivered[some] / sent[some], color=colour, linewidth=wide, label=name, **mark)
@@ -89,7 +90,7 @@ def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str,
     """Age of information: a panel per topic with a sawtooth per run.
 
     :param panels: panel name -> line name -> messages
-    :param t_end: s, end of the watch by line name
+    :param t_end: s, end of the observation by line name
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     figure = Figure(figsize=(8.0, 1.2 + max(1.25 * len(panels), 2.4)), layout="constrained")
@@ -120,8 +121,7 @@ def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str,
 
 
 def airtime_figure(packets: Packets, airtime_s: float, duration_s: float) -> Figure:
-    """How much of the air was asked for and used: airtime of the packets that left the source, and of those that
-    arrived, per time.
+    """Airtime per time of the packets that left the source, and of those that arrived.
 
     :param airtime_s: s, of one packet on average
     :param duration_s: s during which messages were submitted
@@ -131,7 +131,7 @@ def airtime_figure(packets: Packets, airtime_s: float, duration_s: float) -> Fig
     t_sent, t_received = packets.times()
     end = max(duration_s, 1e-3, _latest(t_sent), _latest(t_received))
     width = nice_step(max(duration_s, 1e-3) / _BINS)
-    # An interval shorter than a few packets shows the grid and not the load.
+    # An interval must be longer than a few packets. Otherwise the figure shows rounding effects and not the load.
     width = max(width, nice_step(5 * airtime_s))
     edges = np.arange(0, end + width, width)
     for times, name, colour, alpha in (
@@ -171,7 +171,7 @@ def packets_figure(packets: Packets, topics: Sequence[str]) -> Figure:
     for at, code, serial in zip(number, codes, packets.serial[entry], strict=True):
         blocks.append(Rectangle((at - 0.45, heights[at]), 0.9, 1))
         colours.append(COLOURS[code % len(COLOURS)])
-        # A message is a shade, so that its fragments can be told from the next one's.
+        # Consecutive messages have different shades, so that their fragments can be distinguished.
         edges.append((0, 0, 0, 0.0) if serial % 2 else (1, 1, 1, 0.35))
         heights[at] += 1
     above.add_collection(PatchCollection(blocks, facecolor=colours, edgecolor="white", linewidth=0.4))
@@ -203,7 +203,7 @@ def packets_figure(packets: Packets, topics: Sequence[str]) -> Figure:
 
 
 def nice_step(at_least: float) -> float:
-    """The next of … 0.1, 0.2, 0.5, 1, 2, 5, 10 … that is no smaller.
+    """The smallest of … 0.1, 0.2, 0.5, 1, 2, 5, 10 … that is not smaller than ``at_least``.
 
     :param at_least: above 0
     """
@@ -212,7 +212,7 @@ def nice_step(at_least: float) -> float:
 
 
 def _latest(times: Floats) -> float:
-    """The largest that is a number, at least 0."""
+    """The latest time that is not NaN, at least 0."""
     return float(np.max(times, initial=0.0, where=~np.isnan(times)))
 
 

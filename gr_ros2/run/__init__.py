@@ -1,1 +1,1 @@
-"""Experiments as they run: a scenario, its flowgraphs or its simulated time, and what is told on the way."""
+"""Running experiments: a scenario, its flowgraphs or its simulated time, and the observers of a run."""

@@ -1,8 +1,8 @@
 """The bag of what a simulated run delivered.
 
-Invariants: a message is written when it is delivered, with its arrival as the time it was received and its submission
-as the time it was sent (MCAP's log_time and publish_time), both on the run's clock since the origin; payloads, and with
-them header stamps, are untouched.
+Invariants: a message is written when it is delivered; its arrival is the time of reception and its submission the time
+of sending (MCAP's log_time and publish_time), both on the run's clock since the origin; payloads, including header
+stamps, are not changed.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class DeliveredBag:
 
     :param path: folder that does not exist yet
     :param origin_ns: the run's time 0, ns since 1970
-    :param storage: ``sqlite3`` keeps the time of arrival alone
-    :param definitions: ``.msg`` texts by type name; of other types ROS's
+    :param storage: ``sqlite3`` stores the time of arrival only
+    :param definitions: ``.msg`` texts by type name; types that are not in it use the definitions of ROS
     :raises BagError: when it exists already or cannot be made
     :raises ConfigError: when the folder around it cannot be made
     """
@@ -46,28 +46,28 @@ class DeliveredBag:
         self.written: Counter[str] = Counter()
         """Messages by topic."""
         self.not_recorded: Counter[str] = Counter()
-        """Messages the disk did not take, by reason; :meth:`close` raises it."""
+        """Messages that could not be written to disk, by reason. :meth:`close` raises the error."""
         self._origin_ns = origin_ns
         make_folder(path.parent)
         self._recorder = BagRecorder(path, storage, definitions or {}, self._count)
         self._channels: dict[tuple[int, int], BagChannel] = {}
 
     def add_source(self, src_id: int, registry: Registry, names: Mapping[int, str]) -> None:
-        """The topics that come from one sender, offered with the default QoS.
+        """Add the topics that come from one sender, with the default QoS.
 
-        :param names: what they are called in the bag, by topic id
+        :param names: names of the topics in the bag, by topic id
         """
         for topic_id, name in names.items():
             qos = Qos("reliable", "volatile", 10)
             self._channels[src_id, topic_id] = self._recorder.channel(name, registry[topic_id].type_name, qos)
 
     def copy_source(self, src_id: int, topics: Mapping[int, RecordedTopic]) -> None:
-        """The topics that come from one sender, each as it stands in the bag that was sent, by topic id."""
+        """Add the topics that come from one sender, by topic id, each as it is in the bag that was sent."""
         for topic_id, topic in topics.items():
             self._channels[src_id, topic_id] = self._recorder.copy(topic)
 
     def take(self, event: Delivered, now: float, submitted: float | None) -> None:
-        """One delivery; times are s since the origin.
+        """Write one delivery; times are s since the origin.
 
         :raises BagError: when the file cannot be written
         """
@@ -93,7 +93,7 @@ class DeliveredBag:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finish the file; of a run that failed or was interrupted nothing stays."""
+        """Finish the file. If the run failed or was interrupted, the file is removed."""
         if kind is None:
             self.close()
             return
@@ -106,9 +106,9 @@ class DeliveredBag:
 
 
 def bag_origin_ns(scenario: Scenario, topics: Collection[str]) -> int:
-    """ns since 1970 at the run's time 0: of a recording its first message, of the simulator its start time.
+    """ns since 1970 at the run's time 0: the first message of a recording, or the start time of the simulator.
 
-    :param topics: absolute names of those that count
+    :param topics: absolute names of the topics that count
     :raises ConfigError: when the recording has none of the scenario's topics
     """
     if scenario.bag_path is None:

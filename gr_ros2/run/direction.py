@@ -1,7 +1,7 @@
 """One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph.
 
-Invariants: the only path from the input graph to the output graph is the link; whatever is opened here is closed by the
-stack it was entered on.
+Invariants: the only path from the input graph to the output graph is the link; everything that is opened here is closed
+by the exit stack it was entered on.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from gr_ros2.run.load import recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 
 _QUIET_S = 0.3
-"""A PHY that has given no packet for so long, with nothing waiting, is empty."""
+"""A PHY is empty if nothing waits for it and it has given no packet for this time."""
 
 
 def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) -> Middleware:
-    """A participant of its own on the graph of one end of the link.
+    """Join the graph of one end of the link with a participant of its own.
 
-    :param node: what it is called there, after ``gr_ros2_``
+    :param node: name of the node on the graph, after ``gr_ros2_``
     """
     return join_graph(
         end.middleware,
@@ -44,7 +44,7 @@ class Direction:
     """Both blocks and the link between them, ready to start.
 
     :param scenario: a one-way scenario, see :meth:`Scenario.directions`
-    :param observer: hears the events of both blocks
+    :param observer: receives the events of both blocks
     :param stack: closes what is opened here
     :param instrumented: see :class:`LoopbackLink`
     :ivar topics: topic id of every topic the source subscribes, by absolute name
@@ -66,7 +66,7 @@ class Direction:
         self.topics = source_names(scenario, registry)
         self.input = stack.enter_context(self._input_graph())
         self.output = stack.enter_context(open_graph(scenario, scenario.ros_sink, "sink"))
-        # Pulling a bag as fast as the link takes it needs a source that holds it back instead of dropping.
+        # A bag that is read as fast as the link takes it needs a source that makes the reader wait instead of dropping.
         pulled = scenario.bag_path is not None and scenario.bag_speed == 0
         backpressure = scenario.ros_source.backpressure or pulled
         sends, hears = (self._end(source=True), self._end(source=False)) if scenario.version else (None, None)
@@ -99,7 +99,7 @@ class Direction:
         stack.callback(self.link.stop)
 
     def _end(self, *, source: bool) -> LiveEnd:
-        """One end of a run: its starts are not counted, since nothing outlives the run."""
+        """One end of a run. Its starts are not counted, because no end exists longer than the run."""
         ends = (self.scenario.ros_source, None) if source else (None, self.scenario.ros_sink)
         start = Start(self.scenario.seed + 1)
         return LiveEnd(lambda observer: make_endpoint(self.registry, *ends, start=start, observer=observer))
@@ -113,7 +113,7 @@ class Direction:
     def empty(self, unresolved: bool) -> bool:
         """Whether nothing is left at the source, at the gate or in the PHY.
 
-        :param unresolved: there are messages whose fate is open, so it is worth waiting a moment for the PHY
+        :param unresolved: whether the result of some messages is open; then it is useful to wait briefly for the PHY
         """
         counts = self.link.counts()
         if not self.source.idle or counts.backlog or counts.transmitted < counts.passed:
@@ -122,7 +122,7 @@ class Direction:
         return self.link.counts() == counts
 
     def counters(self) -> dict[str, Any]:
-        """What each part counted; ``channel``: packets it lost on purpose, by setting."""
+        """What each part counted. ``channel``: the packets it lost on purpose, by the setting that caused the loss."""
         return {
             "source": self.source.stats(),
             "sink": self.sink.stats(),
@@ -133,5 +133,5 @@ class Direction:
         path = self.scenario.bag_path
         if path is None:
             return open_graph(self.scenario, self.scenario.ros_source, "source")
-        recorded_names(self.scenario, self.registry)  # refuses a recording with nothing for this link
+        recorded_names(self.scenario, self.registry)  # raises if the recording has nothing for this link
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)

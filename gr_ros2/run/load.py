@@ -1,6 +1,7 @@
 """How much a scenario offers to its link, and the sample rate that carries it.
 
-Invariant: the offered load counts every message as if it travelled alone, so it is never below what the link will see.
+Invariant: the offered load counts every message as if it used its packets alone, so it is never below the actual load
+of the link.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from gr_ros2.sim.fleet import Fleet
 from gr_ros2.wire import Format
 
 _SAMPLE_S = 2.0
-"""Simulated seconds that are generated to learn message sizes; sizes hardly vary."""
+"""Simulated seconds that are generated to find out message sizes. Sizes hardly vary."""
 
 
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
     """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
 
-    :raises ConfigError: for wrong PHY options, a channel it cannot have, or when nothing is offered
+    :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when nothing is offered
     """
     chosen = scenario.phy.sample_rate
     rate = 0.0 if chosen == AUTO else chosen
@@ -39,7 +40,7 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
 
 
 def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
-    """The PHY of every direction of a scenario, all at one sample rate: the highest that any of them asks for.
+    """The PHY of every direction of a scenario. All have one sample rate: the highest that any of them needs.
 
     :raises ConfigError: see :func:`make_phy`
     """
@@ -52,7 +53,7 @@ def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
 
 
 def offered_packets(scenario: Scenario, registry: Registry) -> float:
-    """Packets/s the source needs if every message travels alone.
+    """Packets/s that the source needs if no packet carries more than one message.
 
     :raises ConfigError: when the source offers nothing on the registered topics
     """
@@ -71,8 +72,8 @@ def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
 def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     """Those of :func:`source_names` that the scenario's recording has.
 
-    :raises ConfigError: it has none of them, or one with another type or as one that cannot be carried
-    :raises BagError: it cannot be read
+    :raises ConfigError: when the recording has none of them, or has one with another type or one that cannot be carried
+    :raises BagError: when the recording cannot be read
     """
     names = source_names(scenario, registry)
     contents = recording(scenario)
@@ -86,9 +87,9 @@ def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
 
 
 def recording(scenario: Scenario) -> BagContents:
-    """What the scenario's recording has, nothing where the simulator is the source.
+    """What the scenario's recording contains; empty where the simulator is the source.
 
-    :raises BagError: it cannot be read
+    :raises BagError: when the recording cannot be read
     """
     return BagContents(Path(), {}, {}, ()) if scenario.bag_path is None else bag_contents(scenario.bag_path)
 
@@ -124,5 +125,5 @@ def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
 
 
 def _packets_alone(size: int, packet_len: int, wire: Format) -> int:
-    """Packets that a message of this size needs alone; one too large for the link needs none."""
+    """Packets that a message of this size needs if it shares none; 0 for a message too large for the link."""
     return max(-(-size // wire.single_entry_payload(packet_len)), 1) if size <= wire.largest_message(packet_len) else 0

@@ -1,9 +1,9 @@
-"""How many packets a PHY loses on a channel, measured on its flowgraph and kept: the losses of ``time: packets``.
+"""Tables of how many packets a PHY loses on a channel, measured on its flowgraph: the losses of ``time: packets``.
 
-Invariants: a number here was measured, on the flowgraph of that very PHY, packet length and channel, at SNRs
-``STEP_DB`` apart; between two of them the log-odds of delivery is interpolated, beyond none is guessed; the same
-setting gives the same table on every machine. Tables lie in the package and in the user's cache folder; what neither
-has is measured when it is asked for, by one process at a time, and said in the log.
+Invariants: every number is measured on the flowgraph of the same PHY, packet length and channel, at SNRs ``STEP_DB``
+apart; between two SNRs the log-odds of delivery are interpolated, and nothing is extrapolated; the same setting gives
+the same table on every machine. Tables are stored in the package and in the user's cache folder. A point that is in
+neither is measured on demand, by one process at a time, and the log says so.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from gr_ros2.files import replacing
 from gr_ros2.phy import Phy
 
 BUILTIN_DIR = Path(__file__).resolve().parent.parent / "losses"
-"""Where the tables that come with gr-ros2 lie."""
+"""Folder of the tables that come with gr-ros2."""
 STEP_DB = 0.5
 PACKETS = 1000
-"""Sent at each SNR when a point is measured on demand: a PDR of one half is then known with a deviation of 0.016."""
+"""Packets sent at each SNR when a point is measured on demand. The standard deviation at a PDR of 0.5 is 0.016."""
 
 _SEEDS_APART = 2**40
-"""Losses of the PHY are not drawn from the seeds of the channel's own losses."""
+"""Added to the seed, so that the losses of the PHY are independent of the channel's own losses."""
 _log = logging.getLogger(__name__)
 
 
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 class Point:
     """What was counted at one SNR.
 
-    :param lost_in: runs of lost packets, one behind the other
+    :param lost_in: number of runs of consecutive lost packets
     """
 
     sent: int
@@ -57,12 +57,12 @@ class Point:
 
     @property
     def log_odds(self) -> float:
-        """Of delivery; finite, half a packet counted either way."""
+        """Log-odds of delivery. Half a packet is added to both counts, so that the value is finite."""
         return math.log((self.delivered + 0.5) / (self.sent - self.delivered + 0.5))
 
     @property
     def memory(self) -> float:
-        """How far a loss tells of the next packet: 0 = not at all, 1 = that it is lost too."""
+        """How strongly a loss predicts the next packet: 0 = not at all, 1 = the next packet is lost too."""
         lost = self.sent - self.delivered
         if not lost or not self.delivered:
             return 0.0
@@ -74,7 +74,7 @@ class Point:
 class LossTable:
     """The points of one setting, by SNR in dB; None is the channel without noise.
 
-    :param setting: what the losses depend on beside the SNR
+    :param setting: what the losses depend on, apart from the SNR
     """
 
     setting: dict[str, Any]
@@ -82,7 +82,7 @@ class LossTable:
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """Name of its file."""
         text = json.dumps(self.setting, sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:12]
         return f"{self.setting['phy']}-{self.setting['packet_len']}-{digest}.json"
@@ -90,7 +90,7 @@ class LossTable:
     def losses(self, snr_db: float | None) -> tuple[float, float]:
         """Share of packets lost, and their memory (see :class:`Point`), from the points next to an SNR.
 
-        :raises KeyError: when they are not there
+        :raises KeyError: when the table does not have these points
         """
         if snr_db is None or snr_db in self.points:
             point = self.points[snr_db]
@@ -106,30 +106,30 @@ class LossTable:
 
 
 def neighbours(snr_db: float) -> tuple[float, float]:
-    """The SNRs at which a table has points, next to this one; twice the same where it has this one."""
+    """The two SNRs of a table next to this one, below and above. Both are equal where the table has this SNR itself."""
     steps = snr_db / STEP_DB
     return math.floor(steps) * STEP_DB, math.ceil(steps) * STEP_DB
 
 
 def setting_of(phy: Phy, channel: ChannelConfig) -> dict[str, Any]:
-    """What the losses of a PHY's packets depend on, beside the SNR; what is at its default is left out."""
+    """What the losses of a PHY's packets depend on, apart from the SNR. Options at their default are left out."""
     chosen, default = phy.options, phy.Options()
     names = [item.name for item in fields(chosen)]
     options = {name: getattr(chosen, name) for name in names if getattr(chosen, name) != getattr(default, name)}
     on_samples = {name: value for name, value in channel.on_samples().items() if name != "snr_db"}
     setting = {"phy": phy.name, "packet_len": phy.packet_len, "options": options, "channel": on_samples}
     if channel.doppler_hz:
-        setting["sample_rate"] = phy.sample_rate  # all else is relative to it
+        setting["sample_rate"] = phy.sample_rate  # all other settings are relative to it
     return dict(json.loads(json.dumps(setting, default=str)))
 
 
 def measure(phy: Phy, channel: ChannelConfig, packets: int) -> Point:
-    """Send packets and count.
+    """Send packets and count those that arrive.
 
-    :param channel: its seed and its losses of whole packets play no part
+    :param channel: its seed and its losses of whole packets are ignored
     :param packets: how many, 1 or more
     """
-    from gr_ros2.phy.measure import BatchChannel  # only here: a table that is there needs no flowgraph
+    from gr_ros2.phy.measure import BatchChannel  # only here: an existing table needs no flowgraph
 
     passage = BatchChannel(phy, replaced(channel, seed=0))
     source = random.Random(0)
@@ -145,12 +145,12 @@ def measure(phy: Phy, channel: ChannelConfig, packets: int) -> Point:
 
 
 def packet_losses(phy: Phy, channel: ChannelConfig) -> ChannelConfig:
-    """A channel that loses whole packets as the PHY does on ``channel``; what is not known of it is measured.
+    """A channel that loses whole packets as the PHY does on ``channel``. Missing points are measured.
 
-    With fading the losses come in bursts (two states, as long as measured), otherwise one by one.
+    With fading the losses come in bursts (two states, with the measured burst length), otherwise independently.
 
-    :raises ConfigError: for a channel the PHY cannot have, or sample clocks that differ: measured, what a packet
-        carries matters with these, and with nothing else
+    :raises ConfigError: for a channel that the PHY does not support, or for sample clocks that differ: measurements
+        show that the losses then depend on the contents of a packet, and only then
     :raises RunError: when the cache folder cannot be written
     """
     phy.check_channel(channel)
@@ -171,7 +171,7 @@ def packet_losses(phy: Phy, channel: ChannelConfig) -> ChannelConfig:
 
 
 def snrs_of(channel: ChannelConfig) -> set[float | None]:
-    """The points a channel needs."""
+    """The SNRs of the points that a channel needs."""
     return {None} if channel.snr_db is None else set(neighbours(channel.snr_db))
 
 
@@ -183,10 +183,10 @@ def table_for(
     packets: int | None = None,
     folder: Path | None = None,
 ) -> LossTable:
-    """The table of a setting with at least these points; those missing are measured and kept.
+    """The table of a setting with at least these points. Missing points are measured and stored.
 
-    :param packets: sent at each point that is measured, None = ``PACKETS``; points of fewer count as missing
-    :param folder: where it is kept, None = the cache folder
+    :param packets: sent at each point that is measured, None = ``PACKETS``; points with fewer packets count as missing
+    :param folder: where the table is stored, None = the cache folder
     :raises RunError: when the folder cannot be written
     """
     packets = PACKETS if packets is None else packets
@@ -213,7 +213,7 @@ def table_for(
 
 
 def cache_dir() -> Path:
-    """Where tables measured on demand are kept: ``gr-ros2/losses`` in ``$XDG_CACHE_HOME``, by default ``~/.cache``."""
+    """Folder of tables measured on demand: ``gr-ros2/losses`` in ``$XDG_CACHE_HOME``, by default ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gr-ros2" / "losses"
 
 
@@ -231,7 +231,7 @@ def write(table: LossTable, path: Path) -> None:
 
 @cache
 def _program() -> str:
-    """What measured: version and sources of the PHYs, since a changed one loses other packets."""
+    """Version of gr-ros2 and digest of the PHYs' sources. A changed PHY loses other packets."""
     digest = hashlib.sha256()
     for source in sorted((BUILTIN_DIR.parent / "phy").glob("*.py")):
         digest.update(source.read_bytes())
@@ -239,7 +239,7 @@ def _program() -> str:
 
 
 def _read(path: Path, table: LossTable) -> None:
-    """Add the points of a file. One that is damaged, or measured with other PHYs, has none."""
+    """Add the points of a file. A file that is damaged, or that was measured with other PHYs, is ignored."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if (path.parent == BUILTIN_DIR or values["program"] == _program()) and values["setting"] == table.setting:
@@ -258,7 +258,7 @@ def _missing(table: LossTable, snrs: set[float | None], packets: int) -> list[fl
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """While this process has the file for itself; others wait."""
+    """Lock the file: this process has it for itself, and other processes wait."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_name(f".{path.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -1,7 +1,7 @@
-"""Observers of a run, such as a dashboard: they receive the events of both ends, and see the parts while they run.
+"""Observers of a run, such as a dashboard: they receive the events of both ends, and can read the parts while they run.
 
-Invariant: the run never depends on an observer, even if it raises, hangs or is slow; without observers there is no
-cost.
+Invariant: the run never depends on an observer, even if the observer raises, hangs or is slow; without observers there
+is no cost.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from gr_ros2.registry import Registry
 _HELD_BYTES = 1 << 25
 """Bytes of events that may wait for an observer with a thread of its own."""
 _EVENT_BYTES = 256
-"""Bytes of an event without packet and payload."""
+"""Bytes counted for each event, in addition to its packet or payload."""
 _PATIENCE_S = 5.0
 """s that an observer may take to process the waiting events."""
 
 
 class LiveLink(Protocol):
-    """What can be seen of a flowgraph, and changed in it: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
+    """What an observer can read and change in a flowgraph: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
 
-    The setters raise a GrRos2Error where that cannot be changed.
+    The setters raise a GrRos2Error where the setting cannot be changed.
     """
 
     @property
@@ -63,7 +63,7 @@ class LiveRun:
     :param topics: absolute name at the source, by source id and topic id
     :param sources: sending block by source id
     :param links: every direction's flowgraph
-    :param ledger: where every message sent so far stands; None where only one end of the link is here
+    :param ledger: the state of every message sent so far; None where only one end of the link is in this process
     :param clock: s, the clock of the run's events
     """
 
@@ -79,27 +79,28 @@ class LiveRun:
 
 
 class RunObserver(LinkObserver, Protocol):
-    """An observer. Its ``name``, where it has one, stands in what is said about it.
+    """An observer. Messages about it use its ``name``, where it has one.
 
-    :param instruments: whether the link is to be built so that its channel can be changed and its signal seen
+    :param instruments: whether the link must be built so that its channel can be changed and its signal observed
     """
 
     @property
     def instruments(self) -> bool: ...
 
     def run_started(self, run: LiveRun) -> None:
-        """Before the first event of a run."""
+        """Called before the first event of a run."""
 
     def run_ended(self, result: Result | None) -> None:
-        """The link has stopped. ``result`` is None where the run failed; then it comes after the error was raised."""
+        """Called when the link has stopped. ``result`` is None where the run failed; the call then follows the
+        error."""
 
 
 class LateObservers(Observers[RunObserver]):
-    """An observer that passes everything on to whoever looks on at the moment: they may come while the run goes on.
+    """An observer that passes everything on to other observers, which may be attached while the run goes on.
 
-    Who comes late is told of the run, and from then on of every event.
+    An observer that is attached late first receives ``run_started``, and then every further event.
 
-    :param instruments: see :class:`RunObserver`; for everybody who may come
+    :param instruments: see :class:`RunObserver`; for all observers that may be attached
     """
 
     name = "audience"
@@ -132,11 +133,11 @@ class LateObservers(Observers[RunObserver]):
 
 
 class RunObservers(Observers[RunObserver]):
-    """The observers of one run or link, which can neither stop it nor hold it up.
+    """The observers of one run or link. They can neither stop it nor delay it.
 
-    :param threaded: give each a thread of its own and a bounded memory of what it has not heard yet; what does not fit
-        is left out and counted. Otherwise they hear everything at once, as is right where time waits: in simulated
-        time.
+    :param threaded: give each observer a thread of its own and a bounded queue of events; events that do not fit are
+        left out and counted. Otherwise observers are called directly, which is correct in simulated time, because
+        the simulation waits for them.
     """
 
     def __init__(self, observers: Iterable[RunObserver] = (), *, threaded: bool) -> None:
@@ -150,12 +151,13 @@ class RunObservers(Observers[RunObserver]):
             guard(observer.run_started, run)
 
     def settle(self) -> None:
-        """Wait until all have heard everything so far; the link has stopped. Who takes too long has missed the rest."""
+        """Wait until all observers have received everything so far. The link has stopped. If an observer takes too
+        long, its remaining events count as missed."""
         for observer in self._threaded:
             observer.settle()
 
     def run_ended(self, result: Result | None) -> None:
-        """See :class:`RunObserver`; nothing follows."""
+        """See :class:`RunObserver`. No call follows this one."""
         for observer, guard in self._guarded:
             guard.last(observer.run_ended, result)
 
@@ -205,7 +207,7 @@ class ThreadedObserver(Observers[RunObserver]):
 
 
 def _size(event: SenderEvent | ReceiverEvent) -> int:
-    """Bytes of packet or message that an event holds; a packet's are there as bytes and as payloads."""
+    """Bytes of the packet or message that an event holds. A packet counts twice: as bytes and as payloads."""
     if isinstance(event, SentPacket | Received):
         return 2 * len(event.data)
     return len(event.data) if isinstance(event, Rejected) else len(getattr(event, "payload", b""))

@@ -1,4 +1,4 @@
-"""What a run gives back and tells on its way, however its time passes.
+"""What a run returns and what it reports while it runs, in real time and in simulated time alike.
 
 Invariant: nothing here depends on how a run is made.
 """
@@ -14,12 +14,12 @@ from gr_ros2.record.result import Result
 from gr_ros2.record.trace import Trace
 
 DELIVERED_BAG = "delivered"
-"""Folder of the bag with what came out on the receiving graphs."""
+"""Folder of the bag with the messages that were published on the receiving graphs."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run is: s since it began, s it takes (0 = until the bag ends), messages sent and delivered."""
+    """Progress of a run: s since its start, s it takes (0 = until the bag ends), messages sent and delivered."""
 
     elapsed_s: float
     duration_s: float
@@ -29,14 +29,14 @@ class Progress:
 
 @dataclass
 class Outcome:
-    """The result, and what happened message by message."""
+    """The result, and the trace of every message."""
 
     result: Result
     trace: Trace
 
 
 def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:
-    """``phy`` of a result, once the recorder has finished.
+    """The field ``phy`` of a result. Call it after the recorder has finished.
 
     :param channels: one per direction
     """

@@ -1,7 +1,7 @@
-"""How late threads of this process come to work: one that wakes up again and again, and looks when it does.
+"""Measures how late the threads of this process are scheduled: one thread wakes up periodically and checks the time.
 
-Invariant: it does nothing else, so what it is late by is the computer's doing: busy with other programs, or with this
-one's other threads.
+Invariant: the thread does nothing else, so its lateness is caused by the computer, which is busy with other programs or
+with other threads of this one.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class Pulse:
         self._thread = threading.Thread(target=self._beat, name="gr-ros2-pulse", daemon=True)
 
     def start(self) -> None:
-        """Begin; once only."""
+        """Begin. To be called only once."""
         self._thread.start()
 
     def close(self) -> None:
-        """End. Idempotent, also before the start."""
+        """End. Idempotent; may also be called before the start."""
         self._over.set()
         if self._thread.ident is not None:
             self._thread.join()

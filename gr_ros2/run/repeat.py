@@ -1,4 +1,4 @@
-"""One scenario several times, with other seeds each time: repetition k, from 0, has every seed k higher."""
+"""One scenario several times, with other seeds each time. In repetition k (from 0) every seed is k higher."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def repetitions(scenario: Scenario) -> Iterator[Scenario]:
 
 
 def _reseeded(scenario: Scenario, k: int) -> Scenario:
-    """The same with every seed so much higher."""
+    """The same scenario with every seed higher by ``k``."""
     sim, channel = replaced(scenario.sim, seed=scenario.sim.seed + k), _reseeded_channel(scenario.channel, k)
     back = scenario.back and replace(scenario.back, channel=_reseeded_channel(scenario.back.channel, k))
     reports = scenario.reports and replace(scenario.reports, channel=_reseeded_channel(scenario.reports.channel, k))

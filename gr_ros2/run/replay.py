@@ -1,8 +1,8 @@
-"""A recording through a link and a channel into a recording: what it would have looked like at the other end.
+"""Sends a recording through a simulated link and channel, and writes what arrives as a second recording.
 
 Invariants: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types,
-type definitions, the QoS of every publisher and payloads (with them header stamps) are those of the original; a topic
-that a link cannot carry is left out and said; the file appears whole or not at all.
+type definitions, the QoS of every publisher and payloads (including header stamps) are those of the original; a topic
+that a link cannot carry is left out and reported; the file appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulated_runner import run_simulated
 
 _STORAGES: dict[str, Literal["mcap", "sqlite3"]] = {".mcap": "mcap", ".db3": "sqlite3"}
-"""Of a bare file, by its suffix; anything else is a bag folder."""
+"""Storage of a single bag file, by its suffix. A path with any other suffix is a bag folder."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Replayed:
     """What a replay did.
 
     :param carried, left_out: topics of the original, by absolute name
-    :param remarks: why a topic could not be carried, and where the original's counts differ, one line each
+    :param remarks: one line each: why a topic could not be carried, and where the counts in the original's metadata
+        differ from its messages
     """
 
     outcome: Outcome
@@ -49,18 +50,18 @@ def replay(
     topics: Sequence[str] = (),
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Replayed:
-    """Send a recording through a scenario's link and keep what comes out.
+    """Send a recording through a scenario's link and record what comes out.
 
-    The scenario's registry says which topics are carried. Where it has none of the recording's, or ``topics`` are
-    named, the registry is made of the recording.
+    The scenario's registry says which topics are carried. The registry is made from the recording instead if it has
+    no topic of the recording, or if ``topics`` is given.
 
     :param source: bag folder, ``.mcap`` or ``.db3`` file
     :param target: ``.mcap`` or ``.db3`` file, otherwise a bag folder (MCAP); must not exist
-    :param scenario: its own source plays no part; ``time`` real becomes samples
+    :param scenario: its own source is ignored; ``time`` real becomes samples
     :param topics: absolute names; () = as the registry says
     :raises BagError: when ``source`` cannot be read, or ``target`` exists or cannot be written
-    :raises ConfigError: for a topic the recording has not or a link cannot carry, for too many of them, or a wrong
-        scenario
+    :raises ConfigError: for a topic that the recording does not have or a link cannot carry, for too many topics, or
+        for a wrong scenario
     """
     if target.exists():
         raise BagError(f"{target}: exists already; choose another name or remove it")
@@ -89,7 +90,7 @@ def replay(
 def _made_for(
     scenario: Scenario, registry: Registry, contents: BagContents, topics: Sequence[str]
 ) -> tuple[Scenario, Registry]:
-    """The scenario with a registry made of the recording; options of topics that both have are kept."""
+    """The scenario with a registry made from the recording. Options of topics that are in both are kept."""
     source, recorded = contents.path, contents.topics
     for name in topics:
         if name in contents.left_out:
@@ -135,7 +136,7 @@ def _check_types(
 
 @contextmanager
 def _bag_at(target: Path, origin_ns: int) -> Iterator[DeliveredBag]:
-    """A bag that is at ``target`` when the block ends well, and nowhere otherwise."""
+    """A bag that is at ``target`` when the block ends without an error. After an error no bag is left."""
     storage = _STORAGES.get(target.suffix)
     folder = target if storage is None else target.with_name(f".{target.name}.part")
     if folder != target:

@@ -1,7 +1,7 @@
-"""Runs one scenario: one direction or two, watched by a Recorder.
+"""Runs one scenario with one or two directions, observed by a Recorder.
 
-Invariants: everything started is stopped in reverse order whatever happens; a run that is interrupted still closes its
-books and writes its result.
+Invariants: everything that was started is stopped in reverse order, also after an error; a run that is interrupted
+still closes its ledger and writes its result.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from gr_ros2.sim.publisher import SimPublisher
 __all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
 
 REGISTRY_FILE = "registry.csv"
-"""The run's registry as it was, for who looks at its packets."""
+"""Copy of the run's registry, needed to decode its packets later."""
 
 _MATCH_S = 20.0
 _POLL_S = 0.05
 
 
 class DeliveryRecorder:
-    """An independent subscriber on the receiving graphs, which records what comes out there as one bag.
+    """An independent subscriber on the receiving graphs, which records what is published there in one bag.
 
-    :param graphs: name and type of the topics to hear, by graph
-    :param definitions: ``.msg`` texts of types by name; ROS's where missing
+    :param graphs: name and type of the topics to subscribe, by graph
+    :param definitions: ``.msg`` texts by type name; types that are not in it use the definitions of ROS
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class DeliveryRecorder:
         self.received: Counter[str] = Counter()
         self._closed = False
         self._guard = Guard("bag of delivered messages")
-        # A reader that waits for the disk would make DDS hold up the link's own publisher.
+        # If this subscriber waited for the disk, DDS would delay the link's own publisher.
         self._bag = BagMiddleware(path=bag, mode="write", definitions=definitions, lossless=False)
         self._publishers = {
             name: self._bag.advertise(name, kind, Qos()) for topics in graphs.values() for name, kind in topics.items()
@@ -80,7 +80,7 @@ class DeliveryRecorder:
         return all(subscription.matched() for subscription in self._subscriptions.values())
 
     def lost(self) -> dict[str, int]:
-        """Messages of each topic that were published and that the graph lost on the way here; {} where none was."""
+        """Messages of each topic that were published but that the graph lost on the way here; {} if none was lost."""
         return {name: subscription.lost for name, subscription in self._subscriptions.items() if subscription.lost}
 
     def close(self) -> None:
@@ -92,9 +92,9 @@ class DeliveryRecorder:
             self._guard.last(self._bag.close)
 
     def told(self) -> list[str]:
-        """What is missing in the bag, as one line; none where nothing is. To be asked when it is closed."""
+        """What is missing in the bag, as one line; empty if nothing is missing. To be called after :meth:`close`."""
         missed = sum(self._bag.counters.values())
-        if self._guard.error is not None:  # a storage writes in chunks: what it took before may not be there either
+        if self._guard.error is not None:  # a storage writes in chunks: earlier messages may be missing too
             return [f"{one_line(self._guard.error)}; any of its {self.received.total()} messages may be missing"]
         return [f"bag {self._bag.path}: slower than the link; {missed} messages are missing"] if missed else []
 
@@ -111,9 +111,9 @@ def run_scenario(
         made if missing; None writes nothing
     :param on_progress: called about 20 times a second
     :param observers: where one has ``instruments``, the link is built so that its channel can be changed and
-        its signal seen
+        its signal observed
     :raises ConfigError: when the scenario cannot be set up
-    :raises RunError: when it fails under way
+    :raises RunError: when it fails while it runs
     """
     if out is not None and (out / DELIVERED_BAG).exists():
         raise ConfigError(f"{out}: holds a run already; choose another folder")
@@ -140,25 +140,25 @@ def run_repetitions(
     on_start: Callable[[], Callable[[Progress], None] | None] = lambda: None,
     observers: Sequence[RunObserver] = (),
 ) -> list[Result]:
-    """Run every repetition of a scenario, until KeyboardInterrupt at the latest, each into a folder of its own.
+    """Run every repetition of a scenario, each into a folder of its own. KeyboardInterrupt stops the series.
 
     :param out: folder for ``rep-0``, ``rep-1``, ... and ``repetitions.json``, made if missing
-    :param on_start: called before each run for its ``on_progress``
+    :param on_start: called before each run; returns the ``on_progress`` of that run
     :param observers: see :func:`run_scenario`
-    :return: the results of the runs that came to their end
-    :raises ConfigError: when the scenario cannot be set up, or a run is there already
-    :raises RunError: when a run fails under way
+    :return: the results of the runs that were completed
+    :raises ConfigError: when the scenario cannot be set up, or the folder already holds a run
+    :raises RunError: when a run fails while it runs
     """
     results: list[Result] = []
     for k, one in enumerate(repetitions(scenario)):
         try:
             result = run_scenario(one, repetition_folder(out, k), on_start(), observers).result
-        except KeyboardInterrupt:  # between two runs: the same as during one
+        except KeyboardInterrupt:  # between two runs: handled as during a run
             break
         if result.interrupted:
             break
         results.append(result)
-        write_repetitions(results, out)  # each time, so that runs are kept together whatever happens to the next
+        write_repetitions(results, out)  # after each run, so that the file is complete even if the next run fails
     return results
 
 
@@ -216,7 +216,7 @@ class _Run:
         )
 
     def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
-        """The graph of every simulated robot: its source's, or else the one at the other end of the link."""
+        """The graph of every simulated robot: that of its source, or else the graph at the other end of the link."""
         ids = range(1, self.scenario.sim.robots + 1)
         robots = dict.fromkeys(ids, self.directions[0].output)
         for way in self.directions:
@@ -290,7 +290,7 @@ class _Run:
         return Outcome(result, trace)
 
     def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
-        """How late the computer was; None where the link waits for it."""
+        """How late the computer was; None where the link waits for the computer."""
         if self.scenario.time == "unthrottled":
             return None
         parts: dict[str, list[Lateness]] = {"threads": [self.pulse.lateness], "gate": [], "modem": []}
@@ -302,7 +302,8 @@ class _Run:
         return lateness_result(parts, begin, end, trace)
 
     def _wait_matched(self) -> None:
-        """Wait until every end of both graphs has found the other, so that no message goes unheard."""
+        """Wait until all publishers and subscribers of both graphs have found each other, so that no message is
+        missed."""
         limit = time.monotonic() + _MATCH_S
         while time.monotonic() < limit:
             heard = self.listener is None or self.listener.matched()
@@ -331,7 +332,8 @@ class _Run:
         return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        """Let the link deliver what it holds, for at most ``drain_s`` without news where it runs unthrottled."""
+        """Let the link deliver what it holds, for at most ``drain_s``. With time unthrottled, each further message
+        restarts that time."""
         limit = time.monotonic() + self.scenario.drain_s
         before = (0, 0)
         while time.monotonic() < limit and self.recorder.ledger.unresolved():
@@ -352,7 +354,7 @@ class _Run:
             self.progress_guard(on_progress, now)
 
     def _incomplete(self) -> list[str]:
-        """What observers and the bag of delivered messages missed; the bag is closed for that."""
+        """What observers and the bag of delivered messages missed. The bag is closed first."""
         if self.listener is None:
             return self.run_observers.told()
         self.listener.close()

@@ -1,9 +1,9 @@
 """Scenarios: one experiment as one YAML file, with single settings replaced on the command line.
 
-Invariants: what both ends of the link must agree on (`registry`, `packet_len`) stands once, at the top level, and all
-ends follow it; `source` names where messages come from, `ros_source` and `ros_sink` configure the two blocks; a two-way
-scenario is two one-way ones between the same two graphs; `dump` gives a mapping from which `scenario_from` makes the
-same scenario again.
+Invariants: settings that must be equal at both ends of the link (`registry`, `packet_len`) are given once, at the top
+level, and apply to all ends; `source` names where messages come from, `ros_source` and `ros_sink` configure the two
+blocks; a two-way scenario is two one-way scenarios between the same two graphs; `dump` gives a mapping from which
+`scenario_from` makes the same scenario again.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from gr_ros2.sim.settings import SimSettings
 _GRAPH_KEYS = ("middleware", "domain_id")
 """Settings of a block that say on which ROS graph it is."""
 _OWN_KEYS = ("namespace", "robot_id", "dst_id", *_GRAPH_KEYS)
-"""Settings of a block that belong to its robot: the way back does not take them over."""
+"""Settings of a block that belong to its robot. The way back does not take them over."""
 _BACK_SEED = 100_003
-"""From the seed of one direction's channel to the other's; no two repetitions of an experiment are so far apart."""
+"""Difference between the channel seeds of the two directions. It is larger than between any two repetitions."""
 
 
 Time = Literal["real", "unthrottled", "samples", "packets"]
@@ -130,7 +130,7 @@ class Scenario(Experiment, Traffic, AnyLink):
             )
 
     def directions(self) -> tuple[Scenario, ...]:
-        """The one-way scenarios this one is made of: itself, or the way there and the way back."""
+        """The one-way scenarios that this scenario consists of: itself, or the way there and the way back."""
         if self.back is None:
             return (self,)
         there = replace(self, back=None, reports=None, receivers=())
@@ -139,13 +139,13 @@ class Scenario(Experiment, Traffic, AnyLink):
 
     @property
     def simulated(self) -> bool:
-        """Whether its clock is simulated, so that a run takes as long as it takes to compute."""
+        """Whether its clock is simulated. A run then takes as long as its computation."""
         return self.time in ("samples", "packets")
 
     def load_registry(self) -> Registry:
-        """The registry both ends work with.
+        """The registry of both ends.
 
-        :raises RegistryError: file, line, what is wrong
+        :raises RegistryError: when the file is wrong; names file, line and problem
         :raises ConfigError: when a sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
         registry = Registry.from_csv(self.registry)
@@ -163,8 +163,8 @@ def dump(scenario: Scenario) -> dict[str, Any]:
 def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
     """Make a scenario from a mapping.
 
-    :param where: what to call the mapping in errors, for instance its file name
-    :raises ConfigError: for an unknown key, a value out of range, or ends that disagree; names it
+    :param where: name of the mapping in errors, for instance its file name
+    :raises ConfigError: for an unknown key, a value out of range, or ends that disagree; names the key
     """
     values = dict(values)
     prefix = f"{where}: " if where else ""
@@ -186,7 +186,7 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
 
 
 def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of ``back``, with what it does not set taken over from the way there."""
+    """The settings of ``back``. Settings that it does not have are taken over from the way there."""
     back = dict(values["back"])
     parts = {part: values.get(part, {}) for part in (*ENDS, "channel")}
     if not all(isinstance(part, Mapping) for part in (*parts.values(), *(back.get(name, {}) for name in parts))):
@@ -200,7 +200,7 @@ def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _another(channel: Mapping[str, Any], given: Any, place: int) -> Any:
-    """A further channel: what is not set is as in the first, but for the seed."""
+    """A further channel. Settings that are not given are as in the first channel, except for the seed."""
     if not isinstance(given, Mapping):
         return given  # build() says what is wrong with it
     seed = channel.get("seed", 0)
@@ -213,7 +213,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
 
     :param name_or_path: name of a built-in scenario, otherwise the path of a file
     :param overrides: `key=value` with dotted keys and YAML values (`phy.sample_rate=2e5`), in this order
-    :param settings: top-level settings that win over all others; None leaves one as it is
+    :param settings: top-level settings that override all others; None leaves a setting as it is
     :raises ConfigError: when there is no such scenario, or a setting is wrong
     """
     path = BUILTIN_DIR / f"{name_or_path}.yaml"

@@ -1,11 +1,13 @@
-"""A scenario without threads and waiting: both ends of its link on a clock that jumps from event to event.
+"""Discrete-event simulation of a scenario, without threads and waiting: the clock jumps from event to event.
 
-An event loop (:class:`EventLoop`) over the ends and the directions between them (:class:`LinkDirection`): an end is
-asked for packets when it may have one, a packet is on the air for its airtime, and what lands is given to the other
-end, which it may move to send. What the computer takes (middleware, Python, signal processing) is one constant,
-``overhead_s``, 0 unless given. Invariants: the same scenario gives the same numbers; the packets of a direction go one
-after the other, each for its airtime, so no message completes before all its packets have been on the air; everything
-is told in the order of time.
+An event loop (:class:`EventLoop`) serves both ends of the link and the directions between them
+(:class:`LinkDirection`). It asks an end for packets when the end may have one. A packet is on the air for its airtime.
+Then the other end receives it and may send in response. The time that the computer takes (middleware, Python, signal
+processing) is one constant, ``overhead_s``, 0 by default.
+
+Invariants: the same scenario gives the same numbers; the packets of a direction are sent one after the other, each for
+its airtime, so no message is complete before all its packets have been on the air; events are reported in the order of
+time.
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ from gr_ros2.sim.settings import SimSettings
 from gr_ros2.wire import BROADCAST
 
 _LONGEST_GAP_S = 30 * 86400.0
-"""s between two neighbouring messages of a recording. A longer one is a stamp that was never set, and the link would be
-computed over all of it: 30 years where the first stamp is 0."""
+"""s between two consecutive messages of a recording. A longer gap means that a stamp was never set. The link would be
+simulated for all of the gap: decades where the first stamp is 0."""
 _REMEMBERED_S = 60.0
-"""Of two robots with all their topics that is 5 MB."""
+"""Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,22 +59,22 @@ class Offered:
 
 @dataclass(frozen=True, slots=True)
 class AirtimeEnded:
-    """A packet whose airtime is over, and whose fate is decided later."""
+    """A packet whose airtime is over. Whether it arrives is decided later."""
 
     data: bytes
 
 
 TimedEvent = tuple[float, "LinkDirection | Branch", SenderEvent | ReceiverEvent | AirtimeEnded]
-"""When, s after the start; in which direction, or at which further receiver; and what."""
+"""Time of the event, s after the start; its direction or further receiver; and the event itself."""
 Airtime = Callable[[int | None], float]
-"""s that a packet of so many bytes is on the air; of None: the longest."""
+"""s that a packet of this many bytes is on the air; None stands for the longest packet."""
 Medium = Callable[[bytes, float], Iterable[bytes]]
-"""What becomes of a packet whose airtime is over now: what comes out of the receiver."""
+"""From a packet whose airtime is over, and the time now, to the packets that come out of the receiver."""
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What came out.
+    """The result of a simulation.
 
     :param duration_s: s during which messages were offered
     :param airtime_s: of the longest packet, s; 0 for a PHY without samples
@@ -90,8 +92,8 @@ class Simulated:
 def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
     """What the scenario's source gives to the link, in time order.
 
-    :raises ConfigError: for a recording played as fast as the link takes it, which has no times
-    :raises BagError: for one whose times leap by more than 30 days
+    :raises ConfigError: for a recording played as fast as the link takes it, because its messages have no times
+    :raises BagError: for a recording whose times jump by more than 30 days
     """
     if scenario.bag_path is None:
         names = source_names(scenario, registry)
@@ -118,7 +120,7 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
 
 
 def _simulated(settings: SimSettings, duration_s: float, topics: frozenset[str]) -> Iterable[SimMessage]:
-    """The simulator's messages; those of short runs are remembered, since a sweep wants them again and again."""
+    """The simulator's messages. Those of short runs are cached, because a sweep needs them many times."""
     if duration_s <= _REMEMBERED_S:
         return _remembered(settings, duration_s, topics)
     return Fleet(settings).messages(duration_s, topics=topics)
@@ -138,11 +140,11 @@ def simulate(
     on_packet: Callable[[SentPacket], None] | None = None,
     overhead_s: float = 0.0,
 ) -> Simulated:
-    """Run a scenario on its link's engines. Of the channel, what loses whole packets takes part.
+    """Run a scenario on its link's engines. Only those settings of the channel that lose whole packets have an effect.
 
     :param phy: None makes the scenario's
     :param messages: in time order; None takes the scenario's source
-    :param codec: of both ends; None makes it where ``compression`` is on
+    :param codec: of both ends; None makes one where ``compression`` is on
     :param on_packet: called with every packet that leaves the source
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
@@ -175,7 +177,7 @@ def simulate(
 
 
 def tell(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:
-    """Let an observer hear of what happened."""
+    """Pass an event on to an observer."""
     now, way, event = timed_event
     if isinstance(event, SenderEvent):
         observer.sender_event(way.src_id, event)
@@ -185,7 +187,11 @@ def tell(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.
 
 @dataclass(frozen=True)
 class End:
-    """One robot's end, what its sending half has done and nobody has heard of yet, and its id, -1 for none."""
+    """One robot's end of the link.
+
+    :param told: events of its sending half that have not been reported yet
+    :param src_id: -1 for none
+    """
 
     endpoint: Endpoint
     told: list[SenderEvent]
@@ -195,10 +201,10 @@ class End:
 def make_ends(
     ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None, *, any_length: bool = False
 ) -> list[End]:
-    """The ends of a link: the first sends, the others hear it; where there are two ways, the second sends too.
+    """The ends of a link. The first sends and the others receive; with two directions, the second sends too.
 
     :param ways: one scenario per direction
-    :param codec: of all messages; None makes it where ``compression`` is on
+    :param codec: of all messages; None makes one where ``compression`` is on
     :param any_length: whether the PHY carries shorter packets in less time
     """
     there, back = ways[0], ways[1] if len(ways) > 1 else None
@@ -216,7 +222,7 @@ def make_ends(
 
 
 def _free_id(taken: int, number: int) -> int:
-    """A source id of a receiver that has none of its own and reports."""
+    """A source id for a receiver that reports and has no id of its own."""
     return BROADCAST - 1 - number - (BROADCAST - 1 - number <= taken)
 
 
@@ -233,10 +239,10 @@ def _end(
 
 
 class Branch:
-    """A further end that hears a way.
+    """A further end that receives the packets of a direction.
 
-    :param air: what becomes of packets on the way to it
-    :param number: among those that hear the same sender, from 1
+    :param air: decides what arrives at this end
+    :param number: of this end among the further receivers of the same sender, from 1
     """
 
     def __init__(self, way: LinkDirection, receiver: End, air: Medium, number: int) -> None:
@@ -246,19 +252,20 @@ class Branch:
         self.number = number
 
     def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
-        """A packet comes out of its receiver."""
+        """Give the end a packet that has arrived there."""
         for event in self.receiver.endpoint.receive(data, now):
             yield now, self, event
 
 
 class LinkDirection:
-    """One direction of a link: what is offered to the end that sends, its turn on the air, and the end that hears it.
+    """One direction of a link: the messages offered to the sending end, the airtime of its packets, and the receiving
+    end.
 
     :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without samples
     :param messages: in the order of time
     :param src_id: of the end that sends; None: the scenario's source
     :param delay_s: s from the end of a packet's airtime to its arrival
-    :raises ConfigError: for time ``unthrottled``, which has no times
+    :raises ConfigError: for time ``unthrottled``, in which messages have no times
     """
 
     def __init__(
@@ -280,17 +287,17 @@ class LinkDirection:
         self.number = 0
         self.src_id = scenario.ros_source.src_id() if src_id is None else src_id
         self.branches: list[Branch] = []
-        """Who else hears it; only where ``air`` is set."""
+        """The further receivers. They are used only where ``air`` is set."""
         self.over = False
-        """Whether it is over, as far as this end can tell: one that answers may yet have something to say."""
+        """Whether this direction has nothing more to send, as far as is known: an end that answers may send later."""
         self.air: Medium | None = None
-        """What becomes of packets; None leaves that to who hears of them (:class:`AirtimeEnded`)."""
+        """Decides which packets arrive. None: the caller of the loop decides, for each :class:`AirtimeEnded`."""
         self.due = 0.0
-        """s, when something may happen next; infinite when it is over."""
+        """s, time at which something may happen next; infinite when the direction is over."""
         self.end = 0.0
-        """s, when something happened last."""
+        """s, time at which something last happened."""
         self.duration_s = scenario.duration_s
-        """s during which messages were offered; where the scenario leaves that to its bag, known at the end."""
+        """s during which messages were offered. Where the length of the bag decides this, it is known at the end."""
         self._messages = messages
         self._coming = next(messages, None)
         self._airtime = airtime
@@ -318,12 +325,12 @@ class LinkDirection:
         self.due = self._next(now)
 
     def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
-        """A packet comes out of the receiver."""
+        """Give the receiving end a packet that has arrived there."""
         for event in self.receiver.endpoint.receive(data, now):
             yield now, self, event
 
     def wake(self, now: float) -> None:
-        """The sending end has been called: it may have something earlier than it said."""
+        """Look again at when the sending end has a packet. It has just received something and may send earlier."""
         at = self.sender.endpoint.next_departure()
         if at is not None and (self.due < inf or self.sender.endpoint.answers):
             self.due = min(self.due, max(now, at))
@@ -370,7 +377,7 @@ class LinkDirection:
         self.sender.told.clear()
 
     def _next(self, now: float) -> float:
-        """When something may happen next; infinite when all is done, or the time to drain is over."""
+        """Time at which something may happen next; infinite when all is done, or the time to drain is over."""
         coming = self._coming
         answers = self.sender.endpoint.answers
         done = coming is None and now >= self.duration_s and self.empty
@@ -382,7 +389,7 @@ class LinkDirection:
         times = (None if coming is None else coming.t, clock, delayed, self.sender.endpoint.next_departure())
         soonest = min((at for at in times if at is not None), default=inf)
         if soonest == inf and now < self.duration_s:
-            soonest = self.duration_s  # nothing more to come before the end of the run
+            soonest = self.duration_s  # nothing more happens before the end of the run
         soonest = max(now, soonest)
         self.over = done or (coming is None and soonest > self.duration_s + self._drain)
         return inf if self.over and not answers else soonest
@@ -391,9 +398,9 @@ class LinkDirection:
 def report_ways(
     scenario: Scenario, ends: Sequence[End], airtime: Airtime, airs: Sequence[Medium]
 ) -> list[LinkDirection]:
-    """The ways by which receivers report to the one that they hear.
+    """The directions on which receivers report to their sender.
 
-    :param ends: it, and the receivers
+    :param ends: the sender, and then its receivers
     :param airs: one per receiver
     """
     delay_s = 0.0 if scenario.reports is None else scenario.reports.delay_s
@@ -408,7 +415,7 @@ def report_ways(
 class EventLoop:
     """The directions of one link on one clock.
 
-    :param ways: each with the ends that it joins
+    :param ways: the directions, each with its two ends
     """
 
     def __init__(self, ways: Sequence[LinkDirection]) -> None:
@@ -416,7 +423,8 @@ class EventLoop:
         self.now = -inf
 
     def run(self) -> Iterator[TimedEvent]:
-        """Everything that happens, in the order of time, until nothing is left or the time to drain is over. Once."""
+        """Everything that happens, in the order of time, until nothing is left or the time to drain is over. To be
+        called only once."""
         while not all(way.over for way in self._ways) and (due := min(way.due for way in self._ways)) < inf:
             self.now = min([due, *self._timers()])
             yield from self._expire()
@@ -425,7 +433,7 @@ class EventLoop:
                     yield from self._heard(way.step(self.now))
 
     def _timers(self) -> Iterator[float]:
-        """When an end that hears of its packets at once has something to do, other than to send."""
+        """When the ends that receive their packets immediately have something to do other than to send."""
         for ear in self._ears():
             at = ear.receiver.endpoint.next_timeout()
             yield inf if at is None or at <= self.now else at
@@ -445,7 +453,7 @@ class EventLoop:
         return endpoint.handle_timeout(self.now) if at is not None and at <= self.now else []
 
     def _heard(self, timed_events: Iterable[TimedEvent]) -> Iterator[TimedEvent]:
-        """Let an end that has heard something send."""
+        """Pass the events on, and let an end that has received something send."""
         for timed_event in timed_events:
             yield timed_event
             _, way, event = timed_event

@@ -1,9 +1,9 @@
 """Runs one scenario on simulated time: no ROS graph, no waiting, and the same numbers each time.
 
-Invariants: equal scenarios give equal results, but for ``wall_s``; with ``time: samples`` every packet goes through the
-scenario's own transmitter, channel and receiver, with ``time: packets`` it is lost as these were measured to lose
-(:mod:`gr_ros2.run.loss_table`); either way it comes out when its last sample was on the air. Idle air makes no
-samples, as in a run in real time, so neither noise nor fading moves on in it.
+Invariants: equal scenarios give equal results, except for ``wall_s``; with ``time: samples`` every packet goes through
+the scenario's own transmitter, channel and receiver; with ``time: packets`` packets are lost with the probability that
+was measured for them (:mod:`gr_ros2.run.loss_table`); in both cases a packet arrives when its last sample has been on
+the air. While nothing is sent there are no samples, as in a run in real time, so noise and fading do not advance.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ def run_simulated(
 
     :param out: folder for the bag of delivered messages, made if missing; None writes none
     :param on_progress: called about 20 times a second
-    :param run_observers: hear everything; there is no flowgraph for them to act on
+    :param run_observers: receive all events; there is no flowgraph that they could change
     :param registry: None takes the scenario's
-    :param bag: where delivered messages go instead
+    :param bag: receives the delivered messages instead of a bag in ``out``
     :raises ConfigError: when the scenario cannot be set up
-    :raises RunError: when it fails under way
+    :raises RunError: when it fails while it runs
     """
     began = time.monotonic()
     registry = registry or scenario.load_registry()
@@ -150,7 +150,7 @@ class _EventClock:
 class _PendingPacket:
     """A packet whose samples have been on the air.
 
-    :param arrived: what came out of the receiver; None while that is not known
+    :param arrived: the packets that came out of the receiver; None while they are not known
     """
 
     data: bytes
@@ -158,7 +158,7 @@ class _PendingPacket:
 
 
 class _Air:
-    """What a channel does to packets, one by one, for ends whose next packet depends on it."""
+    """A channel that passes packets one by one, for ends whose next packet depends on what arrived."""
 
     def __init__(self, scenario: Scenario, phy: Phy, channel: ChannelConfig) -> None:
         self._losses = PduLosses(channel)
@@ -172,7 +172,7 @@ class _Air:
             self._measured = PduLosses(packet_losses(phy, channel))
 
     def pass_one(self, data: bytes, now: float) -> Iterator[bytes]:
-        """What comes of a packet."""
+        """The packets that arrive after one packet was sent."""
         if self._measured is not None:
             arrived = [data] if self._measured.passes(now) else []
         else:
@@ -182,9 +182,9 @@ class _Air:
 
 
 class _Direction:
-    """One direction, and what the air does to its packets.
+    """One direction of the link, and the channel for its packets.
 
-    :param ends: the one that sends, and the one that hears it
+    :param ends: the end that sends, and the end that receives
     """
 
     def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
@@ -206,7 +206,7 @@ class _Direction:
             self.way.air = lambda data, now: [data] if measured.passes(now) and self._losses.passes(now) else ()
 
     def land(self, data: bytes) -> _PendingPacket:
-        """A packet's samples have been on the air; its fate is known when its batch is full."""
+        """Take a packet whose samples have been on the air. Whether it arrives is known when its batch is full."""
         pending = _PendingPacket(data)
         self._pending.append(pending)
         if self._batches_through is not None and len(self._pending) == self._batches_through.batch:
@@ -214,7 +214,7 @@ class _Direction:
         return pending
 
     def decide(self) -> None:
-        """Let what has landed pass through the flowgraph."""
+        """Send the packets of the current batch through the flowgraph."""
         if self._batches_through is None or not self._pending:
             return
         arrived: list[list[bytes]] = [[] for _ in self._pending]
@@ -226,13 +226,13 @@ class _Direction:
         self._pending.clear()
 
     def arrive(self, pending: _PendingPacket, now: float) -> Iterator[TimedEvent]:
-        """What the flowgraph made of a packet, less what is lost by setting."""
+        """What came out of the flowgraph for a packet, without the packets that a setting of the channel drops."""
         for data in pending.arrived or ():
             if self._losses.passes(now):
                 yield from self.way.arrive(data, now)
 
     def counters(self) -> dict[str, Any]:
-        """What each part counted; ``channel``: packets lost in the PHY, and on purpose by setting."""
+        """What each part counted. ``channel``: packets lost in the PHY, and packets dropped by each setting."""
         sent, got = self.way.sender.endpoint.sent, self.way.receiver.endpoint.received
         return {
             "source": {
@@ -261,7 +261,7 @@ class _Direction:
         }
 
     def _packet_by_packet(self, data: bytes, now: float) -> Iterator[bytes]:
-        """For ends that answer: what comes next depends on whether this one arrives."""
+        """For ends that answer: their next packet depends on whether this one arrives."""
         pending = self.land(data)
         self.decide()
         yield from (packet for packet in pending.arrived or () if self._losses.passes(now))
@@ -281,7 +281,7 @@ def _recorder(
 
 
 def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End]) -> list[LinkDirection]:
-    """Let the further receivers hear the first way, and return those by which receivers report."""
+    """Connect the further receivers to the first direction, and return the directions on which receivers report."""
     first.way.branches = [
         Branch(first.way, end, _Air(scenario, phy, channel).pass_one, number)
         for number, (end, channel) in enumerate(zip(ends[2:], scenario.receivers, strict=False), 1)
@@ -294,8 +294,8 @@ def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End
 
 
 def _all_events(loop: EventLoop, directions: Sequence[_Direction]) -> Iterator[TimedEvent]:
-    """Everything that happens. Packets go through the flowgraph many at a time where no end answers; until the fate of
-    one is known, what comes behind it waits."""
+    """Everything that happens. If no end answers, packets go through the flowgraph in batches. Events after a packet
+    wait until it is known whether the packet arrives."""
     of = {id(direction.way): direction for direction in directions}
     held: deque[tuple[TimedEvent, _PendingPacket | None]] = deque()
 

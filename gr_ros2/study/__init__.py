@@ -1,1 +1,1 @@
-"""Questions that take many runs: sweeps, ablation, and a forecast before the first."""
+"""Studies that need many runs: sweeps and ablation. Also a forecast before the first run."""

@@ -1,8 +1,8 @@
-"""What each part of a link is worth: a scenario as it is, and again with one part switched off at a time.
+"""Ablation: measures the effect of each part of a link. A scenario runs as it is, and then without one part at a time.
 
-Invariants: a variant differs from the scenario in the settings of one part and in nothing else, so the same messages
-meet the same radio; a part that is off in the scenario has no variant; the settings are those that `--set` takes, so
-any variant can be run by hand.
+Invariants: a variant differs from the scenario in the settings of one part and in nothing else, so the messages and the
+radio are the same; a part that is off in the scenario has no variant; the settings are those that `--set` takes, so any
+variant can be run by hand.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
 
 WHOLE = "whole"
-"""Folder, and name in tables, of the scenario as it is."""
+"""Name of the unchanged scenario, for its folder and in tables."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The scenario with one part off.
+    """The scenario with one part switched off.
 
     :param name: folder, and name in tables
     :param settings: `key=value`, as `--set` takes them
@@ -36,9 +36,9 @@ class Variant:
 
 
 def variants(scenario: Scenario) -> list[Variant]:
-    """The scenario itself, then without each part that it has.
+    """The scenario itself, and then one variant without each part that it uses.
 
-    :raises ConfigError: for a scenario that has none of them on
+    :raises ConfigError: for a scenario in which all of these parts are off
     """
     source = scenario.ros_source
     found = [Variant(WHOLE)]
@@ -71,11 +71,11 @@ def run_variants(
     """Run a scenario and its variants one after the other, each into its own folder.
 
     :param name: as `load_scenario` takes it, likewise ``overrides``, ``seed`` and ``duration_s``
-    :param out: folder of the folders
+    :param out: folder in which each run has its folder
     :param on_run: called before each run
     :raises ConfigError: when a scenario cannot be set up, or has nothing to switch off
     :raises RunError: when a run fails
-    :raises KeyboardInterrupt: when one is interrupted; what ran before stays
+    :raises KeyboardInterrupt: when a run is interrupted; the results of earlier runs are kept
     """
     chosen = variants(load_scenario(name, overrides, seed=seed, duration_s=duration_s))
     for variant in chosen:
@@ -88,7 +88,8 @@ def run_variants(
 
 
 def worth_grid(runs: Sequence[Run]) -> Grid:
-    """Per topic what reaches the far end and how old it is there, a column per run; at last what a message costs."""
+    """Delivery and age of each topic, with a column per run. The last line is the number of bytes on the air per
+    message."""
     sections = []
     for index, topic in enumerate(runs[0].result.topics):
         found = [(run.result, run.result.topics[index]) for run in runs]
@@ -106,7 +107,7 @@ def worth_grid(runs: Sequence[Run]) -> Grid:
 
 
 def air_bytes(result: Result) -> float | None:
-    """Packet bytes that left the source, PAD and headers included, per message delivered; None without any."""
+    """Packet bytes that left the source, PAD and headers included, per message delivered; None if none was."""
     delivered = sum(topic.delivered for topic in result.topics)
     packet_len: int = result.config["packet_len"]
     return result.packets["sent"] * packet_len / delivered if delivered else None

@@ -1,8 +1,8 @@
-"""Does this traffic fit this radio? A forecast from a simulation of the link, and what would make it better.
+"""Does this traffic fit this radio? A forecast from a simulation of the link, and changes that would improve it.
 
-Invariants: a forecast is a simulation of the very scenario, never a formula; airtime of a packet is divided among its
-entries by their bytes, so the shares of the topics add up to the airtime used; advice comes with the forecast it is
-based on.
+Invariants: a forecast is a simulation of the same scenario, never a formula; the airtime of a packet is divided among
+its entries in proportion to their bytes, so the shares of the topics add up to the airtime used; each advice contains
+the forecast it is based on.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ TRIAL_S = 10.0
 OVERHEAD_S = 0.0025
 """s that middleware, Python and the OFDM receiver add to the airtime of a message, as measured on two idle cores."""
 _WALL_S = 1.7e9
-"""s since 1970, of some day: a plan is the same on every day."""
+"""s since 1970. A fixed time, so that a plan is the same on every day."""
 _MARGIN = 1.5
-"""A proposed ``reassembly_timeout_s`` beside the longest pause: what a lost packet and a busy computer add."""
+"""Ratio of a proposed ``reassembly_timeout_s`` to the longest pause: a lost packet and a busy computer add time."""
 _PARTS = (1, 2, 3)
-"""Packets per message that packet lengths are tried for."""
+"""Numbers of packets per message for which packet lengths are tried."""
 _YOUNGER = 0.97
-"""Age of a topic beside what it is now, from which it counts as younger; its inverse, as older."""
+"""A topic counts as younger if the ratio of its new age to its age now is below this, and as older above the
+inverse."""
 _NOTICED_S, _NOTICED_PDR = 0.001, 0.03
-"""Differences of an age and of the share delivered below which a topic is held to be as before."""
+"""Differences of the age and of the share delivered up to which a topic counts as unchanged."""
 _LIGHTER = 0.95
-"""Airtime used beside what it is now, from which a change is worth proposing that makes nothing worse."""
+"""A change that makes nothing worse is proposed if the ratio of the new airtime used to that used now is below this."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,9 @@ class TopicForecast:
     :param offered_hz: messages/s given to the source
     :param message_bytes: mean, serialized
     :param air_bytes: mean per message on the air, coded where the link compresses, without headers
-    :param load: airtime that all of its messages would take at what those sent have cost, 1 = all there is
-    :param share: airtime of what left the source, likewise; unpaced, more may leave than the air takes
+    :param load: part of the airtime that all its messages would take, at the mean cost of those sent; 1 = all airtime
+    :param share: part of the airtime of the packets that left the source; above 1 is possible where the source is not
+        paced
     :param rate_hz: messages/s delivered
     """
 
@@ -68,14 +70,15 @@ class TopicForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a scenario will do.
+    """The predicted behaviour of a scenario.
 
     :param airtime_s: of one packet
     :param capacity: packets/s the radio carries
     :param used: part of the airtime that is used, 0..1
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
     :param pad: part of the packets' bytes that is PAD
-    :param pause_s: s that may lie between two fragments of a message while others go first; 0 where each has only one
+    :param pause_s: s that may pass between two fragments of a message while other messages are sent; 0 where every
+        message has only one fragment
     """
 
     packet_len: int
@@ -87,22 +90,22 @@ class Forecast:
     pause_s: float
     topics: tuple[TopicForecast, ...]
     air: Mapping[str, float] = field(default_factory=dict)
-    """Packets per message sent, by what they are spent on: new messages, repair, reports, hellos; version 0 does not
-    tell."""
+    """Packets per message sent, by their purpose: new messages, repair, reports, hellos. Version 0 does not
+    distinguish them."""
 
     @property
     def load(self) -> float:
-        """Airtime that all messages would take, 1 = all there is; above 1 they do not fit."""
+        """Part of the airtime that all messages would take; 1 = all airtime, above 1 they do not fit."""
         return sum(topic.load for topic in self.topics)
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of settings does to one topic.
+    """The effect of a change of settings on one topic.
 
     :param weight: of the topic, as it is configured
-    :param age_s: now, and with the change: mean age, s; of a topic that sends once, its latency. What never arrives
-        counts ``TRIAL_S``
+    :param age_s: now, and with the change: mean age, s, or the latency of a topic that sends once. A topic that never
+        arrives counts as ``TRIAL_S``
     :param pdr: now, and with the change: share of its messages that arrive, 0..1
     """
 
@@ -113,30 +116,30 @@ class Effect:
 
     @property
     def younger(self) -> bool:
-        """Whether what arrives is fresher, by so much that it is noticed."""
+        """Whether the age decreases by more than the thresholds."""
         before, after = self.age_s
         return after < _YOUNGER * before and before - after > _NOTICED_S
 
     @property
     def older(self) -> bool:
-        """Whether it is staler, likewise."""
+        """Whether the age increases by more than the thresholds."""
         before, after = self.age_s
         return before < _YOUNGER * after and after - before > _NOTICED_S
 
     @property
     def fewer(self) -> bool:
-        """Whether less of it arrives."""
+        """Whether the share of messages that arrive decreases."""
         return self.pdr[0] - self.pdr[1] > _NOTICED_PDR
 
     @property
     def more(self) -> bool:
-        """Whether more of it arrives."""
+        """Whether the share of messages that arrive increases."""
         return self.pdr[1] - self.pdr[0] > _NOTICED_PDR
 
 
 @dataclass(frozen=True)
 class Advice:
-    """A change of settings, as one would write it, and what it would bring.
+    """A change of settings, as on the command line, and its effects.
 
     :param setting: one or more ``key=value``, with spaces between them
     :param forecast: with the change
@@ -151,20 +154,21 @@ class Advice:
 
     @property
     def harmless(self) -> bool:
-        """Whether no topic gets older or arrives less."""
+        """Whether no topic becomes older and no topic loses more messages."""
         return not any(effect.older or effect.fewer for effect in self.effects)
 
     @property
     def gain(self) -> float:
-        """How much younger the topics get: weighted mean of the logarithms of the ratios of their ages; 0 = not."""
+        """How much younger the topics become: weighted mean of the logarithms of the ratios of their ages; 0 = no
+        change."""
         weight = sum(effect.weight for effect in self.effects)
         gains = [effect.weight * np.log(effect.age_s[0] / effect.age_s[1]) for effect in self.effects]
         return float(sum(gains) / weight) if weight else 0.0
 
     @property
     def worth_it(self) -> bool:
-        """Whether it is to be proposed: topics get younger in the mean, and those that do weigh more than those that
-        get older; or airtime is saved and nothing gets worse."""
+        """Whether to propose the change. Either topics become younger on average, and the younger ones have more
+        weight than the older ones; or the change saves airtime and makes nothing worse."""
         younger = sum(effect.weight for effect in self.effects if effect.younger)
         older = sum(effect.weight for effect in self.effects if effect.older)
         if younger > older and self.gain > -np.log(_YOUNGER):
@@ -173,7 +177,7 @@ class Advice:
 
 
 class Planner:
-    """Forecasts for one scenario and variants of it, on the same messages.
+    """Forecasts for one scenario and variants of it, with the same messages.
 
     :raises ConfigError: for a PHY that takes no airtime, or a scenario that cannot be set up
     """
@@ -182,7 +186,7 @@ class Planner:
         if not PHY.load(scenario.phy.name).has_samples:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
         if not scenario.simulated:
-            # Robots then stamp with the wall clock, whose large numbers take a byte more where messages are coded.
+            # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
         self.scenario = scenario
         self.registry = scenario.load_registry()
@@ -197,17 +201,18 @@ class Planner:
         return self._forecast(self.scenario)
 
     def reassembly_timeout_s(self, forecast: Forecast) -> float | None:
-        """The sink's ``reassembly_timeout_s`` that this traffic needs, s, where the configured one is too short for
-        messages of several fragments to wait for their turns; None where it is not."""
+        """The sink's ``reassembly_timeout_s`` that this traffic needs, s. None where the configured one is long enough
+        for messages of several fragments, which wait between their fragments."""
         if self.scenario.ros_sink.reassembly_timeout_s > forecast.pause_s:
             return None
         return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
 
     def advice(self) -> list[Advice]:
-        """Single changes that make topics younger or the link freer; first those that make no topic worse, the best
-        first.
+        """Single changes that make topics younger or save airtime. Changes that make no topic worse come first; within
+        each group the best comes first.
 
-        Each is tried on the first seconds of the traffic, and so is what it is compared with.
+        Each change is tried on the first seconds of the traffic, and compared with the present settings on the same
+        seconds.
         """
         base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
         now = self._forecast(base)
@@ -216,7 +221,7 @@ class Planner:
         return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.gain, advice.forecast.used))
 
     def _compared(self, setting: str, now: Forecast, then: Forecast) -> Advice:
-        """What a change brings, topic by topic."""
+        """The effect of a change on each topic."""
         registry = self.registry.with_options(self.scenario.ros_source.topic_options)
         weights = {
             name: registry[topic_id].options.weight for name, topic_id in source_names(self.scenario, registry).items()
@@ -256,7 +261,7 @@ class Planner:
             )
 
     def _packet_lens(self) -> list[int]:
-        """Packet lengths into which the messages of some topic fit whole, or in a few equal parts."""
+        """Packet lengths such that the messages of one of the topics fit into one packet, or into a few equal parts."""
         source = self.scenario.ros_source
         wire = source.wire_format
         sizes: dict[int, list[int]] = {}
@@ -348,7 +353,7 @@ class Planner:
 
 
 class _Remembering:
-    """A codec that codes each message once, however often it is tried."""
+    """A codec with a cache: it codes each message only once, for all forecasts."""
 
     def __init__(self, codec: MessageCodec) -> None:
         self._codec = codec
@@ -372,11 +377,11 @@ class _Remembering:
 
 
 def _turn(scenario: Scenario) -> int:
-    """Packets per topic until a topic that waits has its turn again."""
+    """Packets until a waiting topic has its turn again, divided by the number of topics."""
     return TURN if scenario.ros_source.scheduler == "freshness" else 1
 
 
 def _age(result: TopicResult) -> float:
-    """Mean age, s; of a topic that sends once, its latency; what never arrives counts TRIAL_S."""
+    """Mean age, s, or the latency of a topic that sends once. A topic that never arrives counts as TRIAL_S."""
     age = result.age_s.mean if result.sent > 1 else result.latency_s.max
     return TRIAL_S if age is None else max(age, _NOTICED_S)

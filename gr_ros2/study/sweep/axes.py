@@ -1,7 +1,7 @@
-"""Which swept key goes where in the figures, and the summaries sorted into panels, curves and fields.
+"""Assigns the swept keys to the axes of the figures, and sorts the summaries into panels, curves and fields.
 
-Invariants: summaries of different settings are never averaged: what is neither along an axis nor a curve has a panel of
-its own; an axis is numeric only where every value is a number.
+Invariants: summaries of different settings are never averaged; every combination of the keys that are not on an axis
+and not a curve has a panel of its own; an axis is numeric only where every value is a number.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NAMES = {
     "sim.odom_rate": "odometry [1/s]",
     "duration_s": "duration [s]",
 }
-"""How axes call keys that need a unit or are long; the others are called as they are."""
+"""Axis labels of keys that need a unit or are long. Other keys are their own labels."""
 
 _SNR = "channel.snr_db"
 Place = float | str | None
@@ -36,7 +36,10 @@ Place = float | str | None
 
 @dataclass(frozen=True)
 class Axes:
-    """:param y: None where there is nothing to make a heat map of"""
+    """The keys of the axes.
+
+    :param y: None where there is no second axis for a heat map
+    """
 
     x: str
     by: tuple[str, ...]
@@ -45,9 +48,9 @@ class Axes:
 
 @dataclass(frozen=True)
 class Panel:
-    """The summaries that share what no axis shows.
+    """Summaries with the same values of all keys that are not shown by an axis or a curve.
 
-    :param title: what they share; '' where that is nothing
+    :param title: these values; '' where there are none
     :param curves: name -> points (place, estimate) in the order of places
     """
 
@@ -56,7 +59,7 @@ class Panel:
 
 
 def choose_axes(plan: SweepPlan) -> Axes:
-    """The axes the sweep asks for, or those its keys suggest."""
+    """The axes that the sweep defines, or otherwise axes chosen from its keys."""
     sweep = plan.sweep
     keys = [key for key in plan.keys if len(places(plan, key)) > 1] or list(plan.keys[:1])
     numeric = [key for key in keys if _numeric(plan, key)]
@@ -75,7 +78,7 @@ def choose_axes(plan: SweepPlan) -> Axes:
 
 
 def curve_panels(plan: SweepPlan, axes: Axes, found: Sequence[Summary]) -> list[Panel]:
-    """One panel per combination of what is neither x nor by, one curve per combination of by."""
+    """One panel per combination of the keys that are neither x nor in by, and one curve per combination of by."""
     rest = [key for key in plan.keys if key != axes.x and key not in axes.by]
     panels: dict[Hashable, Panel] = {}
     for summary, estimate in _shown(plan, found):
@@ -93,7 +96,7 @@ def curve_panels(plan: SweepPlan, axes: Axes, found: Sequence[Summary]) -> list[
 def heat_panels(
     plan: SweepPlan, axes: Axes, found: Sequence[Summary]
 ) -> list[tuple[str, dict[tuple[Place, Place], float]]]:
-    """Per combination of what is neither x nor y its title, and (x, y) -> value."""
+    """For each combination of the keys that are neither x nor y: its title, and (x, y) -> value."""
     assert axes.y is not None
     rest = [key for key in plan.keys if key not in (axes.x, axes.y)]
     panels: dict[str, dict[tuple[Place, Place], float]] = {}
@@ -104,7 +107,7 @@ def heat_panels(
 
 
 def places(plan: SweepPlan, key: str) -> list[Place]:
-    """Every value of a key, numbers in ascending order, others as they come."""
+    """Every value of a key. Numbers are in ascending order, other values in the order of the cells."""
     found = list(dict.fromkeys(cell.values[key] for cell in plan.cells))
     return sorted(found) if all(_is_number(value) for value in found) else found
 
@@ -125,7 +128,7 @@ def _shown(plan: SweepPlan, found: Sequence[Summary]) -> list[tuple[Summary, Est
 
 
 def _title(plan: SweepPlan, cell: SweepCell, keys: Sequence[str]) -> str:
-    """What a cell has of some keys: texts as they are, other values with their key."""
+    """The values of some keys in a cell, as a title: texts as they are, other values with their key."""
     parts = []
     for key in keys:
         value = cell.values[key]

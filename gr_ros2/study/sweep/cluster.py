@@ -1,7 +1,8 @@
 """Runs on Dask: worker processes of this machine, or an existing cluster.
 
-Invariants: a run that ends in an error, or takes its process down with it, costs itself only; runs of a worker that is
-lost are given to another; Ctrl-C reaches this process and never the workers, who end because they are told to.
+Invariants: a run that ends in an error, or that crashes its process, does not affect other runs; runs of a worker that
+is lost are given to another worker; Ctrl-C reaches this process and never the workers, which end when this process
+tells them to.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from gr_ros2.settings_file import BUILTIN_DIR, find_registry
 from gr_ros2.study.sweep.store import without_registry
 
 RUNS_PER_PROCESS = 200
-"""A safeguard: of shared memory a system has 4096 segments, and flowgraphs that are over once kept theirs."""
+"""Runs after which a worker is replaced. A system has 4096 shared memory segments. This limit protects against
+flowgraphs that do not free theirs at their end, which has happened before."""
 
 _CONNECT_S = 15.0
 _WORKERS_S = 60.0
@@ -40,7 +42,7 @@ _WORKERS_S = 60.0
 
 @dataclass(frozen=True)
 class Failed:
-    """A run that gave no result, and why, in one line."""
+    """A run that gave no result, and the reason in one line."""
 
     reason: str
 
@@ -58,9 +60,9 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
-            # There is an HTTP server nevertheless; it is not to take the port a Dask dashboard is known by.
+            # Dask starts an HTTP server in any case. It must not take the default port of a Dask dashboard.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-            silence_logs=logging.CRITICAL,  # what goes wrong comes back as a result
+            silence_logs=logging.CRITICAL,  # errors are returned as results
         )
     try:
         yield cluster
@@ -70,17 +72,17 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
 
 @contextmanager
 def local_workers(processes: int) -> Iterator[Client]:
-    """As many processes of this machine."""
+    """A client of this many worker processes on this machine."""
     with local_cluster(processes) as cluster, Client(cluster) as client:
         yield client
 
 
 @contextmanager
 def remote_workers(address: str) -> Iterator[Client]:
-    """The workers of an existing cluster.
+    """A client of the workers of an existing cluster.
 
     :param address: of its scheduler, such as tcp://10.0.0.1:8786
-    :raises ConfigError: when none answers there, or a worker has not this gr-ros2
+    :raises ConfigError: when no scheduler answers there, or a worker does not have this version of gr-ros2
     """
     try:
         client = Client(address, timeout=_CONNECT_S)
@@ -95,12 +97,13 @@ def remote_workers(address: str) -> Iterator[Client]:
 
 
 def run_all(client: Client, scenarios: Mapping[str, Scenario]) -> Generator[tuple[str, Result | Failed]]:
-    """Run scenarios in any order; yields each as it ends. Those that are left when the caller stops are cancelled.
+    """Run scenarios in any order, and yield each result when its run ends. If the caller stops early, the remaining
+    runs are cancelled.
 
-    :param scenarios: by the key their result is called after
-    :raises RunError: when the cluster goes away
+    :param scenarios: by the key that is yielded with the result
+    :raises RunError: when the cluster is lost
     """
-    client.forward_logging("gr_ros2")  # what a worker has to say is said here
+    client.forward_logging("gr_ros2")  # log messages of workers appear in this process
     futures = {
         client.submit(run_one, _portable(scenario), __version__, key=f"gr-ros2-{key}", pure=False): key
         for key, scenario in scenarios.items()
@@ -108,7 +111,7 @@ def run_all(client: Client, scenarios: Mapping[str, Scenario]) -> Generator[tupl
     try:
         for future in as_completed(list(futures)):
             if future.status == "lost" and client.status == "running":
-                # The worker that had the result has gone, and another runs it again.
+                # The worker that had the result is lost, and another worker repeats the run.
                 with suppress(FuturesCancelledError):
                     wait(future)
             yield futures[future], _outcome(future)
@@ -119,7 +122,7 @@ def run_all(client: Client, scenarios: Mapping[str, Scenario]) -> Generator[tupl
 
 
 def run_one(values: Mapping[str, Any], version: str) -> Result | Failed:
-    """What a worker does: one run, by itself on the machine if it is in real time."""
+    """Execute one run in a worker. A run in real time has the machine for itself."""
     try:
         if version != __version__:
             raise ConfigError(f"a worker has gr-ros2 {__version__}, the sweep {version}; install the same")
@@ -135,7 +138,7 @@ _flowgraphs = count(1)
 
 
 def _make_room(scenario: Scenario) -> None:
-    """End a worker that has run many flowgraphs: Dask starts another in its place, and gives that the run."""
+    """End a worker that has run many flowgraphs. Dask then starts a new worker and gives it the run."""
     if scenario.time == "packets" or next(_flowgraphs) <= RUNS_PER_PROCESS:
         return
     with suppress(ValueError):  # not in a worker
@@ -144,7 +147,7 @@ def _make_room(scenario: Scenario) -> None:
 
 
 def _portable(scenario: Scenario) -> dict[str, Any]:
-    """A scenario for a machine on which gr-ros2 may lie elsewhere."""
+    """The settings of a scenario for a machine on which gr-ros2 may be installed in another folder."""
     path = Path(scenario.registry)
     return {**without_registry(dump(scenario)), "registry": path.name if path.parent == BUILTIN_DIR else str(path)}
 
@@ -183,7 +186,7 @@ def _check_workers(client: Client, address: str) -> None:
             return ""
         return gr_ros2.__version__
 
-    # A function inside a function travels as code, which a worker without gr_ros2 can run.
+    # A function inside a function is sent as code, so a worker without gr_ros2 can run it.
     for worker, version in client.run(version_there).items():
         if version != __version__:
             raise ConfigError(
@@ -194,8 +197,8 @@ def _check_workers(client: Client, address: str) -> None:
 
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Processes and threads started inside do not hear Ctrl-C, which a terminal sends to a whole group of processes."""
-    # multiprocessing lets signals through again when it starts its tracker, so that must be running.
+    """Processes and threads that are started inside ignore Ctrl-C. A terminal sends it to a whole process group."""
+    # multiprocessing unblocks signals when it starts its resource tracker, so the tracker must already run.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -206,11 +209,12 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def alone_on_this_machine(scenario: Scenario) -> Iterator[None]:
-    """Real time means the whole computer, and the scenario's DDS domains: such runs take turns."""
+    """Lock this machine for a run in real time. Such a run needs the whole computer and the scenario's DDS domains, so
+    only one of them runs at a time."""
     if scenario.simulated:
         yield
         return
     path = Path(tempfile.gettempdir()) / f"gr-ros2-{os.getuid()}.lock"
     with path.open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # given back when the file is closed, also by the end of the process
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed, also at the end of the process
         yield

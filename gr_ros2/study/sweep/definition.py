@@ -1,7 +1,8 @@
-"""A sweep as one YAML file, and the cells it asks for: which settings, how often, drawn over what.
+"""A sweep as one YAML file, and its cells: the settings, the number of repetitions, and the axes of the figures.
 
-Invariants: every cell is a scenario that :func:`gr_ros2.run.scenario.load_scenario` accepts with a PHY that can be
-built, and all are made before the first one runs; repetition n of every cell has the same seed, the scenario's plus n.
+Invariants: every cell is a scenario that :func:`gr_ros2.run.scenario.load_scenario` accepts, with a PHY that can be
+built; all cells are made before the first one runs; repetition n has the same seed in every cell, the scenario's plus
+n.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from gr_ros2.settings_file import BUILTIN_DIR as SCENARIO_DIR
 from gr_ros2.settings_file import find_registry
 
 BUILTIN_DIR = Path(__file__).resolve().parents[2] / "sweeps"
-"""Where the built-in sweeps lie."""
+"""Folder of the built-in sweeps."""
 
 PDR = "pdr"
 VALUES = {
@@ -43,10 +44,10 @@ VALUES = {
     "airtime_per_message_s": "airtime per message delivered [s]",
     "airtime_per_byte_s": "airtime per byte delivered [s]",
 }
-"""The numbers a figure can show, columns of the table, and how an axis calls them."""
+"""The numbers that a figure can show: column of the table -> label of an axis."""
 
 OF_THE_LINK = (PDR, "goodput_Bps", "airtime_per_message_s", "airtime_per_byte_s")
-"""Those that exist over all topics together."""
+"""The numbers that exist for all topics together."""
 
 Overrides = Mapping[str, Any]
 """Dotted key -> value, as on the command line after ``--set``."""
@@ -102,12 +103,12 @@ class Sweep(Experiment):
 
     @property
     def keys(self) -> Sequence[str]:
-        """The swept keys, those of the list first."""
+        """The swept keys. Those of the list come first."""
         return [*dict.fromkeys(key for entry in self.list for key in entry), *self.grid]
 
     @property
     def points(self) -> Sequence[Overrides]:
-        """The settings of each cell beside those of all."""
+        """The settings of each cell, without the settings that all cells share."""
         axes = [[(key, value) for value in values] for key, values in self.grid.items()]
         return [{**entry, **dict(point)} for entry in self.list or ({},) for point in product(*axes)]
 
@@ -117,9 +118,9 @@ class SweepCell:
     """One point of a sweep.
 
     :param number: from 1
-    :param point: what was asked for here
-    :param values: what every swept key is here, also where the point does not name it; numbers, truth values, texts or
-        None
+    :param point: the settings of this cell
+    :param values: the value of every swept key in this cell, also where the point does not name it; numbers, truth
+        values, texts or None
     :param runs: the scenario, once per repetition
     """
 
@@ -136,7 +137,7 @@ class SweepCell:
 
 @plain_dataclass(frozen=True)
 class SweepPlan:
-    """A sweep whose cells are known to be runnable.
+    """A sweep whose cells have been checked, so that they can run.
 
     :param name: of the file
     """
@@ -152,7 +153,7 @@ class SweepPlan:
 
     @property
     def real_time(self) -> bool:
-        """Whether a run of it needs a machine for itself."""
+        """Whether some of its runs are in real time and need the whole machine."""
         return any(not scenario.simulated for cell in self.cells for scenario in cell.runs)
 
 
@@ -160,7 +161,7 @@ def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Sweep
     """Read a built-in sweep or a YAML file and make all its cells.
 
     :param overrides: `key=value` for all cells, over the file's own ``set``
-    :raises ConfigError: when there is no such sweep or a setting is wrong; names cell and key
+    :raises ConfigError: when there is no such sweep or a setting is wrong; names the cell and the key
     """
     path, where = _path(name_or_path), str(name_or_path)
     sweep = read_sweep(name_or_path)
@@ -170,7 +171,7 @@ def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Sweep
 def read_sweep(name_or_path: str | Path) -> Sweep:
     """Read a built-in sweep or a YAML file, without making its cells.
 
-    :raises ConfigError: when there is no such sweep, or a key of it is unknown or wrong
+    :raises ConfigError: when there is no such sweep, or one of its keys is unknown or wrong
     """
     return build(Sweep, read_yaml(_path(name_or_path)), str(name_or_path))
 
@@ -200,7 +201,7 @@ def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> 
     builtin = (SCENARIO_DIR / f"{sweep.scenario}.yaml").is_file()
     name = sweep.scenario if builtin else folder / Path(sweep.scenario).expanduser()
     try:
-        load_scenario(name)  # what is wrong with the scenario itself is no cell's fault
+        load_scenario(name)  # an error in the scenario itself is reported without a cell
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     fixed = [f"time={sweep.time}", *_texts(sweep.set, folder), *overrides]
@@ -226,9 +227,9 @@ def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> 
 
 
 def _check(sweep: Sweep, scenario: Scenario, phys: dict[str, Phy]) -> None:
-    """Find out before the first run what a run would only find out when it begins.
+    """Find errors before the first run that would otherwise appear only when a run begins.
 
-    :param phys: those made for cells before, since the load that chooses a sample rate takes a while to find out
+    :param phys: PHYs made for earlier cells; they are reused because computing the load for a sample rate takes time
     """
     registry = scenario.load_registry()
     names: list[str] = []
@@ -245,13 +246,13 @@ def _check(sweep: Sweep, scenario: Scenario, phys: dict[str, Phy]) -> None:
 
 
 def _texts(point: Overrides, folder: Path) -> list[str]:
-    """Settings as the command line has them; a registry's path is seen from the sweep's file."""
+    """Settings in the form of the command line. A registry's path is relative to the sweep's file."""
     found = {**point, "registry": find_registry(str(point["registry"]), folder)} if "registry" in point else point
     return [f"{key}={_json(value)}" for key, value in found.items()]
 
 
 def _json(value: Any) -> str:
-    """A value as JSON, which is YAML too."""
+    """A value as JSON, which is also valid YAML."""
     return json.dumps(value, ensure_ascii=False, default=str)
 
 

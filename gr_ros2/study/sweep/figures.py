@@ -1,6 +1,6 @@
-"""The pictures of a sweep: curves with intervals, and a heat map. Returned, never written.
+"""The figures of a sweep: curves with intervals, and a heat map. The functions return figures and write no files.
 
-Invariant: as in :mod:`gr_ros2.report.figures`, nothing of matplotlib's global state is changed.
+Invariant: as in :mod:`gr_ros2.report.figures`, matplotlib's global state is not changed.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from gr_ros2.study.sweep.definition import PDR, VALUES, SweepPlan
 from gr_ros2.study.sweep.summaries import Summary
 
 MOST_PANELS = 12
-"""Panels in one figure; further ones are left to the table, and the report says so."""
+"""Most panels in one figure. Data of further panels is in the table only, and the report says so."""
 
 _COLUMNS = 3
 _WRITTEN_OUT = 200
-"""Fields of a heat map up to which each has its number in it."""
+"""Number of fields of a heat map up to which each field shows its number."""
 
 
 def curves_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int]:
@@ -41,7 +41,7 @@ def curves_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, in
         if list(panel.curves) != [""]:
             title = ", ".join(NAMES.get(key, key) for key in axes.by)
             style: dict[str, Any] = {"fontsize": "small", "title": title, "title_fontsize": "small", "frameon": False}
-            # Below, where it hides no point.
+            # The legend is below the panel, where it hides no point.
             field.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, **style)
     return figure, max(len(panels) - MOST_PANELS, 0)
 
@@ -73,7 +73,7 @@ def heat_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int]
 
 
 def _grid(count: int, width: float, height: float) -> tuple[Figure, list[Any]]:
-    """A figure of so many panels, each of this size in inches."""
+    """A figure with this number of panels, each of this size in inches."""
     columns = min(max(count, 1), _COLUMNS)
     rows = ceil(max(count, 1) / columns)
     figure = Figure(figsize=(width * columns, height * rows), layout="constrained")

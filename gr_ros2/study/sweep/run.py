@@ -1,7 +1,7 @@
-"""Runs a sweep: what is missing in its folder, on workers, each run kept as it ends.
+"""Runs a sweep: workers do the runs that are missing in its folder, and each result is stored when its run ends.
 
-Invariants: whatever ends a sweep early, all runs that ended before are kept, and the next call does the others only;
-the tables, figures and page are written of what there is.
+Invariants: if a sweep ends early, for any reason, all finished runs are kept, and the next call does only the others;
+tables, figures and page are made from the results that exist.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from gr_ros2.study.sweep.sweep_page import write_sweep
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """Where a sweep is: runs in all, those with a result, those of them that were found, and those that failed."""
+    """Progress of a sweep: all runs, runs with a result, how many of these were already in the folder, and failed
+    runs."""
 
     total: int
     done: int
@@ -34,7 +35,7 @@ class SweepProgress:
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """What a sweep gave.
+    """The outcome of a sweep.
 
     :param results: by cell number and repetition
     :param failures: runs without a result, one line each
@@ -57,15 +58,15 @@ def run_sweep(
     fresh: bool = False,
     on_progress: Callable[[SweepProgress], None] | None = None,
 ) -> SweepOutcome:
-    """Run what is missing of a sweep, until KeyboardInterrupt at the latest.
+    """Run what is missing of a sweep. KeyboardInterrupt stops it.
 
-    :param out: folder of the sweep, made if missing; one that was stopped is continued
+    :param out: folder of the sweep, made if missing; a sweep that was stopped is continued
     :param scheduler: address of a Dask cluster; None starts processes on this machine
-    :param workers: how many of these; None starts one per core, or a single one for runs in real time
+    :param workers: number of processes on this machine; None starts one per core, or one for runs in real time
     :param fresh: run everything again
     :param on_progress: called at the start and after every run
     :raises ConfigError: when the folder cannot be used, nothing answers at ``scheduler``, or ``workers`` does not fit
-    :raises RunError: when the cluster goes away
+    :raises RunError: when the cluster is lost
     """
     count = _workers(plan, scheduler, workers)
     store = Store(out)
@@ -74,7 +75,7 @@ def run_sweep(
     for cell in plan.cells:
         for repetition, scenario in enumerate(cell.runs):
             key = run_key(scenario)
-            scenarios[key] = scenario  # two cells may come to the same settings; these run once
+            scenarios[key] = scenario  # two cells may have the same settings; these run once
             places.setdefault(key, []).append((cell.number, repetition))
     found = {} if fresh else {key: kept for key in scenarios if (kept := store.find(key)) is not None}
     done, failed, interrupted = dict(found), dict[str, str](), False
@@ -84,7 +85,8 @@ def run_sweep(
             on_progress(SweepProgress(len(scenarios), len(done), len(found), len(failed)))
 
     report()
-    # Mixed: the time left is then told by all kinds of cells, and neighbours do not wait for one table of losses.
+    # Random order: the estimate of the time left then uses all kinds of cells, and neighbouring cells do not wait for
+    # the same table of losses.
     order = random.Random(0).sample(list(scenarios), len(scenarios))
     missing = {key: scenarios[key] for key in order if key not in done}
     try:
@@ -107,7 +109,7 @@ def run_sweep(
         for key, reason in failed.items()
         for number, repetition in places[key]
     ]
-    # Who pressed Ctrl-C wants the prompt back, not seconds of drawing.
+    # After Ctrl-C the command ends at once; drawing would take seconds.
     files = [] if interrupted or not results else write_sweep(plan, results, failures, out)
     return SweepOutcome(results, tuple(failures), tuple(files), interrupted)
 

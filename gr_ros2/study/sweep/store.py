@@ -1,7 +1,7 @@
-"""The finished runs of a sweep in its folder, one file each, so that none is run twice.
+"""The finished runs of a sweep in its folder, one file each, so that no run is done twice.
 
-Invariants: a file is called after everything that decides what the run gives (every setting, the bytes of registry and
-dictionaries, size and time of the recording, the version of gr-ros2), so that another run never has its name; it
+Invariants: the name of a file depends on everything that determines the result (every setting, the bytes of registry
+and dictionaries, size and time of the recording, the version of gr-ros2), so no other run has the same name; the file
 appears whole or not at all.
 """
 
@@ -34,9 +34,9 @@ class Store:
         self._folder = folder / RUNS
 
     def find(self, key: str) -> Result | None:
-        """What a run gave, None where it has not been run.
+        """The result of a run, None where it has not been run.
 
-        :raises ConfigError: when its file is damaged; names it
+        :raises ConfigError: when its file is damaged; names the file
         """
         path = self._path(key)
         if not path.exists():
@@ -47,7 +47,7 @@ class Store:
             raise ConfigError(f"{error}, or delete the file: then this one run is repeated") from error
 
     def keep(self, key: str, result: Result) -> None:
-        """Write what a run gave.
+        """Write the result of a run.
 
         :raises ConfigError: when it cannot be written
         """
@@ -59,13 +59,13 @@ class Store:
 
 def run_key(scenario: Scenario) -> str:
     """The name of a run's file."""
-    # Of files counts what is in them, not where they lie.
+    # Files are identified by their contents, not by their paths.
     identity = {"version": __version__, "settings": without_registry(dump(scenario)), "files": list(_files(scenario))}
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:_KEY_CHARACTERS]
 
 
 def without_registry(settings: Any) -> Any:
-    """The same settings without the path of the registry, which stands in several places."""
+    """The same settings without the path of the registry, which occurs in several places."""
     if not isinstance(settings, dict):
         return settings
     return {key: without_registry(value) for key, value in settings.items() if key != "registry"}

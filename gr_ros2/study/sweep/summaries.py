@@ -1,8 +1,8 @@
-"""The numbers of a sweep: one row per run and topic, and per cell what its repetitions say together.
+"""The numbers of a sweep: one row per run and topic, and a summary of the repetitions of each cell.
 
-Invariants: every row names its cell by all swept keys; a row with the topic ``ALL`` holds what can be said of all
-topics together, and with one topic everything; a share over repetitions is that of all their messages, not a mean of
-shares.
+Invariants: every row names its cell by all swept keys; a row with the topic ``ALL`` holds the numbers that exist for
+all topics together, or all numbers if there is only one topic; a share over repetitions is the share of all their
+messages, not a mean of shares.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from gr_ros2.study.sweep.definition import PDR, VALUES, SweepCell, SweepPlan
 ALL = "all topics"
 
 Results = Mapping[tuple[int, int], Result]
-"""(cell number, repetition from 0) -> result; what has not been run or has failed is missing."""
+"""(cell number, repetition from 0) -> result. Runs that are not done or that failed are missing."""
 
 _OF_THE_RUN = ("airtime_s", "airtime_per_message_s", "airtime_per_byte_s", "sample_rate")
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What the repetitions of a cell say of one topic, or of all.
+    """The numbers of one topic, or of all topics, over the repetitions of a cell.
 
     :param runs: repetitions with a result
-    :param numbers: by the names of ``VALUES``; the PDR with a Wilson interval over all messages, the others with
-        Student's over runs
+    :param numbers: by the names of ``VALUES``; the PDR has a Wilson interval over all messages, the others have
+        Student's t interval over runs
     """
 
     cell: SweepCell
@@ -70,7 +70,7 @@ def rows_of(plan: SweepPlan, results: Results) -> list[dict[str, Any]]:
 
 
 def summaries(plan: SweepPlan, rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
-    """What the repetitions of each cell say, all topics together first."""
+    """The summaries of each cell. The summary of all topics together comes first."""
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["cell"], row["topic"]), []).append(row)
@@ -134,7 +134,7 @@ def _summary(cell: SweepCell, topic: str, rows: Sequence[Mapping[str, Any]]) -> 
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Values of one type as they are, of several as JSON text."""
+    """A column of a table. Values of one type are stored as they are, values of several types as JSON text."""
     kinds = {type(value) for value in values if value is not None}
     if len(kinds) > 1 and not kinds <= {int, float}:
         return pa.array([None if value is None else json.dumps(value) for value in values], pa.string())

@@ -1,6 +1,7 @@
 """The results of a sweep as files: tables, figures, and a page with both.
 
-Invariant: everything is made of the rows alone, so an interrupted sweep can be looked at like a finished one.
+Invariant: everything is made from the rows alone, so the page of an incomplete sweep has the same form as that of a
+finished one.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _INTERVALS = (
 
 
 def summary_grid(plan: SweepPlan, found: Sequence[Summary], shown: Sequence[str] = _SHOWN) -> Grid:
-    """A line per cell and topic, where there are several topics a section per cell.
+    """A line per cell and topic. If there are several topics, each cell has a section.
 
     :param shown: names of ``VALUES``
     """
