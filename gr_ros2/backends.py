@@ -53,7 +53,7 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
 
     :param family: what errors call a row, and the last part of the group
     :param rows: the rows of this package, by name; an entry point cannot replace them
-    :param kind: of a row
+    :param kind: class of a row
     """
 
     def __init__(self, family: str, rows: Mapping[str, RowT], kind: type[RowT]) -> None:

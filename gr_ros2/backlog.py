@@ -20,7 +20,7 @@ Work = tuple[Callable[..., object], tuple[object, ...]]
 class Backlog:
     """Does work in a thread of its own.
 
-    :param name: of the thread
+    :param name: name of the thread
     :param most: bytes that may wait or be in progress
     """
 
@@ -67,7 +67,7 @@ class Backlog:
     def settle(self, timeout_s: float) -> bool:
         """Wait until all accepted work is done.
 
-        :return: whether it is, by then
+        :return: whether it was done in time
         """
         with self._changed:
             return self._changed.wait_for(lambda: not self.pending, timeout_s)
@@ -76,7 +76,7 @@ class Backlog:
         """Accept no more work, and wait until all accepted work is done. Idempotent.
 
         :param timeout_s: None waits without limit
-        :return: whether it is, by then
+        :return: whether it was done in time
         """
         with self._changed:
             self._closed = True

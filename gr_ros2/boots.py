@@ -1,10 +1,10 @@
 """What a robot keeps from one start to the next: its boot number, and the newest packet heard of each other robot.
 
-A boot number is greater than all before it, and at least the wall clock's seconds: so it grows when the file is lost,
-and when the clock is set back.
+A boot number is greater than all earlier ones, and at least the wall clock's seconds. So it also grows if the file is
+lost, and if the clock is set back.
 
-Invariants: the file is replaced as a whole and is on the disk before a call returns, so that a power cut leaves the old
-or the new one; a boot number is given out only after it has been written.
+Invariants: the file is replaced as a whole, and is on the disk before a call returns, so a power cut leaves the old or
+the new file; a boot number is used only after it has been written.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LARGEST = (1 << 32) - 1
 class BootFile:
     """The state file of one robot.
 
-    :param path: of the file, which need not exist; its folder must
+    :param path: path of the file, which need not exist; its folder must exist
     :param wall_clock: seconds since 1970
     :raises ConfigError: the file cannot be read, written or understood
     """
@@ -31,18 +31,18 @@ class BootFile:
         self._path = Path(path)
         before, self._heard = self._read()
         self.boot = min(max(before + 1, int(wall_clock)), _LARGEST)
-        """Of this start."""
+        """Boot number of this start."""
         if self.boot <= before:
             raise ConfigError(f"{self._path}: boot numbers are used up; make a new key and delete this file")
         self._write()
 
     @property
     def heard(self) -> Mapping[int, tuple[int, int]]:
-        """Per robot id its newest boot number, and the packet number below which nothing more is taken."""
+        """By robot id: its newest boot number, and the packet number below which nothing more is accepted."""
         return self._heard
 
     def save(self, src_id: int, boot: int, floor: int) -> None:
-        """Remember how far a robot has been heard.
+        """Store up to which packet a robot has been heard.
 
         :raises ConfigError: the file cannot be written
         """

@@ -1,8 +1,8 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Invariants: a name is introduced by one dataclass, which others inherit from; what is derived is spelt ``auto``;
-durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the value and what
-is allowed.
+Invariants: each name is introduced by one dataclass, and other dataclasses inherit it; a derived value is written
+``auto``; durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the
+value and what is allowed.
 """
 
 from __future__ import annotations
@@ -287,7 +287,7 @@ class SourceConfig(Queued, EndConfig):
 
     @property
     def wire_format(self) -> Format:
-        """The version that packets are written in."""
+        """The wire format of the version in which packets are written."""
         return format_of(self.version)
 
     def src_id(self) -> int:
@@ -526,8 +526,8 @@ class DiagnosticsConfig:
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
     """Make a configuration object from a mapping.
 
-    :param cls: one of the dataclasses above, or one made of them
-    :param where: what to call it in errors, for instance the file name
+    :param cls: one of the dataclasses above, or one composed of them
+    :param where: name of the settings in errors, for instance the file name
     :raises ConfigError: naming key, value and what is allowed
     """
     if not isinstance(values, Mapping):
@@ -550,8 +550,8 @@ def replaced(config: _T, **changes: Any) -> _T:
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """One YAML file as a mapping.
 
-    :raises ConfigError: when it cannot be read, is no mapping, has a key twice, or is past what
-        :mod:`gr_ros2.yaml_bounds` allows; names file and line
+    :raises ConfigError: when it cannot be read, is not a mapping, has a key twice, or exceeds the limits of
+        :mod:`gr_ros2.yaml_bounds`; names file and line
     """
     try:
         text = read_bounded(Path(path))

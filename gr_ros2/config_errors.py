@@ -1,7 +1,7 @@
-"""What is wrong with settings, in one line: key, value, what is allowed, and what the key is for.
+"""Describes errors in settings in one line: key, value, what is allowed, and what the key is for.
 
-Invariants: a value that a union refuses is one complaint, however many members the union has; an old name or value is
-answered with the new one.
+Invariants: a value that a union refuses gives one complaint, however many members the union has; for an old name or
+value, the complaint gives the new one.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ _KINDS = {
     "string": "a text",
     "tuple": "a list",
 }
-"""What a value is asked to be, by what pydantic calls it."""
+"""The expected kind of value in words, by pydantic's name of the error."""
 _DERIVED_ONCE: tuple[Any, ...] = (None, -1, 0, "", [])
-"""Values that stood for ``auto`` at one setting or another."""
+"""Values that meant ``auto`` in earlier versions, for at least one setting."""
 
 
 def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
-    """Complaints of pydantic as one line.
+    """Complaints of pydantic in one line.
 
     :param cls: the settings class
     :param items: ``ValidationError.errors()``
-    :param where: what the settings are called, for instance the file name
+    :param where: name of the settings in errors, for instance the file name
     """
     prefix = f"{where}: " if where else ""
     places: dict[tuple[str, ...], list[Any]] = {}
@@ -44,7 +44,7 @@ def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
         keys, owner = _place(cls, item["loc"])
         places.setdefault(keys, []).append(item)
         owners[keys] = owner
-    # What several parts take over from the top level is wrong once, and not in every part.
+    # A wrong value at the top level that several parts inherit is reported once, not for every part.
     top = [(keys, group[0]["input"]) for keys, group in places.items() if len(keys) == 1]
     told = {
         keys: group for keys, group in places.items() if len(keys) == 1 or (keys[-1:], group[0]["input"]) not in top
@@ -53,14 +53,14 @@ def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
 
 
 def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[Any] | None]:
-    """The keys down to a place and the settings class that has the last; the name of a union's member is no key."""
+    """The keys that lead to a place, and the settings class of the last key. A union member's name is not a key."""
     keys: list[str] = []
     owner: Any = None
     kinds: tuple[Any, ...] = (cls,)
     for part in loc:
         kinds = tuple(kind for kind in kinds if kind is not type(None))
         if len(kinds) > 1:
-            kinds = ()  # which member it is, is not said in a way that could be followed
+            kinds = ()  # pydantic does not say which member it is in a form that can be used here
             continue
         owner = kinds[0] if kinds and is_dataclass(kinds[0]) else None
         keys.append(str(part))
@@ -72,7 +72,7 @@ def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[An
 
 
 def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[Any]) -> str:
-    """What is wrong at one place."""
+    """The complaint about one place."""
     key, item = ".".join(keys), group[0]
     if not key:
         return str(item["msg"]).removeprefix("Value error, ")
@@ -105,9 +105,9 @@ def _either(choices: Sequence[Any]) -> str:
 
 
 def _asked(item: Any, said: str) -> str:
-    """What pydantic asks for, in our words.
+    """What pydantic expects, in our words.
 
-    :param said: what the setting is for, told where the value is of the wrong kind
+    :param said: what the setting is for; it is given if the value is of the wrong kind
     """
     kind, _, problem = item["type"].partition("_")
     if kind in _KINDS and problem in ("type", "parsing", "str_parsing", "from_float"):

@@ -3,7 +3,7 @@
     GrRos2Error
     ├── ConfigError (ValueError)        a setting, file or argument is wrong: exit status 2
     │   └── RegistryError               the same, with file and line of a registry CSV
-    ├── WireError (ValueError)          bytes that are no packet of ours, or a packet that has no bytes
+        ├── WireError (ValueError)          bytes that are not a valid packet, or a packet that cannot be encoded
     │   ├── LengthError · CrcError · VersionError · NoEntriesError
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   ├── EntryKindError · VarintError · WindowError · SourcesError
@@ -19,7 +19,7 @@
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
     └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
 
-Invariant: messages name the thing, its value and the remedy, in one line.
+Invariant: a message names the object, its value and the remedy, in one line.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class RegistryError(ConfigError):
     """A registry CSV is wrong.
 
     :param path: the file, or None where the registry was built in code
-    :param line: line number from 1, or None where the file as a whole is meant
+    :param line: line number from 1, or None for the file as a whole
     """
 
     def __init__(self, problem: str, path: str | Path | None = None, line: int | None = None) -> None:
@@ -52,13 +52,13 @@ class RegistryError(ConfigError):
 
 
 class WireError(GrRos2Error, ValueError):
-    """Bytes that are no packet of ours. ``kind`` is the name its counter carries."""
+    """Bytes that are not a valid packet. ``kind`` is the name of its counter."""
 
     kind = "wire"
 
 
 class LengthError(WireError):
-    """Not as many bytes as ``packet_len`` allows."""
+    """More or fewer bytes than ``packet_len`` allows."""
 
     kind = "length"
 
@@ -70,7 +70,7 @@ class CrcError(WireError):
 
 
 class VersionError(WireError):
-    """A version nibble this decoder does not know."""
+    """A version nibble that this decoder does not know."""
 
     kind = "version"
 
@@ -112,19 +112,19 @@ class EntryKindError(WireError):
 
 
 class VarintError(WireError):
-    """A number of variable length that is too long, too large, or longer than it needs to be."""
+    """A number of variable length that is too long, too large, or not in its shortest form."""
 
     kind = "varint"
 
 
 class WindowError(WireError):
-    """A repair whose window, mask and row do not go together."""
+    """A repair whose window, mask and row contradict each other."""
 
     kind = "window"
 
 
 class SealError(WireError):
-    """A packet that may be intact and yet cannot be trusted here."""
+    """A packet that may be intact, but that cannot be trusted here."""
 
     kind = "seal"
 

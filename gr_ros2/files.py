@@ -37,7 +37,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: Any, write: Callable[[Any, Path], object]) -> Path:
-    """Write a table or text to a file, in a folder that is made if missing.
+    """Write a table or text to a file; its folder is made if missing.
 
     :param write: called with the content and the path to write to
     :raises ConfigError: the file cannot be written
@@ -57,7 +57,7 @@ def write_text(text: str, path: Path) -> None:
 
 
 def make_folder(path: Path) -> Path:
-    """The folder, made if missing.
+    """Make the folder if it is missing, and return it.
 
     :raises ConfigError: when it cannot be made
     """

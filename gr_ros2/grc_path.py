@@ -52,7 +52,7 @@ def install(environ: Mapping[str, str] = os.environ) -> Path:
     """Make GRC find the folder from now on.
 
     :returns: the preference file that GNU Radio 3.10 reads
-    :raises ConfigError: when a file cannot be read or written, or our folder cannot stand in one
+    :raises ConfigError: when a file cannot be read or written, or the path of our folder cannot be written in one
     """
     folder = str(grc_path())
     if any(letter in folder for letter in '"#\n' + os.pathsep):
@@ -71,7 +71,7 @@ def install(environ: Mapping[str, str] = os.environ) -> Path:
 
 
 def uninstall(environ: Mapping[str, str] = os.environ) -> list[Path]:
-    """Take the folder out of the preferences again; what else stands there stays.
+    """Remove the folder from the preferences; all other lines stay.
 
     :returns: the files that were changed, or removed because nothing else was in them
     :raises ConfigError: when a file cannot be read or written
@@ -96,7 +96,7 @@ def uninstall(environ: Mapping[str, str] = os.environ) -> list[Path]:
 def without_blocks_path(text: str, folder: str) -> str:
     """The text of a preference file without a folder in `local_blocks_path`, the rest unchanged.
 
-    A setting and a section that then are empty go too.
+    A setting and a section that are empty after that are removed too.
     """
     lines = text.splitlines(keepends=True)
     headings = [number for number, line in enumerate(lines) if _SECTION.match(line)]
@@ -112,7 +112,7 @@ def without_blocks_path(text: str, folder: str) -> str:
             paths.remove(folder)
             lines[number] = _setting(paths) if paths else ""
             if not "".join(lines[heading + 1 : end]).strip():
-                # An empty line before it was ours too, where it came last.
+                # An empty line before the section at the end of the file was ours too.
                 before = heading - (end == len(lines) and heading > 0 and not lines[heading - 1].strip())
                 del lines[before:end]
             return "".join(lines)

@@ -1,7 +1,7 @@
 """Makes gr-ros2 importable in the Python that GNU Radio Companion and its flowgraphs run in.
 
-Invariants: written are two files in the user's site-packages of that Python, which ``withdraw`` removes; pip and its
-database are not touched (PEP 668); nothing of that Python's packages is shadowed before a flowgraph imports gr-ros2.
+Invariants: only two files are written, in the user's site-packages of that Python, and ``withdraw`` removes them; pip
+and its database are not touched (PEP 668); no package of that Python is shadowed before a flowgraph imports gr-ros2.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ NEEDED = (
     "pyyaml",
     "rosbags",
 )
-"""Distributions that blocks use; what reports, tables and the dashboard use has no business in a flowgraph."""
+"""Distributions that blocks use. A flowgraph does not need those of reports, tables and the dashboard."""
 _ALONE = ("cyclonedds",)
-"""Those of which the Python part is not imported, so that nothing it needs is needed."""
+"""Distributions whose Python part is not imported, so that their own requirements are not needed."""
 _KEPT = ("PYTHONUSERBASE", "PYTHONNOUSERSITE")
 _ASK = """
 import json, os, site, sys, sysconfig
@@ -63,11 +63,11 @@ class OtherPython:
 
     :param program: its path
     :param version: major and minor
-    :param abi: which compiled modules it loads
+    :param abi: ABI of the compiled modules that it can load
     :param user: site-packages of the user
-    :param enabled: whether it looks there
-    :param where: folder from which it imports gr_ros2 by itself, without our path file; '' = it does not
-    :param has: version of each distribution it finds, by plain name
+    :param enabled: whether it reads the user's site-packages
+    :param where: folder from which it imports gr_ros2 without our path file; '' = it does not
+    :param has: version of each distribution that it finds, by normalised name
     """
 
     program: str
@@ -80,9 +80,9 @@ class OtherPython:
 
 
 def grc_program(search: str | None = None) -> str:
-    """The Python in whose name GRC starts: that of the first line of ``gnuradio-companion`` or ``grcc``.
+    """The Python that GRC runs in: the one in the first line of ``gnuradio-companion`` or ``grcc``.
 
-    :param search: folders, as PATH has them; None takes PATH
+    :param search: folders, in the form of PATH; None for PATH itself
     """
     for name in ("gnuradio-companion", "grcc"):
         script = shutil.which(name, path=search)
@@ -96,7 +96,7 @@ def grc_program(search: str | None = None) -> str:
 
 
 def ask(program: str, environ: Mapping[str, str] = os.environ) -> OtherPython:
-    """What a Python says of itself, as it is without the path file.
+    """Ask a Python for its properties, without our path file.
 
     :raises ConfigError: it does not run
     """
@@ -119,7 +119,7 @@ def ask(program: str, environ: Mapping[str, str] = os.environ) -> OtherPython:
 
 
 def finds_us(program: str, environ: Mapping[str, str] = os.environ) -> bool:
-    """Whether a Python, started as a menu does it, imports gr-ros2 with its blocks."""
+    """Whether a Python, started as from a desktop menu, imports gr-ros2 with its blocks."""
     command = [program, "-c", "import gr_ros2.gr"]
     try:
         return not subprocess.run(command, env=_clean(environ), capture_output=True, cwd="/", check=False).returncode
@@ -128,11 +128,10 @@ def finds_us(program: str, environ: Mapping[str, str] = os.environ) -> bool:
 
 
 def provide(other: OtherPython) -> Path | None:
-    """Let that Python import gr-ros2 and what its blocks need from the environment this runs in.
+    """Let that Python import gr-ros2 and the requirements of its blocks from the environment that this program runs in.
 
-    :returns: the path file; None where that Python finds this gr-ros2 by itself
-    :raises ConfigError: it is of another version, does not look into the user's site-packages, or these cannot be
-        written
+    :returns: the path file; None if that Python finds this gr-ros2 by itself
+    :raises ConfigError: it is of another version, does not read the user's site-packages, or these cannot be written
     """
     folder = Path(path_finder.__file__).resolve().parent.parent
     if other.where == str(folder):
@@ -160,7 +159,7 @@ def provide(other: OtherPython) -> Path | None:
 
 
 def withdraw(other: OtherPython) -> list[Path]:
-    """Take back what :func:`provide` wrote; returns what was there.
+    """Remove what :func:`provide` wrote; returns the files that existed.
 
     :raises ConfigError: a file cannot be removed
     """
@@ -175,12 +174,12 @@ def withdraw(other: OtherPython) -> list[Path]:
 
 
 def _clean(environ: Mapping[str, str]) -> dict[str, str]:
-    """An environment in which nothing leads a Python elsewhere."""
+    """An environment without variables that change where a Python finds its modules."""
     return {name: value for name, value in environ.items() if name in _KEPT or not name.startswith("PYTHON")}
 
 
 def _offered(theirs: Mapping[str, str]) -> tuple[str, list[str], list[str]]:
-    """The environment's site-packages; modules and distributions of it that the other Python lacks or has too old.
+    """The environment's site-packages, and its modules and distributions that the other Python lacks or has too old.
 
     :param theirs: version of each distribution the other Python has
     """
@@ -196,7 +195,7 @@ def _offered(theirs: Mapping[str, str]) -> tuple[str, list[str], list[str]]:
 
 
 def _requirements() -> Iterator[tuple[str, list[str]]]:
-    """Each distribution that blocks need, also by way of others, and what is asked of its version."""
+    """Each distribution that blocks need, directly or indirectly, and the requirements on its version."""
     from packaging.requirements import Requirement
 
     asked: dict[str, list[str]] = {}
@@ -224,7 +223,7 @@ def _fits(version: str, specifiers: Iterable[str]) -> bool:
 
 
 def _distribution(name: str, environment: Path) -> metadata.Distribution | None:
-    """A distribution, where it is the environment's own and not seen through to the system."""
+    """A distribution, if it belongs to the environment itself and not to the system behind it."""
     try:
         found = metadata.distribution(name)
     except metadata.PackageNotFoundError:
@@ -233,7 +232,7 @@ def _distribution(name: str, environment: Path) -> metadata.Distribution | None:
 
 
 def _modules(found: metadata.Distribution) -> set[str]:
-    """What is imported of a distribution, by dotted names; of a namespace package also its parts."""
+    """The modules of a distribution, by dotted names; for a namespace package also its parts."""
     files = [file for file in found.files or () if file.suffix in (".py", ".so")]
     regular = {file.parts[:-1] for file in files if file.name.partition(".")[0] == "__init__"}
     names = set()
@@ -249,5 +248,5 @@ def _modules(found: metadata.Distribution) -> set[str]:
 
 
 def _plain(name: str) -> str:
-    """As PEP 503 compares names."""
+    """A name in the normalised form in which PEP 503 compares names."""
     return name.lower().replace("_", "-").replace(".", "-")

@@ -19,7 +19,7 @@ class Guard:
     """Calls one observer, or one function of it, until it raises.
 
     :param name: first words of the log line about it
-    :param needed: :meth:`check` raises its failure, and nothing is logged
+    :param needed: :meth:`check` raises its error, and nothing is logged
     """
 
     def __init__(self, name: str, *, needed: bool = False) -> None:
@@ -67,7 +67,7 @@ class Guard:
             _log.warning("%s: slower than the link; what it cannot take is left out", self.name)
 
     def check(self) -> None:
-        """:raises GrRos2Error: when it has failed: its own error, or a RunError that names it"""
+        """:raises GrRos2Error: if it has failed: its own error, or a RunError that names it"""
         if isinstance(self.error, GrRos2Error):
             raise self.error
         if self.error is not None:

@@ -20,7 +20,7 @@ MAX_NODE_LEN = 255
 """Characters of a node name (``RMW_NODE_NAME_MAX_NAME_LENGTH``)."""
 
 INFRASTRUCTURE = ("/rosout", "/parameter_events")
-"""Topics every ROS node has, which nobody wants on a radio by accident."""
+"""Topics that every ROS node has and that are rarely meant to be sent by radio."""
 
 _FIELD = "{src_id}"
 _LONGEST_ID = 255
@@ -68,7 +68,7 @@ def check_node(node_name: str, namespace: str) -> tuple[str, str]:
 
 
 def filled(form: str, src_id: int) -> str:
-    """A form with the sender's id in it."""
+    """A form with the sender's id filled in."""
     return form.replace(_FIELD, str(src_id))
 
 
@@ -120,7 +120,7 @@ def _form_fault(form: str) -> str:
 
 
 def _of_form(form: str, fault: str) -> str:
-    """A fault of a form, with the sender's number that was filled in where the fault depends on it."""
+    """A fault of a form; it names the sender's number that was filled in if the fault depends on it."""
     return f"{fault} (for sender {_LONGEST_ID})" if re.search(r"[0-9]", fault) and _FIELD in form else fault
 
 

@@ -1,6 +1,7 @@
-"""Settings that had another name once: what a file that still has the old one is told.
+"""Settings that had another name earlier, and the hint for a file that still uses the old name.
 
-Invariant: a row's new name exists, in the class that the old one stood in; a name that is in use again is no row.
+Invariant: the new name of each row exists in the class that had the old one; an old name that is in use again has no
+row.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ OLD_NAMES: Mapping[str, tuple[str, str]] = {
     "start_time": ("start_time_s", "start_time_s"),
     "turnaround": ("turnaround_s", "turnaround_s"),
 }
-"""Old name -> a field of the class that had it, and what to write now."""
+"""Old name -> a field of the class that had it, and the setting to write now."""
 
 
 def new_name(old: str, known: Collection[str]) -> str:
-    """What to write for a name of old, '' where it is none.
+    """The setting to write instead of an old name, '' if the name is not an old one.
 
-    :param known: the names of today, of the class in which it stands
+    :param known: the present names of the settings in the class
     """
     field, said = OLD_NAMES.get(old, ("", ""))
     return said if field in known else ""

@@ -1,9 +1,9 @@
-"""Lets another Python import gr-ros2, and what it needs, from an environment that is not its own.
+"""Lets another Python import gr-ros2 and its requirements from a different environment.
 
-`gr-ros2 grc-path --install` copies this file into the user's site-packages of GNU Radio's Python, where a path file
-calls ``offer`` at every start. Invariants: it finds ``gr_ros2`` alone, and only when nobody else has, until that is
-imported; from then on it also finds the packages of gr-ros2 that the other Python lacks or has too old, and nothing
-else; what the process has imported before stays as it is.
+`gr-ros2 grc-path --install` copies this file into the user's site-packages of GNU Radio's Python. A path file there
+calls ``offer`` at every start. Invariants: until ``gr_ros2`` is imported, the finder finds only ``gr_ros2``, and only
+if no other finder has found it; after that it also finds the packages of gr-ros2 that the other Python lacks or has too
+old, and nothing else; modules that the process imported before stay unchanged.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ PACKAGE = "gr_ros2"
 class EnvironmentFinder:
     """Finds modules of one environment.
 
-    :param folder: that has the package ``gr_ros2``
+    :param folder: folder that contains the package ``gr_ros2``
     :param environment: site-packages of the environment
-    :param modules: what is found there, by dotted names: top-level modules, and the parts of namespace packages
-    :param packages: the distributions these are of, whose metadata is found too; plain names (PEP 503)
+    :param modules: modules found there, by dotted names: top-level modules, and the parts of namespace packages
+    :param packages: distributions of these modules, whose metadata is found too; normalised names (PEP 503)
     """
 
     def __init__(self, folder: str, environment: str, modules: Iterable[str], packages: Iterable[str]) -> None:
@@ -36,7 +36,7 @@ class EnvironmentFinder:
         path: Sequence[str] | None = None,  # noqa: ARG002 - import's signature
         target: Any = None,
     ) -> ModuleSpec | None:
-        """What Python's import asks a finder."""
+        """Called by Python's import."""
         if name == PACKAGE:
             found = PathFinder.find_spec(name, [self._folder], target)
             if found is not None and not self._wanted:
@@ -54,7 +54,7 @@ class EnvironmentFinder:
         return found
 
     def find_distributions(self, context: Any = None) -> Iterable[Any]:
-        """What ``importlib.metadata`` asks a finder."""
+        """Called by ``importlib.metadata``."""
         from importlib.metadata import DistributionFinder, MetadataPathFinder
 
         asked = None if context is None else context.name
@@ -65,5 +65,5 @@ class EnvironmentFinder:
 
 
 def offer(folder: str, environment: str, modules: Iterable[str], packages: Iterable[str]) -> None:
-    """Let this Python find them; see :class:`EnvironmentFinder`."""
+    """Let this Python find the modules; see :class:`EnvironmentFinder`."""
     sys.meta_path.append(EnvironmentFinder(folder, environment, modules, packages))

@@ -33,7 +33,7 @@ _LONGEST_ID = 255
 def normalize_type(text: str) -> str:
     """``nav_msgs/Odometry`` or ``nav_msgs/msg/Odometry`` as ``nav_msgs/msg/Odometry``.
 
-    :raises ConfigError: when it is neither
+    :raises ConfigError: when it has neither form
     """
     match = _TYPE.fullmatch(text)
     if match is None:
@@ -99,7 +99,7 @@ class Registry(Sequence[Topic]):
 
     @classmethod
     def empty(cls) -> Registry:
-        """No topics: of a robot that sends nothing, and takes what others announce."""
+        """No topics: the registry of a robot that sends nothing and receives the topics that others announce."""
         made = cls.__new__(cls)
         made._topics, made._by_name = (), {}
         return made
@@ -150,7 +150,7 @@ class Registry(Sequence[Topic]):
     def named(self, name: str) -> Topic:
         """The row of that name, with or without leading slash.
 
-        :raises ConfigError: when there is none
+        :raises ConfigError: when there is no such row
         """
         try:
             return self._by_name[name.lstrip("/")]
@@ -160,10 +160,10 @@ class Registry(Sequence[Topic]):
             ) from None
 
     def with_options(self, options: Mapping[str, TopicOptions]) -> Registry:
-        """The same rows with configured options over the registry's own; only settings that differ from the
-        default override.
+        """The same rows, with configured options instead of the registry's own. Only settings that differ from the
+        default replace the registry's.
 
-        :raises ConfigError: for a topic that is not registered, unless none is
+        :raises ConfigError: for a topic that is not registered, unless the registry is empty
         """
         if not self:
             return self
@@ -184,9 +184,9 @@ class Registry(Sequence[Topic]):
 
 
 def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
-    """What a sender has announced of one of its topics.
+    """A topic as its sender has announced it.
 
-    :param options: configured ones by topic name, which go over it
+    :param options: configured options by topic name, which replace the announced ones
     :raises ConfigError: for a name or a type that ROS does not allow
     """
     if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
@@ -204,8 +204,8 @@ def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:
     """Refuse settings with which a sink could not publish what it receives.
 
-    :raises ConfigError: where a topic would come out under a name that ROS does not allow, or two topics of different
-        types under one name, or ``topic_options`` has a topic that is not registered
+    :raises ConfigError: if a topic would be published under a name that ROS does not allow, or two topics of different
+        types under one name, or if ``topic_options`` has a topic that is not registered
     """
     types = dict.fromkeys(sink.merged_topics, _TF_TYPE)
     for topic in registry.with_options(sink.topic_options):

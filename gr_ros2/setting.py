@@ -1,7 +1,7 @@
-"""What a settings class says of each of its fields: meaning, default, range, choices, label.
+"""Describes each field of a settings class: meaning, default, range, choices, label.
 
-Invariant: what shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads them here, so
-that a new setting is one field of a dataclass and its line in the docstring.
+Invariant: everything that shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads them
+here. A new setting is therefore one field of a dataclass and its line in the docstring.
 """
 
 from __future__ import annotations
@@ -17,29 +17,30 @@ from pydantic.fields import FieldInfo
 
 Auto = Literal["auto"]
 AUTO: Final = "auto"
-"""The value of a setting that is derived from others, or left to a device; the setting's meaning says how."""
+"""The value of a setting that is derived from others or chosen by a device; the setting's meaning says how."""
 
 REQUIRED: Final = object()
-"""The default of a setting that has none."""
+"""Stands for the default of a setting that has none."""
 
 _UNITS = {"s": "s", "hz": "Hz", "db": "dB", "m": "m", "len": "bytes"}
-"""Unit of a setting by the end of its name."""
+"""Unit of a setting, by the last part of its name."""
 
 
 @dataclass(frozen=True)
 class Setting:
     """One field of a settings class.
 
-    :param name: of the field
-    :param hint: its type, with what is annotated
-    :param default: ``REQUIRED`` where it has none
-    :param meaning: what the docstrings of its class and the bases of it say
+    :param name: name of the field
+    :param hint: its type, with annotations
+    :param default: ``REQUIRED`` if it has none
+    :param meaning: text from the docstrings of its class and the base classes
     :param title: label in plain words, with the unit of a number in brackets
-    :param choices: all texts and numbers that it may be, or the words beside its range, such as ``auto``
-    :param suggested: values to choose from that are not all there are
-    :param least: smallest number allowed; None without
-    :param most: largest number allowed; None without
-    :param above: numbers have to be above this; None without
+    :param choices: all texts and numbers that are allowed, or the words allowed besides its range, such as ``auto``
+    :param suggested: suggested values; other values are allowed too
+    :param least: smallest allowed number; None if there is no such limit
+    :param most: largest allowed number; None if there is no such limit
+    :param above: numbers must be above this; None if there is no such limit
+    :param below: numbers must be below this; None if there is no such limit
     :param below: numbers have to be below this; None without
     """
 
@@ -62,12 +63,12 @@ class Setting:
 
     @property
     def optional(self) -> bool:
-        """Whether it may be null, which says that there is none."""
+        """Whether it may be null, which means that there is no value."""
         return NoneType in members(self.hint)
 
     @property
     def limits(self) -> tuple[str, str]:
-        """What stands before and behind a name in an expression of its range, ``0 <= `` and `` < 255``, '' without."""
+        """Text before and after a name in an expression of its range, ``0 <= `` and `` < 255``; '' without a limit."""
         low = f"{_number(self.above)} < " if self.above is not None else ""
         high = f" < {_number(self.below)}" if self.below is not None else ""
         low = f"{_number(self.least)} <= " if self.least is not None else low
@@ -75,7 +76,7 @@ class Setting:
 
     @property
     def kinds(self) -> tuple[Any, ...]:
-        """The types it may have beside its choices, without what is annotated: ``(int,)``, ``(str,)``."""
+        """The types that it may have in addition to its choices, without annotations: ``(int,)``, ``(str,)``."""
         return tuple(kind for kind in members(self.hint) if get_origin(kind) is not Literal and kind is not NoneType)
 
 
@@ -118,9 +119,9 @@ def label(name: str) -> str:
 
 
 def meanings(cls: type[Any]) -> dict[str, str]:
-    """What the docstrings of a settings class and its bases say of each setting, one line each."""
+    """The text for each setting in the docstrings of a settings class and its bases, one line each."""
     said: dict[str, str] = {}
-    for part in reversed(cls.__mro__):  # what a class says of a setting goes before what its base says
+    for part in reversed(cls.__mro__):  # the text of a class replaces that of its base
         text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
         said |= {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
     return said
@@ -138,7 +139,7 @@ def titles(cls: type[Any]) -> dict[str, str]:
 
 
 def members(hint: Any) -> tuple[Any, ...]:
-    """The types that a type is made of: the members of a union; otherwise itself, without what is annotated."""
+    """The types that a type is made of: the members of a union; otherwise the type itself, without annotations."""
     if get_origin(hint) is Annotated:
         return members(get_args(hint)[0])
     if get_origin(hint) in (Union, UnionType):
@@ -147,7 +148,7 @@ def members(hint: Any) -> tuple[Any, ...]:
 
 
 def _marks(hint: Any) -> Iterator[Any]:
-    """What is annotated, at any depth of a union."""
+    """The annotations, at any depth of a union."""
     if get_origin(hint) is Annotated:
         inner, *marks = get_args(hint)
         yield from marks

@@ -1,4 +1,4 @@
-"""YAML files of settings: one file, registries found, and single settings replaced on the command line.
+"""YAML files of settings: reads one file, finds its registries, and replaces settings given on the command line.
 
 Invariants: a relative registry path in a file is relative to that file, one on the command line to the current
 directory; overrides apply in their order; only the form is checked here, since the settings classes check their own
@@ -21,10 +21,10 @@ BUILTIN_DIR = Path(__file__).resolve().parent / "scenarios"
 """Folder of the built-in scenarios and registries."""
 
 SHARED_KEYS = tuple(field.name for field in fields(Agreed))
-"""Settings both ends of a link must agree on."""
+"""Settings that both ends of a link must agree on."""
 
 _FILES = ("key", "state")
-"""Those that are files, which need not be there yet."""
+"""Those of them that are files, which need not exist yet."""
 
 ENDS = ("ros_source", "ros_sink")
 """The blocks at the ends of a link."""
@@ -33,7 +33,7 @@ _NUMBER = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 
 
 def read_settings(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """The settings of a YAML file, named after it unless it says otherwise.
+    """The settings of a YAML file; their name is that of the file unless the file sets one.
 
     :param overrides: `key=value` with dotted keys and YAML values (`phy.sample_rate=2e5`), in this order
     :raises ConfigError: when the file cannot be read, has no such registry, or an override is malformed
@@ -44,9 +44,9 @@ def read_settings(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
 def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Settings with their registry found and some of them replaced.
 
-    :param values: as a YAML file has them
+    :param values: in the form of a YAML file
     :param directory: where a relative registry is looked for
-    :param overrides: as :func:`read_settings` takes them
+    :param overrides: as in :func:`read_settings`
     :raises ConfigError: when there is no such registry, or an override is malformed
     """
     values = dict(values)
@@ -68,7 +68,7 @@ def with_shared(values: Mapping[str, Any], shared: Mapping[str, Any], prefix: st
 
     :param shared: values of ``SHARED_KEYS``, as far as they are set
     :param prefix: what errors begin with
-    :raises ConfigError: for a block that sets one of them otherwise
+    :raises ConfigError: for a block that sets one of them to a different value
     """
     blocks: dict[str, Any] = {}
     for end in ENDS:
@@ -104,7 +104,7 @@ def portable_registry(path: str) -> str:
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     """`phy.sample_rate=2e5` as (("phy", "sample_rate"), 200000.0).
 
-    :raises ConfigError: when it has no `=`, an empty key, or a value that is no YAML
+    :raises ConfigError: when it has no `=`, an empty key, or a value that is not YAML
     """
     key, equals, value = text.partition("=")
     keys = tuple(part.strip() for part in key.split("."))

@@ -1,7 +1,7 @@
 """Limits of a YAML text, checked before it is loaded: its length, its depth, and the size with its aliases expanded.
 
-Invariant: time and memory are bounded by the text's length, whatever it holds; without aliases and within the depth a
-settings file needs, every text of that length passes.
+Invariant: time and memory are bounded by the text's length, whatever it contains; every text of that length passes if
+it has no aliases and is not deeper than a settings file needs.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ MOST_CHARACTERS = 1 << 18
 MOST_LEVELS = 50
 """Nesting depth; a scenario's settings use five levels."""
 MOST_VALUES = 20_000
-"""With every alias written out."""
+"""Most values, with every alias expanded."""
 
 
 @dataclass
 class _OpenCollection:
-    """A list or mapping whose end was not read yet. ``values`` counts the values in it, itself included."""
+    """A list or mapping whose end has not been read yet. ``values`` counts the values in it, itself included."""
 
     anchor: str | None
     values: int = 1
@@ -33,7 +33,7 @@ def read_bounded(path: Path) -> str:
 
     :raises ConfigError: when it is longer
     :raises OSError: when it cannot be read
-    :raises UnicodeDecodeError: when it is no UTF-8
+    :raises UnicodeDecodeError: when it is not UTF-8
     """
     with path.open(encoding="utf-8") as file:
         text = file.read(MOST_CHARACTERS + 1)
@@ -45,14 +45,14 @@ def read_bounded(path: Path) -> str:
 def check_bounds(text: str) -> None:
     """Refuse a text that would take too much time or memory to load.
 
-    :raises ConfigError: for a text that is too long, goes too deep, or whose aliases expand to too much
-    :raises yaml.YAMLError: when it is no YAML
+    :raises ConfigError: for a text that is too long, too deep, or whose aliases expand to too much
+    :raises yaml.YAMLError: when it is not YAML
     """
     if len(text) > MOST_CHARACTERS:
         raise ConfigError(f"longer than {MOST_CHARACTERS:,} characters; settings are not")
     sizes: dict[str, int] = {}
     levels = [_OpenCollection(None)]
-    for event in yaml.parse(text):  # events come one by one and build nothing
+    for event in yaml.parse(text):  # the parser gives one event at a time and builds nothing
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.CollectionStartEvent):
             levels.append(_OpenCollection(event.anchor))

@@ -35,7 +35,7 @@ def parse_yaml(text: str, where: str, what: str = "") -> Any:
 
     :param where: what errors begin with, for instance the file name
     :param what: the part of ``where`` that errors name, '' for all of it
-    :raises ConfigError: when it is no YAML, is past what :mod:`gr_ros2.yaml_bounds` allows,
+    :raises ConfigError: when it is not YAML, exceeds the limits of :mod:`gr_ros2.yaml_bounds`,
         or has a key twice; names the key and its lines
     """
     try:

@@ -42,7 +42,7 @@ class LinkCodec:
     :param dictionaries: a user's own dictionaries, or their files; the first one with a topic's type is used, otherwise
         the shipped one
     :param max_size: bytes; larger messages are stored, and nothing larger is decoded
-    :raises ConfigError: a file that is no dictionary, two that share an id, a wrong ``codec`` or ``quantize``
+    :raises ConfigError: a file that is not a dictionary, two that share an id, a wrong ``codec`` or ``quantize``
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class TopicCodec:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
         self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders(topic, item) for item in sets}
         self._choices: list[_Coders] = []
-        """For sending, the preferred first: of every definition of the type one."""
+        """Coders for sending, the preferred one first: one for each definition of the type."""
         for item, coders in zip(sets, self._held.values(), strict=True):
             if topic.type_name in item.types and all(coders.tree != other.tree for other in self._choices):
                 self._choices.append(coders)
@@ -170,7 +170,7 @@ class TopicCodec:
         return found[0].pack(*found[1]) if coders.quantizer is None else coders.quantizer(*found)
 
     def _fitting(self, payload: bytes) -> _Coders:
-        """Those with the first definition that fits the message, which is the first of all where none does."""
+        """The coders of the first definition that fits the message; those of the first definition if none fits."""
         if len(self._choices) > 1:
             for coders in self._choices:
                 if coders.fields is not None and coders.fields.layout(payload) is not None:
@@ -178,7 +178,7 @@ class TopicCodec:
         return self._choices[0]
 
     def _quantize(self, steps: Mapping[str, int], topic: Topic) -> None:
-        """Have messages quantised by every definition that has these fields; at least one must."""
+        """Quantise messages in every definition that has these fields; at least one definition must have them."""
         errors: list[ConfigError] = []
         for coders in self._choices:
             try:
@@ -203,10 +203,10 @@ class _Coders:
 
     All of them are made in advance, so that a received message never causes this work.
 
-    :ivar tree: the type, None where it is not known
-    :ivar fields: None where the type is not known
-    :ivar zstd: None where the set has no dictionary for the type
-    :ivar quantizer: None where nothing is to be quantised
+    :ivar tree: the type, None if it is unknown
+    :ivar fields: None if the type is unknown
+    :ivar zstd: None if the set has no dictionary for the type
+    :ivar quantizer: None if nothing is quantised
     """
 
     def __init__(self, topic: Topic, dictionary: Dictionary) -> None:

@@ -1,9 +1,10 @@
 """When each packet occupies the channel: one after the other, each for its airtime; and when to ask for the next.
 
-Invariants: a packet starts at the later of its arrival and the end of the one before, and leaves ``early`` before its
-airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead`` before the air
-is free of all that is here or promised (credits not yet used, each for a longest packet), and while fewer than
-``OUTSTANDING`` packets are. No IO, no clock: ``now`` is seconds, monotonic.
+Invariants: a packet starts at the later of its arrival and the end of the packet before; a packet leaves ``early``
+before its airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead``
+before the channel is free of all queued and all promised packets (a promised packet is an unused credit, counted as a
+longest packet), and only while there are fewer than ``OUTSTANDING`` of them. There is no IO and no clock: ``now`` is
+seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from gr_ros2.errors import ConfigError
 T = TypeVar("T")
 
 LEAD_S = 0.005
-"""s before the air is free that a source needs to compose and hand over the next packet."""
+"""s before the channel is free; a source needs this time to compose and hand over the next packet."""
 OUTSTANDING = 2
-"""Most packets queued or granted: one on the air and one behind it. Later packets are not composed yet."""
+"""Most packets queued or granted: one being sent and one waiting behind it. Later packets are not composed yet."""
 
 
 class AirtimeClock(Generic[T]):
-    """A queue that lets packets through at the pace of the air.
+    """A queue that lets packets through at the rate of the channel.
 
-    :param airtime: s a packet occupies, gap included, the longest where they differ; 0 where packets cross at once
-    :param lead: s ahead of the air being free at which the next packet is asked for
-    :param early: s before its airtime is over at which a packet leaves: 0 where what follows takes no time, all of its
-        airtime and a little more where a device takes it
+    :param airtime: s that a packet occupies, gap included; the longest if they differ; 0 if packets take no time
+    :param lead: s before the channel is free at which the next packet is requested
+    :param early: s before the end of its airtime at which a packet leaves: 0 if the following stages take no time; all
+        of its airtime and a little more if a device takes that time
     :raises ConfigError: for a negative airtime, lead or early
     """
 
@@ -46,9 +47,9 @@ class AirtimeClock(Generic[T]):
         self._unused = 0
 
     def offer(self, packet: T, now: float, airtime: float | None = None) -> None:
-        """A packet arrives; it uses up a credit where one is open.
+        """A packet arrives; it uses a credit if one is open.
 
-        :param airtime: s that it occupies, None = those of the longest
+        :param airtime: s that it occupies, None for the airtime of the longest packet
         """
         self._free = max(now, self._free) + (self._airtime if airtime is None else airtime)
         self._queue.append((self._free - self._early, packet))
@@ -62,7 +63,7 @@ class AirtimeClock(Generic[T]):
         return over
 
     def grants(self, now: float) -> int:
-        """Credits to give out at ``now``; they count as given."""
+        """Credits to give out at ``now``; they are counted as given."""
         given = 0
         while self._may_grant(now):
             self._unused += 1
@@ -78,7 +79,7 @@ class AirtimeClock(Generic[T]):
 
     @property
     def first_due(self) -> float | None:
-        """When the first packet here may leave, None where there is none."""
+        """When the first queued packet may leave, None if none is queued."""
         return self._queue[0][0] if self._queue else None
 
     @property

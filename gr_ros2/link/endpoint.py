@@ -30,19 +30,19 @@ class Endpoint(Protocol):
 
     @property
     def sent(self) -> SenderStats:
-        """What left and what did not."""
+        """Counters of the sending half."""
 
     @property
     def received(self) -> ReceiverStats:
-        """What arrived and what did not."""
+        """Counters of the receiving half."""
 
     @property
     def idle(self) -> bool:
-        """Whether no message waits, and nothing that has left is worth repairing."""
+        """Whether no message waits, and no packet that has left is worth repairing."""
 
     @property
     def interval(self) -> float:
-        """s from one packet to the next while busy: as configured, or as credits have come; 0 where not known."""
+        """s from one packet to the next while busy: as configured, or as measured from the credits; 0 if unknown."""
 
     @property
     def out_of_credit(self) -> bool:
@@ -55,58 +55,59 @@ class Endpoint(Protocol):
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message.
 
-        It may be refused, and may push out waiting messages of its topic; all are counted and observed.
+        It may be refused, and it may cause waiting messages of its topic to be dropped; all are counted and observed.
 
         :raises ConfigError: for a topic that is not in the registry, or at an end that sends nothing
         """
 
     def missed(self, topic_id: int, total: int) -> None:
-        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted.
+        """Record how many messages of a topic the ROS graph has lost so far, before they could be submitted.
 
-        :param total: since the start; what is new of it is observed
+        :param total: since the start; the increase is reported to the observer
         """
 
     def follow(
         self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
     ) -> bool:
-        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+        """Adapt a topic to the QoS of its publishers, where the configuration leaves it open.
 
-        :param reliable: whether all are
-        :param depth: of their history, 0 unbounded or not known
+        :param reliable: whether all publishers are reliable
+        :param depth: depth of their history, 0 for unbounded or unknown
         :param lifespan_s: s after which a message is useless, 0 without limit
-        :param period_s: s within which they promise a message, 0 no promise
-        :return: whether that changed its queue; ``queue`` has what it is
+        :param period_s: s within which they promise a message, 0 for no promise
+        :return: whether that changed its queue; ``queue`` returns the new values
         """
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """Policy and deadline (s, 0 none) of a topic's queue."""
+        """Policy and deadline (s, 0 for none) of a topic's queue."""
 
     def depth(self, topic_id: int) -> int:
-        """Messages of a topic that may wait, 0 unbounded."""
+        """Number of messages of a topic that may wait, 0 for unbounded."""
 
     def room(self, topic_id: int) -> bool:
-        """Whether a message of that topic could be submitted without pushing another out."""
+        """Whether a message of that topic could be submitted without dropping another one."""
 
     def queued(self) -> dict[int, int]:
-        """Messages waiting or under way, per topic id."""
+        """Messages that wait or are partly sent, per topic id."""
 
     def reconfigure(self, **changes: Any) -> None:
-        """Change settings of what it sends while running.
+        """Change settings of the sending half at run time.
 
         :raises ConfigError: for a value out of range or a setting that cannot change
         """
 
     def keep_incomplete(self, timeout_s: float) -> None:
-        """How long an incomplete message waits for its next fragment, s; version 1 waits while it may be repaired."""
+        """Set how long (s) an incomplete message waits for its next fragment. Version 1 waits while it may be
+        repaired."""
 
     def unpublished(self, event: Delivered) -> Lost:
-        """Book a message that was given out but did not come onto the ROS graph. A repeat of it is given out again."""
+        """Count a message that was delivered but not published on the ROS graph. A repeat of it is delivered again."""
 
     def knows(self, src_id: int) -> bool:
-        """Whether a sender has a place at present."""
+        """Whether the state of a sender is held at present."""
 
     def use_credit(self) -> None:
-        """From now on a packet leaves only for a credit."""
+        """From now on, a packet leaves only when there is a credit."""
 
     def credit(self, packets: int = 1) -> None:
         """The PHY can take this many further packets."""
@@ -118,22 +119,22 @@ class Endpoint(Protocol):
         """Take the bytes of one packet; the events it causes, in order."""
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Do what is due by ``now``; the events it causes, in order. ``next_packet`` is a separate question."""
+        """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
 
     def next_departure(self) -> float | None:
-        """Earliest time at which ``next_packet`` may have something without a further call; None where only a call can
+        """Earliest time at which ``next_packet`` may have something without a further call; None if only a call can
         change that."""
 
     def next_timeout(self) -> float | None:
-        """The same of ``handle_timeout``."""
+        """The same for ``handle_timeout``."""
 
 
 class EndpointV0:
     """An end of version 0. Its receiving half passes nothing on to its sending half.
 
-    :param source: settings of its sending half; None: it sends nothing
-    :param sink: settings of its receiving half; None: it receives nothing
-    :param codecs: of messages sent and received, where the link compresses
+    :param source: settings of its sending half; None if it sends nothing
+    :param sink: settings of its receiving half; None if it receives nothing
+    :param codecs: codecs of messages sent and received, if the link compresses
     :param rng: see :class:`Sender`
     :param observer: called with every SenderEvent, in order
     """
@@ -233,7 +234,7 @@ class EndpointV0:
     def _half(self) -> Sender:
         """The half that sends.
 
-        :raises ConfigError: there is none
+        :raises ConfigError: there is no such half
         """
         if self._sender is None:
             raise ConfigError("an end that sends nothing was asked to; give it a source")

@@ -24,7 +24,7 @@ class Received:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """Bytes from the PHY that are no packet of ours."""
+    """Bytes from the PHY that are not a valid packet."""
 
     data: bytes
     error: WireError
@@ -32,8 +32,8 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: not all of its packets
-    came the first time."""
+    """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
+    packets was lost at first and recovered later."""
 
     src_id: int
     topic_id: int
@@ -45,13 +45,13 @@ class Delivered:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A message of which at least something came will not be delivered.
+    """A message will not be delivered, although at least a part of it arrived.
 
-    ``reason`` is a :class:`gr_ros2.link.ledger_rows.Row`: ``lost_fragments`` (overtaken, contradicted, or behind an
-    outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E);
-    ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (nothing
-    says what its topic is), ``sender_restarted``; or the message is complete and its codec reports
-    ``unknown_dictionary`` or ``damaged``.
+    ``reason`` is a :class:`gr_ros2.link.ledger_rows.Row`: ``lost_fragments`` (overtaken, contradicted, or after an
+    outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E),
+    ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (its topic
+    is not announced or registered), ``sender_restarted``. If the message is complete but cannot be decoded, the reason
+    is that of its codec: ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int
@@ -62,7 +62,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Met:
-    """A robot is heard, for the first time or again.
+    """A robot is heard for the first time or again.
 
     ``boot`` counts its starts; ``hears``: it reports what it hears.
     """
@@ -74,7 +74,7 @@ class Met:
 
 @dataclass(frozen=True, slots=True)
 class Gone:
-    """A robot has been silent for long."""
+    """A robot has been silent for a long time."""
 
     src_id: int
     boot: int
@@ -82,7 +82,7 @@ class Gone:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """A robot's table of topics is here: what the topic ids of the messages that follow mean."""
+    """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
     rows: tuple[TableRow, ...]
@@ -110,8 +110,8 @@ class Accepted:
 class Refused:
     """A submitted message will not be sent, or not completely.
 
-    ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or, of
-    a message whose first fragments have left, ``abandoned``.
+    ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or
+    ``abandoned`` for a message whose first fragments have left.
     """
 
     serial: int
@@ -149,15 +149,15 @@ class SentEntry:
 
 
 AirKind = Literal["new", "repair", "report", "hello"]
-"""What a packet's airtime was spent on: messages; what may have been lost of them; telling what was heard; saying who
-is there, and requests."""
+"""What a packet's airtime was used for: messages; repair of what may have been lost; reports of what was heard; hellos
+and requests."""
 
 
 @dataclass(frozen=True, slots=True)
 class SentPacket:
-    """A packet that left the sender: its bytes, what they say, and of which messages its entries are, in order.
+    """A packet that left the sender: its bytes, their meaning, and the messages to which its entries belong, in order.
 
-    ``entries`` are of messages that go for the first time: a repair has none.
+    ``entries`` are those of messages that are sent for the first time; a repair has none.
     """
 
     data: bytes

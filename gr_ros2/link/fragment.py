@@ -17,8 +17,8 @@ from gr_ros2.wire import Format
 def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: int, wire_format: Format) -> int:
     """Length of the fragments of a message of ``size`` bytes whose first entry is about to be sent.
 
-    Two or more pending topics share packets, k = max(k*(2), k_min); one alone fills them. A message that would need
-    more fragments than it may have at that k is cut to fill packets.
+    Two or more pending topics share packets, k = max(k*(2), k_min); a single one fills them. A message that would need
+    more fragments than allowed at that k is cut to fill packets.
     """
     alone = wire_format.single_entry_payload(packet_len)
     if pending_topics < 2:
@@ -32,7 +32,7 @@ class Outgoing:
     """A message being sent.
 
     :param serial: number of the submitted message
-    :param payload: what goes on the air: the message, coded where the link compresses
+    :param payload: the bytes that are sent: the message, coded if the link compresses
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
     :param weight: weight of its age relative to other topics
@@ -76,7 +76,7 @@ class Outgoing:
         return len(self.payload) - self.offset
 
     def take(self, length: int) -> bytes:
-        """The next fragment, of that many bytes."""
+        """The next fragment, of this many bytes."""
         payload = self.payload[self.offset : self.offset + length]
         self.index += 1
         self.offset += length

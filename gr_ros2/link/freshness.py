@@ -32,7 +32,7 @@ from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY, Format
 TURN = 4
 """One packet in this many belongs to the topic whose last turn is longest ago."""
 FIRST_AGE_S = 1.0
-"""Age in s that a topic is assumed to have when its first message comes."""
+"""Age in s that a topic is assumed to have when its first message arrives."""
 LARGE = 4
 """A message of this many packets or more is cut with slack, so that it can fill the space that others leave."""
 
@@ -43,17 +43,17 @@ Queues = Mapping[int, Sequence[Outgoing]]
 
 
 def value(message: Outgoing, before: float, cost: int) -> float:
-    """What a message is worth per byte of air.
+    """The value of a message per byte sent.
 
-    :param before: submission time of the one of its topic sent before it, s
-    :param cost: bytes that it takes beside its payload
+    :param before: submission time of the previous sent message of its topic, s
+    :param cost: bytes that it takes in addition to its payload
     """
     younger = message.submitted - before
     return message.weight * younger * younger / (message.remaining + cost)
 
 
 class Turns:
-    """Whose turn it is: every ``TURN``-th packet belongs to the topic whose last turn is longest ago."""
+    """Decides whose turn it is: every ``TURN``-th packet belongs to the topic whose last turn is longest ago."""
 
     def __init__(self) -> None:
         self._line: list[int] = []
@@ -96,7 +96,7 @@ class _Packing:
 
 
 class FreshnessScheduler:
-    """See the module's first lines.
+    """The scheduler that the head of this module describes.
 
     :param registry: says which topics are of class latency
     """
@@ -179,7 +179,7 @@ class FreshnessScheduler:
         return True
 
     def _cut(self, packing: _Packing, message: Outgoing) -> bool:
-        """Fix ``total`` and ``cut`` of a message that would start in this packet; False where it is better to wait."""
+        """Fix ``total`` and ``cut`` of a message that would start in this packet; False if it is better to wait."""
         size, room = len(message.payload), packing.room()
         if size <= room:
             message.total, message.cut = 1, size
@@ -207,7 +207,7 @@ class FreshnessScheduler:
         return max(cut, 1)
 
     def _needs(self, message: Outgoing) -> int:
-        """Bytes that the next fragment of a message is to have room for in its turn."""
+        """Bytes of space that the next fragment of a message needs in its turn."""
         if message.started:
             return min(message.cut, message.remaining - (message.total - message.index - 1))
         return max(min(len(message.payload), self._most(message)), 1)

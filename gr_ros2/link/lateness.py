@@ -1,20 +1,20 @@
-"""How much later than due things happen, where a computer has to keep up with a clock.
+"""Measures how much later than due things happen, where a computer has to keep up with a clock.
 
-Invariant: what was late by ``LATE_S`` or more is kept as a moment, from when it was due until it happened; moments that
-touch are one, so that there are no more than the time that passes has room for.
+Invariant: a delay of ``LATE_S`` or more is stored as an interval from the due time to the actual time. Intervals that
+touch are merged, so their number is bounded by the time that has passed.
 """
 
 from __future__ import annotations
 
 LATE_S = 0.05
-"""s. Less is what any system that shares its processor does now and then, and what queues of a few packets carry."""
+"""s. Smaller delays are normal on a system that shares its processor, and queues of a few packets absorb them."""
 
 
 class Lateness:
-    """Of one part of a run, by one thread; others may read.
+    """The delays of one part of a run, recorded by one thread; other threads may read.
 
-    :ivar worst: s, the most that anything was late
-    :ivar moments: (due, happened), s on the caller's clock, by time
+    :ivar worst: s, the longest delay
+    :ivar moments: (due, happened), s on the caller's clock, in order of time
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Lateness:
         self.moments: list[tuple[float, float]] = []
 
     def happened(self, due: float, now: float) -> None:
-        """Something that was due happens at ``now``; in the order in which things happen."""
+        """Record that something that was due happens at ``now``. Calls must be in the order of the events."""
         late = now - due
         self.worst = max(self.worst, late)
         if late < LATE_S:

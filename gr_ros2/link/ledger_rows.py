@@ -56,7 +56,7 @@ class LedgerRow(str, Enum):
 
 
 ARRIVED = (LedgerRow.DELIVERED, LedgerRow.REPAIRED)
-"""Where what was delivered ends."""
+"""The rows of delivered messages."""
 
 
 def arrived(rows: Mapping[str, int]) -> int:
@@ -65,4 +65,4 @@ def arrived(rows: Mapping[str, int]) -> int:
 
 
 ROWS = {row.value: row for row in LedgerRow}
-"""By name. Results of another version may have rows that are not here."""
+"""The rows by name. Results of another version may have rows that are not here."""

@@ -16,7 +16,7 @@ from gr_ros2.config import BurstLoss, ChannelConfig
 class PduLosses:
     """Decides for each packet whether it passes.
 
-    :param config: ``packet_loss``, ``burst_loss``, ``outages`` and ``seed`` of it
+    :param config: its ``packet_loss``, ``burst_loss``, ``outages`` and ``seed`` are used
     """
 
     def __init__(self, config: ChannelConfig) -> None:

@@ -29,7 +29,7 @@ _Observer = TypeVar("_Observer", bound=LinkObserver)
 
 
 class Observers(Generic[_Observer]):
-    """Hands every event to several observers in their order, each under a guard of its own."""
+    """Passes every event to several observers in their order, each under its own guard."""
 
     def __init__(self, observers: Iterable[_Observer] = ()) -> None:
         self._guarded: tuple[tuple[_Observer, Guard], ...] = ()

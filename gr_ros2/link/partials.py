@@ -18,12 +18,12 @@ _FRAGMENT_COST = 64
 
 @dataclass(slots=True, eq=False)
 class Partial:
-    """A message of which not all fragments are here.
+    """A message of which a fragment is missing.
 
     :ivar number: its entry id unwrapped
-    :ivar last: s, when its last fragment came
+    :ivar last: time at which its last fragment came, s
     :ivar size: bytes that it takes
-    :ivar following: the index that a sender which keeps the order sends next
+    :ivar following: the index of the next fragment of a sender that sends fragments in order
     :ivar doubtful: the sender used its id for another message at the same time
     """
 
@@ -50,11 +50,11 @@ class Partial:
 
 
 class Partials:
-    """See the module's first lines."""
+    """Holds the incomplete messages; see the head of this module."""
 
     def __init__(self) -> None:
         self.size = 0
-        """Bytes of all."""
+        """Bytes of all held messages."""
         self._sizes: Counter[int] = Counter()
         self._in_order: OrderedDict[Partial, None] = OrderedDict()
         self._of: dict[tuple[int, int], dict[int, Partial]] = {}
@@ -101,7 +101,7 @@ class Partials:
         return b"".join([partial.fragments[index] for index in range(partial.total)])
 
     def take(self, partial: Partial) -> Partial:
-        """Hold a message no longer."""
+        """Stop holding a message."""
         del self._in_order[partial]
         del self._of[partial.src_id, partial.topic_id][partial.entry_id]
         self.size -= partial.size

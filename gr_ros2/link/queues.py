@@ -54,7 +54,7 @@ class TopicQueue(deque[Outgoing]):
             message.expires = self._expiry(message)
 
     def room(self, depth: int) -> bool:
-        """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 unbounded."""
+        """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 for unbounded."""
         if self.policy == "latest":
             return not self or (len(self) == 1 and self[0].started)
         return not depth or len(self) < depth
@@ -78,9 +78,9 @@ class TopicQueue(deque[Outgoing]):
     def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
         """Drop the messages that cannot be delivered in time, even if they had the link to themselves.
 
-        :param interval: s from one packet to the next, 0 where not known
+        :param interval: s from one packet to the next, 0 if unknown
         :param lead: s between composing a packet and its first sample
-        :param payload: bytes of a message that fit a packet
+        :param payload: bytes of a message that fit in a packet
         """
         if not self.deadline_s:
             return
@@ -127,12 +127,13 @@ def queue_for(
     """The policy of a topic's queue and its deadline in s (0 = none): the configured ones, otherwise from its
     publishers' QoS.
 
-    A configured ``queue`` stands as it is. A history of one message, which the registry may set too, or a promise of
-    one per period says that only the newest matters: ``latest``. A lifespan says when a message becomes useless.
+    A configured ``queue`` is used as it is. A history of one message (which the registry may set too) or a promise of
+    one message per period means that only the newest message matters: ``latest``. A lifespan says when a message
+    becomes useless.
 
-    :param depth: of the publishers' history, 0 unbounded or not known
+    :param depth: depth of the publishers' history, 0 for unbounded or unknown
     :param lifespan_s: s, 0 without limit
-    :param period_s: their deadline: s within which they promise a message, 0 no promise
+    :param period_s: the publishers' deadline: s within which they promise a message, 0 for no promise
     """
     if options.queue != AUTO:
         return options.queue, 0.0 if options.deadline_s == AUTO else options.deadline_s

@@ -31,9 +31,9 @@ from gr_ros2.wire.v0 import V0, Entry
 
 OVERTAKEN = 64
 _PATIENT = 192
-"""Ids that must have passed unseen where the packet numbers show no loss; most likely the sender paused."""
+"""Number of ids that must have passed unseen when the packet numbers show no loss; most likely the sender paused."""
 _STALL_S = 0.5
-"""s that a sender or receiver may hang between packets, however fast it is: at 30,000 packets/s 192 ids take 0.1 s."""
+"""s for which a sender or receiver may stop between packets. At 30,000 packets/s, 192 ids take only 0.1 s."""
 _HISTORY = 128
 _RESTART_JUMP = 4096
 _NOWHERE = (-1, -1)
@@ -58,9 +58,9 @@ class Context:
 
 
 class TopicReassembler:
-    """Decides which entries of one source and topic are of one message.
+    """Decides which entries of one source and topic belong to one message.
 
-    :param partials: holds the incomplete ones
+    :param partials: holds the incomplete messages
     """
 
     def __init__(self, src_id: int, topic_id: int, partials: Partials) -> None:
@@ -72,7 +72,7 @@ class TopicReassembler:
         self._history: deque[tuple[int, int, int, int]] = deque(maxlen=_HISTORY)
         """(packet position, message number, index, epoch) of the last entries."""
         self._latest = self._settled = _NOWHERE
-        """The highest (message number, index) seen at all, and before the last missed packet."""
+        """The highest (message number, index) seen so far, and the highest one before the last missed packet."""
         self._orderly = True
         """Whether the sender has kept the rules since the last reset."""
         self._epoch = 0

@@ -40,7 +40,7 @@ class Receiver:
     """Reassembles the messages of every source heard.
 
     :param registry: says which topic ids exist and which are transient-local
-    :param codec: decodes messages from packets with C = 1, which without it are ``unsupported``
+    :param codec: decodes messages from packets with C = 1; without it, such packets are ``unsupported``
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Receiver:
         return events
 
     def next_timeout(self) -> float | None:
-        """When ``handle_timeout`` has something to do, None while nothing is incomplete."""
+        """When ``handle_timeout`` has something to do, None if no message is incomplete."""
         for partial in self._partials:
             return partial.last + self.config.reassembly_timeout_s
         return None
@@ -96,7 +96,7 @@ class Receiver:
         return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
-        """Whether a sender has a place at present."""
+        """Whether the state of a sender is held at present."""
         return src_id in self._sources
 
     @property

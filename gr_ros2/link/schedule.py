@@ -33,12 +33,12 @@ class Plan:
 
 
 class Scheduler(Protocol):
-    """Chooses what goes into the next packet. Made of the source's configuration, its registry and its wire format."""
+    """Chooses what goes into the next packet. It is made from the source's configuration, registry and wire format."""
 
     config: SourceConfig
 
     def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
-        """The next packet's content from the messages waiting per topic id, or None where nothing is waiting."""
+        """The next packet's content from the messages waiting per topic id, or None if nothing is waiting."""
 
     def sent(self, plan: Plan) -> None:
         """The last plan was executed."""

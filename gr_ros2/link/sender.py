@@ -1,8 +1,8 @@
 """The sending engine: messages in, packets out.
 
 Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
-has them); a message whose first fragment was sent is dropped only when its deadline cannot be met any more; packets
-come out only when the pace (rate or credit) allows; a packet is composed when it is asked for, never before; time is
+lists them); a message whose first fragment was sent is dropped only when its deadline cannot be met any more; packets
+leave only when the pace (rate or credit) allows; a packet is composed when it is requested, never before; time is
 an argument and never goes back.
 """
 
@@ -41,9 +41,9 @@ Observer = Callable[[SenderEvent], None]
 class Sender:
     """Cuts, queues and packs messages of one source.
 
-    :param registry: gives topic ids their options; ``config.topic_options`` go over them
-    :param codec: codes every message, which C = 1 says in every packet; events carry the message as submitted
-    :param rng: seeds the start of sequence number and entry ids, and gives random ids where those are configured
+    :param registry: gives topic ids their options; ``config.topic_options`` override them
+    :param codec: codes every message, and every packet then has C = 1; events carry the message as submitted
+    :param rng: seeds the first sequence number and entry ids, and gives random ids where those are configured
     :param observer: called with every SenderEvent, in order
     """
 
@@ -94,8 +94,8 @@ class Sender:
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message.
 
-        It may be refused (``too_large``), and may push out waiting messages of its topic (``queue_bound`` or
-        ``superseded``); all are counted and observed.
+        It may be refused (``too_large``), and it may cause waiting messages of its topic to be dropped
+        (``queue_bound`` or ``superseded``); all are counted and observed.
 
         :raises ConfigError: for a topic id that is not in the registry
         """
@@ -153,7 +153,7 @@ class Sender:
         return data
 
     def next_timeout(self) -> float | None:
-        """Earliest time at which ``next_packet`` may give something without a further submit or credit."""
+        """Earliest time at which ``next_packet`` may return a packet without a further submit or credit."""
         if self.out_of_credit:
             return None
         times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
@@ -165,11 +165,11 @@ class Sender:
         return max(min(times), self._slot) if times else None
 
     def follow(self, topic_id: int, *, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0) -> bool:
-        """Let a topic's queue follow the QoS of its publishers, as far as the configuration leaves it open.
+        """Adapt a topic's queue to the QoS of its publishers, where the configuration leaves it open.
 
-        :param depth: of their history, 0 unbounded or not known
+        :param depth: depth of their history, 0 for unbounded or unknown
         :param lifespan_s: s after which a message is useless, 0 without limit
-        :param period_s: s within which they promise a message, 0 no promise
+        :param period_s: s within which they promise a message, 0 for no promise
         :return: whether the policy or deadline changed; ``queue`` returns them
         """
         queue = self._queues[topic_id]
@@ -181,17 +181,17 @@ class Sender:
         return True
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """Policy and deadline (s, 0 none) of a topic's queue."""
+        """Policy and deadline (s, 0 for none) of a topic's queue."""
         queue = self._queues[topic_id]
         return queue.policy, queue.deadline_s
 
     def depth(self, topic_id: int) -> int:
-        """Messages of a topic that may wait, 0 unbounded."""
+        """Number of messages of a topic that may wait, 0 for unbounded."""
         depth = self.registry[topic_id].options.queue_depth
         return self.config.queue_depth if depth == AUTO else depth
 
     def use_credit(self) -> None:
-        """From now on a packet leaves only for a credit, unless it is :attr:`unpaced`."""
+        """From now on, a packet leaves only when there is a credit, unless the sender is :attr:`unpaced`."""
         if self._credits is None:
             self._credits = 0
 
@@ -211,7 +211,7 @@ class Sender:
 
     @property
     def _rate(self) -> float:
-        """Packets/s at most, 0 without limit."""
+        """Most packets/s, 0 without limit."""
         return 0.0 if self.config.packet_rate == AUTO else self.config.packet_rate
 
     def room(self, topic_id: int) -> bool:
@@ -222,7 +222,7 @@ class Sender:
     def interval(self) -> float:
         """s from one packet to the next while the source is busy: from ``packet_rate``, or measured from the credits.
 
-        0 where neither is known.
+        0 if neither is known.
         """
         if self._rate:
             return 1 / self._rate
@@ -234,7 +234,7 @@ class Sender:
         return not any(self._queues.values())
 
     def queued(self) -> dict[int, int]:
-        """Messages waiting or under way, per topic id."""
+        """Messages that wait or are partly sent, per topic id."""
         return {topic_id: len(queue) for topic_id, queue in self._queues.items()}
 
     def reconfigure(self, **settings: Any) -> None:
@@ -272,7 +272,7 @@ class Sender:
         return self._plan
 
     def _expire(self, now: float) -> None:
-        """Drop messages that are too late, or would be."""
+        """Drop messages that are too late or will be too late."""
         for queue in self._with_deadline:
             if queue:
                 payload = V0.single_entry_payload(self.config.packet_len)
@@ -288,7 +288,7 @@ class Sender:
                 continue
             self._refuse(message.serial, message.topic_id, item.row, item.detail)
             if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
-                # The message is useless now, or a newer one exists; so it is not kept for robots that join late either.
+                # The message is useless now, or a newer one exists; so it is not kept for robots that join late.
                 del self._latched[message.topic_id], self._repeat_at[message.topic_id]
 
     def _spend_credit(self, now: float) -> None:
@@ -386,7 +386,7 @@ def _queue(topic: Topic) -> TopicQueue:
 
 
 def _packet_qos(plan: Plan) -> int:
-    """Latency if any entry is, bulk only if all are."""
+    """The packet's class: latency if any entry is latency, bulk only if all are bulk."""
     if len(plan.picks) == 1:
         return plan.picks[0].qos
     classes = {message.qos for message in plan.picks}

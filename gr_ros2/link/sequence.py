@@ -42,7 +42,7 @@ class Pace:
     """How long a count takes at its recent rate.
 
     :param window: counts remembered
-    :param least: counts that must have been seen before a rate is believed
+    :param least: counts that must have been seen before a rate is used
     """
 
     def __init__(self, window: int, least: int) -> None:
@@ -53,7 +53,7 @@ class Pace:
         self._now: float | None = None
 
     def observe(self, now: float, count: int) -> None:
-        """``count`` further ones have passed by ``now``."""
+        """Record that ``count`` further ones have passed by ``now``."""
         self._elapsed += 0.0 if self._now is None else now - self._now
         self._now = now
         self._count += count

@@ -1,6 +1,6 @@
 """What both halves of an end have counted since the start.
 
-Invariant: counters only grow, but for estimates of loss, which a packet that comes late takes back.
+Invariant: counters only grow. The exceptions are the estimates of loss: a packet that arrives late lowers them.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class SenderStats:
-    """What left and what did not.
+    """Counters of the sending half.
 
     ``refused`` is keyed by (topic_id, reason); ``missed`` are messages that the ROS graph lost before ``submit``;
-    ``air`` counts packets by what they were spent on (:data:`gr_ros2.link.events.AirKind`).
+    ``air`` counts packets by their use (:data:`gr_ros2.link.events.AirKind`).
     """
 
     submitted: Counter[int] = field(default_factory=Counter)
@@ -30,14 +30,14 @@ class SenderStats:
 
 @dataclass(slots=True)
 class ReceiverStats:
-    """What arrived and what did not.
+    """Counters of the receiving half.
 
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic, and
-    early, which were kept until their sender had said how to open them; ``delivered``, what was given out, by
-    (src_id, topic_id), and ``repaired``, those of them that were not all there at first; ``lost`` by (src_id, topic_id,
-    reason); ``packet_loss_est`` from gaps in packet numbers and ``message_loss_est`` from gaps in entry ids and
-    messages given up are estimates; ``unknown_gaps`` counts where a sender restarted or was silent for long, so that
-    nothing is known of what was lost.
+    early (kept until their sender had said how to open them); ``delivered`` by (src_id, topic_id); ``repaired``, those
+    delivered messages of which a packet was lost at first; ``lost`` by (src_id, topic_id, reason). Two counters are
+    estimates: ``packet_loss_est`` from gaps in packet numbers, and ``message_loss_est`` from gaps in entry ids and
+    messages given up. ``unknown_gaps`` counts how often a sender restarted or was silent for long, so that the number
+    of lost packets is unknown.
     """
 
     packets: int = 0

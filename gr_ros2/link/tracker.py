@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 from gr_ros2.link.events import Accepted, Delivered, Lost, SentEntry
 
 REPEATS = 4096
-"""Keys of repeats remembered of a sender; those of the oldest repeats are forgotten first."""
+"""Number of repeat keys remembered per sender; those of the oldest repeats are forgotten first."""
 
 
 def digest_of(payload: bytes) -> bytes:
@@ -28,10 +28,10 @@ def digest_of(payload: bytes) -> bytes:
 class Tracked:
     """A message whose fate is not known yet.
 
-    :ivar digest: of the bytes that the other end should publish
+    :ivar digest: digest of the bytes that the other end should publish
     :ivar key: topic id and the engine's key, once its first fragment has left
-    :ivar total: fragments, 0 while not known
-    :ivar sent: fragments that have left
+    :ivar total: number of fragments, 0 while unknown
+    :ivar sent: number of fragments that have left
     """
 
     serial: int
@@ -61,7 +61,7 @@ _Index = TypeVar("_Index", bound=Hashable)
 class Tracker(Generic[T]):
     """The open messages of one sender, and its repeats.
 
-    :param most: open messages kept, the oldest are forgotten first; 0 all
+    :param most: most open messages kept, the oldest are forgotten first; 0 keeps all
     """
 
     def __init__(self, most: int = 0) -> None:
@@ -78,11 +78,11 @@ class Tracker(Generic[T]):
 
     @property
     def open(self) -> Iterable[T]:
-        """Oldest first."""
+        """The open messages, oldest first."""
         return self._open.values()
 
     def get(self, serial: int) -> T | None:
-        """The open message of that number."""
+        """The open message with that serial number."""
         return self._open.get(serial)
 
     def add(self, message: T) -> None:
@@ -121,7 +121,7 @@ class Tracker(Generic[T]):
         return (event.topic_id, event.key) in self._repeats
 
     def find(self, event: Delivered) -> T | None:
-        """The open message of a delivery, None where there is none."""
+        """The open message of a delivery, None if there is none."""
         digest = digest_of(event.payload)
         for message in self._by_key.get((event.topic_id, event.key), {}).values():
             if message.digest == digest:

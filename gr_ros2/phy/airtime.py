@@ -27,13 +27,13 @@ _ONE = pmt.from_long(1)
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
 
-    :param airtime: s one packet occupies, gap included; 0 lets packets pass at once
-    :param airtime_of: the same by the packet's bytes, at most ``airtime``; None = that of all
-    :param lead: s before the air is free at which a credit is given
-    :param early: s before its airtime is over at which a packet passes, see :class:`AirtimeClock`
-    :param times: keep when each packet passed; a link that runs without end would keep too many
-    :ivar lateness: of packets against when they were to pass
-    :ivar passed_at: s, monotonic, of every packet; empty unless asked for
+    :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
+    :param airtime_of: the airtime for a packet's bytes, at most ``airtime``; None = all packets have the same
+    :param lead: s before the channel is free at which a credit is given
+    :param early: s before the end of its airtime at which a packet passes, see :class:`AirtimeClock`
+    :param times: store when each packet passed; off by default, since a link that runs without end would store too many
+    :ivar lateness: delays of packets after the time at which they should pass
+    :ivar passed_at: s, monotonic, of every packet; empty if ``times`` is off
     :raises ConfigError: for a value out of range
     """
 
@@ -64,7 +64,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     @property
     def backlog(self) -> int:
-        """Packets waiting for the air or on it."""
+        """Packets that wait for the channel or occupy it."""
         return self._clock.backlog
 
     def start(self) -> bool:

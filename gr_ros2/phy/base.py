@@ -2,7 +2,7 @@
 
 A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
 and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
-on the message port itself. Invariant: how long a packet is on the air depends on its length alone.
+on the message port itself. Invariant: the airtime of a packet depends on its length alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PacketTransmitter(Protocol):
         """Packets that have left it as samples."""
 
     def release(self) -> None:
-        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+        """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
 
 
 class SymbolSource(Protocol):
@@ -57,14 +57,14 @@ class PacketReceiver(Protocol):
 
     @property
     def snr_db(self) -> float | None:
-        """SNR of the newest packets, dB over the sampled band; None before the first, or where the PHY does not measure
+        """SNR of the newest packets, dB over the sampled band; None before the first, or if the PHY does not measure
         it."""
 
     def tap_symbols(self) -> SymbolSource | None:
-        """Make the decoded symbols visible; None where the PHY cannot. Call it once, before the start."""
+        """Make the decoded symbols visible; None if the PHY cannot. Call it once, before the start."""
 
     def release(self) -> None:
-        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+        """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -100,23 +100,23 @@ class Phy(ABC):
 
     @property
     def any_length(self) -> bool:
-        """Whether packets may be shorter than ``packet_len``, and then take less of the air."""
+        """Whether packets may be shorter than ``packet_len``, and then take less airtime."""
         return False
 
     def pad_all(self) -> None:  # noqa: B027 - most PHYs have nothing to do
-        """From now on :attr:`any_length` is False: for what counts samples to tell packets apart."""
+        """From now on :attr:`any_length` is False. Needed if packets are told apart by counting samples."""
 
     @abstractmethod
     def airtime_samples(self, packet_len: int | None = None) -> int:
         """Samples one packet occupies on the air, gap included; 0 for a PHY without samples.
 
-        :param packet_len: its bytes, None = those of the longest; of no account where :attr:`any_length` is False
+        :param packet_len: its bytes, None = the longest; ignored if :attr:`any_length` is False
         """
 
     def airtime(self, packet_len: int | None = None) -> float:
         """Seconds one packet occupies on the air, gap included.
 
-        :param packet_len: its bytes, as for :meth:`airtime_samples`
+        :param packet_len: its bytes, as in :meth:`airtime_samples`
         """
         return self.airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
 
@@ -136,8 +136,8 @@ class Phy(ABC):
     def check_channel(self, channel: ChannelConfig) -> None:
         """Refuse channel settings that this PHY cannot apply.
 
-        :raises ConfigError: for a setting that acts on samples where there are none, or a Doppler shift beyond what
-            the samples show; names it
+        :raises ConfigError: for a setting that acts on samples if there are none, or a Doppler shift too large for the
+            sample rate; names it
         """
         sampled = channel.on_samples()
         if sampled and not self.has_samples:

@@ -1,4 +1,4 @@
-"""Bursts without GNU Radio: frames, what a modem is, and cutting packets out of a stream of samples.
+"""Bursts without GNU Radio: frames, the interface of a modem, and extracting packets from a stream of samples.
 
 Invariants: sans-IO, arrays in and bytes out; every frame ends in a CRC-32, so each output packet equals the packet
 sent; a packet comes out as soon as its last sample is in; samples between bursts are examined once; a damaged frame is
@@ -27,11 +27,11 @@ Octets = NDArray[np.uint8]
 
 CRC_LEN = 4
 _KEPT = 128
-"""Frames: the code of a long one takes some 100 kB."""
+"""Number of frames kept: the code of a long frame takes some 100 kB."""
 _LOOKED_BACK = 16
 """Packets whose SNRs are averaged (median): a single preamble is short, and gives the SNR only to 1 dB."""
 _LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
-"""Limits of a measured SNR: below no packet arrives, above only rounding errors remain."""
+"""Limits of a measured SNR: no packet arrives below it; only rounding errors remain above it."""
 _SPARE = 1 << 16
 """Samples that a receiver's memory holds in addition to one burst; a larger memory is moved less often."""
 
@@ -41,9 +41,9 @@ class Frame:
 
     :param packet_len: bytes of the packet
     :param fill: zero bytes after the packet, covered by the CRC
-    :param mask: what the bytes are whitened with
-    :param code: for all bits of the frame
-    :param order: whether a byte's first bit on the air is its highest or its lowest
+    :param mask: whitening sequence of the bytes
+    :param code: code for all bits of the frame
+    :param order: whether a byte's highest or lowest bit is sent first
     """
 
     def __init__(self, packet_len: int, fill: int, mask: Octets, code: Code, order: BitOrder) -> None:
@@ -52,7 +52,7 @@ class Frame:
 
     @property
     def bits(self) -> int:
-        """Bits on the air."""
+        """Bits sent."""
         return self._code.coded_bits
 
     @property
@@ -61,13 +61,13 @@ class Frame:
         return self._code.bits
 
     def wrap(self, packet: bytes) -> Bits:
-        """A frame's bits in the order they are sent in."""
+        """A frame's bits, in the order in which they are sent."""
         filled = packet + self._fill
         whole = filled + zlib.crc32(filled).to_bytes(CRC_LEN, "little")
         return self._code.encode(np.unpackbits(np.frombuffer(whole, np.uint8) ^ self._mask, bitorder=self._order))
 
     def unwrap(self, soft: Soft) -> bytes | None:
-        """The packet of these soft bits, or None where the CRC-32 does not match."""
+        """The packet of these soft bits, or None if the CRC-32 does not match."""
         whole = (np.packbits(self._code.decode(soft[: self.bits]), bitorder=self._order) ^ self._mask).tobytes()
         filled = whole[:-CRC_LEN]
         if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
@@ -76,14 +76,14 @@ class Frame:
 
 
 class Frames:
-    """The frames of a link, one for each length of packet.
+    """The frames of a link, one for each packet length.
 
     :param packet_len: bytes of the longest packet
     :param fec: name of the code
-    :param fixed: every packet has that many bytes; otherwise 1 to that many, and each burst says how many
-    :param order: whether a byte's first bit on the air is its highest or its lowest
+    :param fixed: every packet has that many bytes; otherwise 1 to that many, and each burst carries the number
+    :param order: whether a byte's highest or lowest bit is sent first
     :param multiple: a frame's bytes are filled up with zeros to a multiple of this
-    :param mask: what the bytes of the longest frame are whitened with, shorter ones with its beginning; None = PN9
+    :param mask: whitening sequence of the longest frame; shorter frames use its beginning; None = PN9
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Frames:
         self._mask = whitening(self.length(packet_len)) if mask is None else mask
         self._codes = Codes(fec)
         self.of = lru_cache(maxsize=_KEPT)(self._make)
-        """The frame of a packet of so many bytes."""
+        """The frame by the bytes of its packet."""
 
     def __reduce__(self) -> Any:
         # Codes hold GNU Radio objects, which cannot be sent to another process: that process makes its own.
@@ -110,23 +110,23 @@ class Frames:
 
     @property
     def lengths(self) -> range:
-        """Bytes that a packet may have."""
+        """Allowed packet lengths, bytes."""
         return range(self.packet_len if self.fixed else 1, self.packet_len + 1)
 
     def length(self, packet_len: int) -> int:
-        """Bytes of the frame of a packet of so many."""
+        """Bytes of the frame of a packet of ``packet_len`` bytes."""
         return packet_len + self.fill(packet_len) + CRC_LEN
 
     def fill(self, packet_len: int) -> int:
-        """Zero bytes behind a packet of so many."""
+        """Zero bytes after a packet of ``packet_len`` bytes."""
         return -(packet_len + CRC_LEN) % self._multiple
 
     def data_bits(self, packet_len: int) -> int:
-        """Bits of the frame of a packet of so many bytes, before coding."""
+        """Bits of the frame of a packet of ``packet_len`` bytes, before coding."""
         return 8 * self.length(packet_len)
 
     def bits(self, packet_len: int) -> int:
-        """The same on the air."""
+        """Bits of that frame after coding."""
         return self._codes.coded_bits(self.data_bits(packet_len))
 
     def _make(self, packet_len: int) -> Frame:
@@ -150,7 +150,7 @@ class Search:
     """Result of a search: where a burst begins, or how many samples contain none.
 
     :param searched: samples from the front that need not be examined again
-    :param start: index of a burst's reference sample, None where there is none (yet)
+    :param start: index of a burst's reference sample, None if there is none (yet)
     """
 
     searched: int
@@ -165,7 +165,7 @@ class Reading:
     :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; fill bits may follow
     :param points: the received constellation points, for display; magnitude about 1
     :param snr: mean power of the burst over that of the noise in the sampled band, measured on its preamble
-    :param end: index behind its last sample that was needed
+    :param end: index after its last sample that was needed
     """
 
     length: int
@@ -181,8 +181,8 @@ class ModemConstants:
 
     :param kernel: name of the kernel
     :param values: the kernel's parameters by name
-    :param soft_bits: number of soft bits of a reading at most, with those that say the length
-    :param points: number of points of a reading at most
+    :param soft_bits: most soft bits of a reading, including those of the length
+    :param points: most points of a reading
     """
 
     kernel: str
@@ -194,7 +194,7 @@ class ModemConstants:
 class BurstModem(ABC):
     """A modulation for the frames of a link.
 
-    :param frames: what bursts carry
+    :param frames: the frames that bursts carry
     """
 
     margin = 0
@@ -207,17 +207,17 @@ class BurstModem(ABC):
 
     @abstractmethod
     def samples_of(self, packet_len: int) -> int:
-        """Samples of the burst of a packet of so many bytes as sent, without gap."""
+        """Samples of the burst of a packet of ``packet_len`` bytes as sent, without gap."""
 
     @property
     def burst_samples(self) -> int:
-        """Those of the longest."""
+        """Samples of the longest burst."""
         return self.samples_of(self.frames.packet_len)
 
     @property
     @abstractmethod
     def span(self) -> int:
-        """Samples from the reference sample on that ``end`` needs, at most those of the shortest burst."""
+        """Samples from the reference sample on that ``end`` needs; at most those of the shortest burst."""
 
     @property
     @abstractmethod
@@ -243,14 +243,14 @@ class BurstModem(ABC):
 
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
-        """The burst whose reference sample is at ``start``, None where the close examination finds no burst."""
+        """The burst whose reference sample is at ``start``; None if the close examination finds no burst."""
 
     def constants(self) -> ModemConstants | None:
         """The parameters of the compiled kernel of this modem; None where there is no kernel."""
         return None
 
     def lengths(self) -> dict[str, Any]:
-        """Those of the constants that tell of the lengths of packets."""
+        """The constants that describe packet lengths."""
         lengths = self.frames.lengths
         bits = [self.frames.bits(length) for length in lengths]
         return {"shortest": lengths[0], "longest": lengths[-1], "frame_bits": bits}
@@ -279,7 +279,7 @@ class BurstReceiver:
     def snr_db(self) -> float | None:
         """SNR over the sampled band, dB, -40..60: the median of the newest packets; None before the first.
 
-        To be called from any thread.
+        May be called from any thread.
         """
         if not self._snrs:
             return None
@@ -310,16 +310,16 @@ class BurstReceiver:
         return len(self._buffer) - self._end
 
     def _finite(self, last: int) -> bool:
-        """Whether the burst's samples up to one are numbers."""
+        """Whether the burst's samples up to ``last`` are finite numbers."""
         assert self._start is not None
         burst = self._buffer[max(0, self._start - self._modem.margin) : min(last + self._modem.margin, self._end)]
         return isfinite(np.vdot(burst, burst).real)
 
     def _ending(self) -> int:
-        """Index behind the last sample that reading the burst needs."""
+        """Index after the last sample that reading the burst needs."""
         assert self._start is not None
         head = self._start + self._modem.span
-        # A head that holds what is no number says nothing of what follows; nor is anything read of it.
+        # A head with values that are not finite gives no length, and such a burst is not read.
         return self._modem.end(self._buffer[: self._end], self._start) if self._finite(head) else head
 
     def _take(self) -> list[bytes]:

@@ -1,7 +1,7 @@
 """GNU Radio blocks around a burst modem: PDUs in, samples out, and back.
 
-Invariants: a PDU that is no packet of a length there is is counted and dropped, never sent; each burst leaves at once,
-its gap behind it; all behaviour is in the modem.
+Invariants: a PDU that is not a packet of an allowed length is counted and dropped, never sent; each burst is sent at
+once, followed by its gap; all behaviour is in the modem.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class BurstOptions:
 
 
 class BurstPhy(Phy):
-    """A PHY made of a burst modem: a subclass sets ``modem``, its numpy form.
+    """A PHY made of a burst modem. A subclass sets ``modem``, the modem's numpy form.
 
     :ivar gap: zero samples after each burst
     """
@@ -71,7 +71,7 @@ class BurstPhy(Phy):
         self.gap: int = _GAP if self.options.gap == AUTO else self.options.gap
 
     def frames(self, **form: Any) -> Frames:
-        """The frames of this link, as set.
+        """The frames of this link, by its settings.
 
         :param form: further arguments of :class:`Frames`
         """
@@ -121,7 +121,7 @@ class BurstTransmitter(TransmitterBlock):
 
     @property
     def refused(self) -> int:
-        """PDUs that were no packet of a length there is."""
+        """PDUs that were not a packet of an allowed length."""
         return self._modulator.refused
 
     def packets_sent(self) -> int:
@@ -131,8 +131,8 @@ class BurstTransmitter(TransmitterBlock):
 class TakesPackets(KeptAlive):
     """Mix-in with message port `pdus` in, for a Python block inside a hier block; list it before GNU Radio's class.
 
-    :param lengths: bytes a packet may have; anything else is dropped and counted
-    :param args: of GNU Radio's class
+    :param lengths: allowed bytes of a packet; any other PDU is dropped and counted
+    :param args: arguments of GNU Radio's class
     """
 
     def __init__(self, lengths: range, *args: Any) -> None:

@@ -46,7 +46,7 @@ _GOLDEN = 0.618
 class Code(ABC):
     """A code for one number of bits.
 
-    :param bits: per frame, before coding
+    :param bits: number of bits per frame, before coding
     """
 
     coded_bits: int
@@ -109,7 +109,7 @@ class Convolutional(Code):
 
     @staticmethod
     def coded(bits: int) -> int:
-        """Bits on the air for so many."""
+        """Coded bits for this number of bits."""
         return 2 * bits + _CC_TAIL
 
     def encode(self, bits: Bits) -> Bits:
@@ -135,7 +135,7 @@ class Blocks(Code):
 
     @staticmethod
     def cut(bits: int, room: int) -> tuple[int, int]:
-        """Blocks, and data bits of each."""
+        """Number of blocks, and data bits of each."""
         count = -(-bits // room)
         return count, -(-bits // count)
 
@@ -146,11 +146,11 @@ class Blocks(Code):
 
 
 class Matrix:
-    """One of GNU Radio's LDPC matrices, which takes it most of a second to set up.
+    """One of GNU Radio's LDPC matrices. GNU Radio needs most of a second to set one up.
 
     :param room: data bits of a block
     :param size: coded bits of a block
-    :raises BackendMissingError: where GNU Radio's matrices are not installed
+    :raises BackendMissingError: if GNU Radio's matrices are not installed
     """
 
     def __init__(self, room: int, size: int, name: str) -> None:
@@ -165,7 +165,7 @@ class Matrix:
 class Ldpc(Blocks):
     """Rate 1/2 and below; sum-product decoder.
 
-    :param matrix: the one that :meth:`shape` names
+    :param matrix: the matrix that :meth:`shape` names
     """
 
     def __init__(self, bits: int, matrix: Matrix) -> None:
@@ -175,12 +175,12 @@ class Ldpc(Blocks):
 
     @staticmethod
     def shape(bits: int) -> tuple[int, int, str]:
-        """Data bits, coded bits and name of the matrix for so many bits."""
+        """Data bits, coded bits and name of the matrix for this number of bits."""
         return next((code for code in _LDPC if bits <= code[0]), _LDPC[-1])
 
     @classmethod
     def coded(cls, bits: int) -> int:
-        """Bits on the air for so many."""
+        """Coded bits for this number of bits."""
         room, size, _ = cls.shape(bits)
         count, each = cls.cut(bits, room)
         return count * (each + size - room)
@@ -209,8 +209,8 @@ class Ldpc(Blocks):
 
 
 def _ldpc_decoder(path: str) -> Any:
-    """A decoder that takes log-likelihood ratios: GNU Radio's decoder does so from 3.10.8 on; before, it takes those of
-    a sigma of √½."""
+    """A decoder that takes log-likelihood ratios. GNU Radio's decoder does so from 3.10.8 on; earlier ones take the
+    ratios for a sigma of √½."""
     try:
         return fec.ldpc_decoder.make(path, 0.5**0.5, _LDPC_ROUNDS)
     except TypeError:
@@ -231,7 +231,7 @@ class Polar(Blocks):
 
     @classmethod
     def coded(cls, bits: int) -> int:
-        """Bits on the air for so many."""
+        """Coded bits for this number of bits."""
         count, each = cls.cut(bits, _POLAR_ROOM)
         return count << int(np.ceil(np.log2(each / _POLAR_RATE)))
 
@@ -257,7 +257,7 @@ def capacities(size: int, design_db: float) -> NDArray[np.float64]:
 
 
 class Codes:
-    """The codes of one name, one for each number of bits; what is dear to make they share.
+    """The codes of one name, one for each number of bits. They share the parts that are expensive to make.
 
     One thread may encode while another decodes.
     """
@@ -267,13 +267,13 @@ class Codes:
         self._matrix = lru_cache(maxsize=len(_LDPC))(Matrix)
 
     def coded_bits(self, bits: int) -> int:
-        """Bits on the air for so many."""
+        """Coded bits for this number of bits."""
         return bits if self.name == "none" else _CODES[self.name].coded(bits)
 
     def of(self, bits: int) -> Code:
-        """The code for frames of so many bits.
+        """The code for frames of this number of bits.
 
-        :raises BackendMissingError: where GNU Radio lacks what it needs
+        :raises BackendMissingError: if GNU Radio lacks a part that the code needs
         """
         if self.name == "none":
             return Uncoded(bits)

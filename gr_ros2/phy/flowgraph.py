@@ -23,8 +23,8 @@ _Self = TypeVar("_Self", bound="Flowgraph")
 class Flowgraph(gr.top_block):  # type: ignore[misc]
     """Blocks that start and stop together, for instance in a ``with`` statement.
 
-    :param name: in GNU Radio's log
-    :param called: its name in errors
+    :param name: name in GNU Radio's log
+    :param called: name in errors
     """
 
     def __init__(self, name: str, called: str) -> None:
@@ -48,7 +48,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
             raise
 
     def stop(self) -> None:
-        """Stop and wait for every thread; harmless when it is not running."""
+        """Stop and wait for every thread; does nothing if it is not running."""
         if self._running:
             self._running = False
             super().stop()
@@ -76,12 +76,12 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
         self._messages: list[tuple[Any, ...]] = []
 
     def msg_connect(self, *ends: Any) -> None:
-        """Connect two message ports, as GNU Radio has it."""
+        """Connect two message ports, with the arguments of GNU Radio's method."""
         super().msg_connect(*ends)
         self._messages.append(ends)
 
     def release(self) -> None:
-        """Let go of everything inside. The flowgraph has stopped, or never ran. Idempotent."""
+        """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
         while self._messages:
             # GNU Radio disconnects a hier block's own port, but then raises, because nothing has subscribed to it.
             with suppress(RuntimeError):
@@ -92,8 +92,8 @@ class HierBlock(gr.hier_block2):  # type: ignore[misc]
 class TransmitterBlock(HierBlock):
     """Message port `pdus` in, complex stream out.
 
-    :param name: in GNU Radio's log
-    :param airtime_samples: of a packet, gap included, where every one has as many
+    :param name: name in GNU Radio's log
+    :param airtime_samples: samples of a packet, gap included, if every packet has the same number
     """
 
     def __init__(self, name: str, airtime_samples: int = 0) -> None:
@@ -104,8 +104,8 @@ class TransmitterBlock(HierBlock):
 
     @property
     def refused(self) -> int:
-        """PDUs that were not a packet of the right length; 0 where GNU Radio's own blocks receive them and do not
-        report this."""
+        """PDUs that were not a packet of the right length; 0 if GNU Radio's own blocks receive them, since these do not
+        report it."""
         return 0
 
     def leave_by(self, block: Any) -> None:
@@ -124,7 +124,7 @@ class TransmitterBlock(HierBlock):
 class ReceiverBlock(HierBlock):
     """Complex stream in, message port `pdus` out. Values that a receiver does not measure are 0 or None.
 
-    :param name: in GNU Radio's log
+    :param name: name in GNU Radio's log
     """
 
     def __init__(self, name: str) -> None:

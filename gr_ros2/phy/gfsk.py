@@ -1,9 +1,10 @@
 """The `gfsk` PHY: binary frequency-shift keying, Gaussian pulses, modulation index 1/2 (GMSK), constant envelope.
 
-Invariant: what is sent is what GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher frequency), so a
-discriminator can receive it too; this receiver does not use one. At modulation index 1/2 the signal is, except for a
-few percent of its energy, a sequence of overlapping pulses whose phase steps by plus or minus 90 degrees (Laurent, IEEE
-Trans. Commun. 34-2, 1986). It is received coherently, about 4 dB better than by a filter and a discriminator.
+Invariant: the samples sent are those that GNU Radio's ``gfsk_mod`` sends for the same bits (bit 1 is the higher
+frequency), so a discriminator can receive them too; this receiver does not use one. At modulation index 1/2 the signal
+is, except for a few percent of its energy, a sequence of overlapping pulses whose phase steps by plus or minus 90
+degrees (Laurent, IEEE Trans. Commun. 34-2, 1986). It is received coherently, about 4 dB better than by a filter and a
+discriminator.
 """
 
 from __future__ import annotations

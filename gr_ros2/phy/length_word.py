@@ -1,8 +1,9 @@
-"""How a burst says how long its packet is: 32 bits of which any two differ in 8 at least.
+"""The length word: 32 bits in a burst that carry the length of its packet. Any two words differ in at least 8 bits.
 
-Invariant: the word of a length is the 32 bits of the header of GNU Radio's OFDM frames (``packet_header_default``): 12
-bits length, 12 bits frame number, CRC-8. GNU Radio counts frames in the number; here it is the parity of the length in
-the extended Golay code (24, 12, 8), so that the likeliest length is right where a packet with a code can be read.
+Invariant: the word of a length has the format of the 32-bit header of GNU Radio's OFDM frames
+(``packet_header_default``): 12 bits length, 12 bits frame number, CRC-8. In the number field, GNU Radio counts frames.
+Here the field holds the parity of the length in the extended Golay code (24, 12, 8). So the most likely length is
+right wherever a packet with a code can be decoded.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from gr_ros2.phy.fec import Bits, Soft
 
 WORD_BITS = 32
 LENGTHS = 1 << 12
-"""Lengths told apart."""
+"""Number of lengths that can be distinguished."""
 _FIELD_BITS, _CRC_BITS = 12, 8
 _WEIGHTS = 1 << np.arange(_FIELD_BITS)
 _GOLAY = 0xAE3
@@ -26,11 +27,11 @@ _GOLAY_CHECKS = 11
 
 
 class LengthWord:
-    """The words of some lengths.
+    """The words of some packet lengths.
 
-    :param lengths: of packets, bytes
-    :param fields: what the length field of each word holds, modulo 4096
-    :param marks: what is added to the number field of each word, for lengths whose length fields are the same
+    :param lengths: packet lengths, bytes
+    :param fields: value of the length field of each word, modulo 4096
+    :param marks: value added to the number field of each word, for lengths with the same length field
     """
 
     def __init__(self, lengths: range, fields: Sequence[int], marks: Sequence[int] | int = 0) -> None:
@@ -39,27 +40,28 @@ class LengthWord:
         numbers = _table(golay_parity)[np.asarray(fields) % LENGTHS] ^ np.asarray(marks)
         same = [place for place, field in enumerate(fields) if field % LENGTHS == self._longest]
         self._numbered = {int(numbers[place]): lengths[place] for place in same}
-        """Of the longest frames' own numbers: the lengths."""
+        """Packet length by number field, for the words whose length field is that of the longest frame."""
         self.bits = header_bits(fields, numbers)
-        """One row per length."""
+        """Bits of the words, one row per length."""
         self.signs = self.bits.astype(np.float32) * 2 - 1
 
     def word(self, length: int) -> Bits:
-        """The bits that say this length."""
+        """The bits of the word for this length."""
         row: Bits = self.bits[length - self._first]
         return row
 
     def read(self, soft: Soft) -> int:
-        """The likeliest length.
+        """The most likely length.
 
-        :param soft: of a word's bits; more may follow
+        :param soft: soft bits of a word; more may follow
         """
         return self._first + int(np.argmax(self.signs @ soft[:WORD_BITS]))
 
     def read_header(self, soft: Soft) -> int:
-        """The likeliest length, in headers by GNU Radio's blocks too: these count, and send the longest frames only.
+        """The most likely length, also for headers sent by GNU Radio's blocks. These blocks use the number field as a
+        counter, and send only the longest frames.
 
-        :param soft: of a header's bits; more may follow
+        :param soft: soft bits of a header; more may follow
         """
         hard = (soft[:WORD_BITS] > 0).astype(np.uint8)
         length, number = (int(hard[at : at + _FIELD_BITS] @ _WEIGHTS) for at in (0, _FIELD_BITS))
@@ -70,14 +72,14 @@ class LengthWord:
 
 
 def header_bits(lengths: Sequence[int], numbers: Any) -> Bits:
-    """Headers by rows, bits in the order they are sent in.
+    """Bits of headers, one header per row, in the order in which they are sent.
 
-    :param lengths: what the length fields hold, modulo 4096
-    :param numbers: what the number fields hold, below 4096
+    :param lengths: values of the length fields, modulo 4096
+    :param numbers: values of the number fields, below 4096
     """
     fields = np.asarray(lengths) % LENGTHS
     zeros = header_crc(0, 0)
-    # A CRC is linear, but for what it is of zeros.
+    # A CRC is linear, except for its constant, which is the CRC of zeros.
     of_length = _table(lambda value: header_crc(value, 0) ^ zeros)
     of_number = _table(lambda value: header_crc(0, value) ^ zeros)
     checks = of_length[fields] ^ of_number[numbers] ^ zeros
@@ -86,7 +88,7 @@ def header_bits(lengths: Sequence[int], numbers: Any) -> Bits:
 
 
 def golay_parity(value: int) -> int:
-    """12 bits that any two 12-bit values differ in together with themselves in 8 of 24 places at least."""
+    """12 parity bits. With them appended, any two 12-bit values differ in at least 8 of 24 bits."""
     rest = value << _GOLAY_CHECKS
     for place in range(_FIELD_BITS + _GOLAY_CHECKS - 1, _GOLAY_CHECKS - 1, -1):
         if rest >> place & 1:
@@ -105,7 +107,7 @@ def header_crc(length: int, number: int) -> int:
 
 
 def _table(linear: Callable[[int], int]) -> NDArray[np.int64]:
-    """A function for which f(a ^ b) = f(a) ^ f(b), for all values of a field."""
+    """Values of a function for which f(a ^ b) = f(a) ^ f(b), for all values of a field."""
     table = np.zeros(1, np.int64)
     for bit in range(_FIELD_BITS):
         table = np.concatenate((table, table ^ linear(1 << bit)))

@@ -1,9 +1,9 @@
 """Single-carrier bursts: phase-shift keying with a known preamble, synchronised feed-forward.
 
-Invariants: a burst is found by correlating the phase steps of its preamble, so carrier offset does not hide it, and is
-one only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured on its
-preamble and followed along its payload in blocks, with no loop that could be locked wrongly from the burst before; the
-payload begins with the word of its length, where lengths differ.
+Invariants: a burst is found by correlating the phase steps of its preamble, so carrier offset does not prevent this; it
+is accepted only if a single carrier then explains the preamble; frequency, phase and timing of each burst are measured
+on its preamble and tracked along its payload in blocks, without a loop that could keep a wrong state from the burst
+before; the payload begins with a length word if packets may have different lengths.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ Reals = NDArray[np.float64]
 _T = TypeVar("_T", np.complex128, np.float64)
 
 PREAMBLE = 64
-"""Symbols: a first one and the 63 phase steps of a maximum-length sequence."""
+"""Symbols of the preamble: a first one and the 63 phase steps of a maximum-length sequence."""
 _SLACK = 4
 """Samples after the last symbol that interpolation and a late start may need."""
 _THRESHOLD = 0.31
 """Threshold of the normalised correlation of the phase steps, above which samples are examined closely. Noise alone
 passes once in 500; a readable burst has 0.35 with a code, 0.7 without one."""
 _ALIKE = 0.28
-"""Threshold of the share of the preamble's power in a single carrier, above which it is a burst. A readable burst has
-0.3; noise reaches the threshold once in several 10^6 samples."""
+"""Threshold of the share of the preamble's power in a single carrier; a burst is above it. A readable burst has 0.3;
+noise reaches the threshold once in several 10^6 samples."""
 _RISE = 16
 """Symbols before its peak at which the correlation of a strong burst may pass the threshold."""
 _CHUNK = 256
@@ -61,9 +61,9 @@ def preamble_steps() -> NDArray[np.int8]:
 class _Carrier(NamedTuple):
     """A preamble's symbols without their signs, and the remaining carrier.
 
-    :param symbols: as received
-    :param frequency: radians per symbol, without the modulation's own turn
-    :param alike: share of their power that this carrier explains, 0..1
+    :param symbols: symbols as received
+    :param frequency: radians per symbol, without the modulation's own rotation
+    :param alike: share of the symbols' power that this carrier explains, 0..1
     """
 
     symbols: Samples
@@ -77,10 +77,10 @@ class LinearModem(BurstModem):
     Samples to :meth:`find` and :meth:`read` have passed a filter with :attr:`taps`. The reference sample is that
     of the preamble's first symbol.
 
-    :param frames: what bursts carry
-    :param order: phases, a power of 2
+    :param frames: the frames that bursts carry
+    :param order: number of phases, a power of 2
     :param sps: samples per symbol, 2 or more
-    :param turn: phase steps beside data and carrier, radians per symbol
+    :param turn: phase step of the modulation in addition to data and carrier, radians per symbol
     """
 
     stretch = 2048
@@ -106,12 +106,12 @@ class LinearModem(BurstModem):
         """Energy of a symbol, in units of the mean power of a burst."""
 
     def payload_symbols(self, packet_len: int) -> int:
-        """Symbols behind the preamble of the burst of a packet of so many bytes."""
+        """Symbols after the preamble in the burst of a packet of ``packet_len`` bytes."""
         word = 0 if self._word is None else WORD_BITS
         return -(-(word + self.frames.bits(packet_len)) // self.constellation.bits)
 
     def symbols(self, packet_len: int) -> int:
-        """Symbols of the burst of a packet of so many bytes."""
+        """Symbols of the burst of a packet of ``packet_len`` bytes."""
         return PREAMBLE + self.payload_symbols(packet_len)
 
     @property
@@ -119,7 +119,7 @@ class LinearModem(BurstModem):
         return self._needed(self.frames.lengths[0])
 
     def _needed(self, packet_len: int) -> int:
-        """Samples from the reference sample on that reading a packet of so many bytes needs."""
+        """Samples from the reference sample on that are needed to read a packet of ``packet_len`` bytes."""
         return (self.symbols(packet_len) - 1) * self.sps + 1 + _SLACK
 
     @property
@@ -152,7 +152,7 @@ class LinearModem(BurstModem):
         self._explained = np.asarray(basis.conj().T, np.complex64)
 
     def payload_bits(self, packet: bytes) -> Bits:
-        """The word of the packet's length, where lengths differ, and its frame."""
+        """The length word, if packets may have different lengths, and the frame."""
         wrapped = self.frames.of(len(packet)).wrap(packet)
         return wrapped if self._word is None else np.concatenate((self._word.word(len(packet)), wrapped))
 
@@ -172,13 +172,14 @@ class LinearModem(BurstModem):
             imag = np.ascontiguousarray(steps[phase::sps].imag)
             match[phase::sps] = np.correlate(real, self._steps) ** 2 + np.correlate(imag, self._steps) ** 2
             chance[phase::sps] = np.correlate(real**2 + imag**2, self._steps**2)
-        # By chance the square of a sum of steps is the sum of their squares, be they 63 of noise or, where a window
-        # reaches into silence, a few of a burst. Over their power those few would often look like a preamble.
+        # For random steps, the square of their sum is on average the sum of their squares. This holds for 63 steps of
+        # noise, and for a few steps of a burst where a window reaches into silence. If the square were divided by the
+        # power instead, those few steps would often look like a preamble.
         above = np.flatnonzero(match > _THRESHOLD**2 * (PREAMBLE - 1) * chance + _TINY)
         at = 0
         while at < len(above):
             first = int(above[at])
-            if first + _RISE * sps > positions:  # the highest point may still be to come
+            if first + _RISE * sps > positions:  # the maximum may still come
                 return Search(first)
             best = first + int(np.argmax(match[first : first + _RISE * sps]))
             if self._carrier(samples, best).alike > _ALIKE:
@@ -202,7 +203,7 @@ class LinearModem(BurstModem):
         return Reading(length, soft[skipped:], points, snr, start + self._needed(length))
 
     def _length(self, samples: Samples, start: int, frequency: float, phase: float) -> int:
-        """Bytes of the packet, from as many symbols as every burst has."""
+        """Bytes of the packet, from the symbols that even the shortest burst has."""
         assert self._word is not None
         symbols = self.payload_symbols(self.frames.lengths[0])
         _, soft = self._payload(samples, start, frequency, phase, symbols)
@@ -211,7 +212,7 @@ class LinearModem(BurstModem):
     def _payload(
         self, samples: Samples, start: int, frequency: float, phase: float, symbols: int
     ) -> tuple[Samples, Soft]:
-        """The payload's first so many points, and their soft bits."""
+        """The first ``symbols`` points of the payload, and their soft bits."""
         sps, order = self.sps, self.order
         late = 0.0
         start_exact = start + self._lateness(samples, start, frequency)

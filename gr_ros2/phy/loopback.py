@@ -27,13 +27,13 @@ class LoopbackLink(PacketPath, Flowgraph):
     :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
     :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
-    :param throttled: packets pass at the pace of the air (:class:`AirtimeGate`); False lets them pass as fast as the
-        flowgraph takes them (:class:`CreditWindow`)
-    :param paced: either grants credits to the source; False for a source without port `credit`. A PHY without samples
-        has no airtime to pace by
+    :param throttled: packets pass at the rate of the channel (:class:`AirtimeGate`); False lets them pass as fast as
+        the flowgraph takes them (:class:`CreditWindow`)
+    :param paced: credits are granted to the source; False for a source without port `credit`. A PHY without samples
+        has no airtime, so it does not set a rate
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
-    :raises ConfigError: for a channel that this PHY cannot have
+    :raises ConfigError: for a channel that this PHY does not support
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class LoopbackLink(PacketPath, Flowgraph):
             self._loss.epoch = now
 
     def gate_lateness(self) -> Lateness | None:
-        """Of the gate; None where there is none."""
+        """Delays of the gate; None if there is no gate."""
         return None if self._gate is None else self._gate.lateness
 
     def passed_at(self) -> Sequence[float]:
-        """s, monotonic, when each packet passed the gate; () where there is none."""
+        """s, monotonic, when each packet passed the gate; () if there is no gate."""
         return () if self._gate is None else self._gate.passed_at
 
     def _offered(self) -> int:

@@ -1,9 +1,9 @@
 """The `lora` PHY: chirp spread spectrum similar to LoRa, for links far below the noise.
 
-Invariants: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame, whose length is
-told by chirps before it where lengths differ; the format is our own (it has LoRa's chirps, Gray code, diagonal
-interleaver and Hamming code, but CRC-32, PN9 and no header), so it does not talk to LoRa modems. With `implementation:
-lora_sdr` the module gr-lora_sdr determines all of this.
+Invariants: one sample per chip, so the sampled band is the chirp's bandwidth; one packet is one frame; if packets may
+have different lengths, chirps before the frame carry its length; the format is our own (it has LoRa's chirps, Gray
+code, diagonal interleaver and Hamming code, but CRC-32, PN9 and no header), so it does not communicate with LoRa
+modems. With `implementation: lora_sdr` the module gr-lora_sdr determines all of this.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_sy
 from gr_ros2.setting import AUTO, Auto
 
 MAX_BURST = 1 << 22
-"""Samples; a longer burst would take more memory than small computers have."""
+"""Most samples of a burst; a longer burst would take more memory than small computers have."""
 _UP, _SYNC, _DOWN = 8, (24, 32), 2
 """Symbols of the preamble: plain up-chirps, a sync word, plain down-chirps."""
 _HEAD = _UP + len(_SYNC) + _DOWN
 _TELLING = 4
-"""Chirps that tell the length: with fewer a code's gain would end where they are misheard."""
+"""Number of chirps that carry the length. With fewer, errors in the length would limit the gain of a code."""
 _LOOK = 6
 """Up-chirps whose spectra are added to detect a burst."""
 _LIMIT, _THRESHOLD = 10.0, 36.0
@@ -50,9 +50,9 @@ _GAIN, _PACE_GAIN = 0.3, 0.05
 _CERTAIN = 50.0
 """Largest magnitude of a soft bit."""
 _NIBBLE = np.array([8, 4, 2, 1])
-"""Weights of a nibble's bits, in the order they come."""
+"""Weights of a nibble's bits, in the order in which they arrive."""
 _SINC = 12
-"""Samples on either side from which a value between two samples is interpolated."""
+"""Number of samples on either side from which a value between two samples is interpolated."""
 _SDR_ONLY = ("oversampling", "sync_word", "ldro", "carrier_hz")
 _SDR_GAP, _SDR_LEAST_GAP = 32, 24
 """Default and least gap, chips; filter and synchroniser of the module's receiver delay by 20."""
@@ -97,7 +97,7 @@ class _ChirpPlace(NamedTuple):
 
 
 class LoraModem(BurstModem):
-    """See :class:`LoraOptions`. The reference sample is approximately the first of an up-chirp early in the
+    """See :class:`LoraOptions`. The reference sample is approximately the first sample of an up-chirp early in the
     preamble."""
 
     def __init__(self, frames: Frames, options: LoraOptions) -> None:
@@ -106,7 +106,7 @@ class LoraModem(BurstModem):
         self.chips = 1 << options.spreading_factor
         self._telling = np.empty((0, 0), np.int64) if frames.fixed else telling(frames.lengths, self.chips)
         self._before = self._telling.shape[1]
-        """Chirps between preamble and payload."""
+        """Number of chirps between preamble and payload."""
         n = np.arange(self.chips)
         self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)
         self._down = self._up.conj()
@@ -121,7 +121,7 @@ class LoraModem(BurstModem):
         self.margin = 2 * self.chips
 
     def blocks(self, packet_len: int) -> int:
-        """Blocks of code words of a packet of so many bytes."""
+        """Blocks of code words of a packet of ``packet_len`` bytes."""
         return -(-self.frames.bits(packet_len) // (4 * self.spreading_factor))
 
     def symbols(self, packet_len: int) -> int:
@@ -133,7 +133,7 @@ class LoraModem(BurstModem):
 
     @property
     def span(self) -> int:
-        # With the chirps that tell the length, and what a value between two samples is made from.
+        # The chirps that carry the length are included, and the samples that interpolation needs.
         return (_HEAD + 1 + (self._before + 1 if self._before else 0)) * self.chips
 
     @property
@@ -163,13 +163,13 @@ class LoraModem(BurstModem):
         # Neighbouring bins are added: a burst that starts between two samples has its peak in two bins. The power of
         # one chirp is limited to a few times the noise, because data may repeat a value and then end.
         pairs = np.minimum(powers + np.roll(powers, 1, axis=1), _LIMIT)
-        # Not as differences of running sums: strong chirps add up to the same, and rounding would choose among them.
+        # Differences of running sums are not used: strong chirps have equal sums, and rounding would choose among them.
         pairs = np.add.reduce([pairs[first : count - _LOOK + 1 + first] for first in range(_LOOK)])
         above = np.flatnonzero(pairs.max(axis=1) > _THRESHOLD)
         if not len(above):
             return Search((count - _LOOK) * self.chips)
         first = int(above[0])
-        if first + _LOOK >= len(pairs):  # a strong burst is detected early; its best position is still to come
+        if first + _LOOK >= len(pairs):  # a strong burst is detected early; its best position may still come
             return Search(first * self.chips)
         best = first + int(np.argmax(pairs[first : first + _LOOK + 1].max(axis=1)))
         late = int(np.argmax(np.minimum(powers[best : best + _LOOK], _LIMIT).sum(axis=0)))
@@ -177,15 +177,15 @@ class LoraModem(BurstModem):
 
     def end(self, samples: Samples, start: int) -> int:
         place = self._place(samples, start)
-        # Samples without a burst need no waiting; the end of a burst may come a few samples late, by clocks and
-        # channel.
+        # Samples without a burst are read without waiting; the end of a burst may be a few samples late, because of the
+        # clocks and the channel.
         return start + self.span if place is None else self._end(place, self._length(samples, place))
 
     def _end(self, place: _ChirpPlace, length: int) -> int:
         return round(place.begin) + (self._before + self.symbols(length)) * self.chips - _SINC
 
     def _tones(self, samples: Samples, place: _ChirpPlace, first: float, count: int) -> NDArray[np.complex64]:
-        """So many chirps from a place on, as tones, by rows."""
+        """``count`` chirps from a position on, as tones, one per row."""
         turn = np.exp(-2j * np.pi * place.carrier * np.arange(self.chips) / self.chips) * self._down
         rows = _delayed(samples, first, count * self.chips).reshape(count, self.chips)
         return np.asarray(rows * turn, np.complex64)
@@ -278,7 +278,7 @@ class LoraModem(BurstModem):
         return float(np.clip(turned * 6 / (np.pi * max(power, _TINY)), -0.5, 0.5))
 
     def _place(self, samples: Samples, start: int) -> _ChirpPlace | None:
-        """Examine a preamble closely; None where this is no burst."""
+        """Examine a preamble closely; None if it is not a burst."""
         windows = samples[start : start + (_HEAD + 1) * self.chips]
         windows = windows[: len(windows) // self.chips * self.chips].reshape(-1, self.chips)
         falls = self._powers(windows, self._up)
@@ -307,7 +307,7 @@ class LoraModem(BurstModem):
         """Power of a burst over that of the noise.
 
         :param chirps: its up-chirps
-        :param top: of the spectrum that they add up to
+        :param top: maximum of the sum of their spectra
         """
         # A window function, since a chirp between two samples has a jump whose power is in all bins; the median, since
         # an echo has its own bin.
@@ -366,13 +366,14 @@ def code_words(check_bits: int) -> NDArray[np.int64]:
 
 
 def telling(lengths: range, chips: int) -> NDArray[np.int64]:
-    """Where the chirps that tell a length begin, by rows: of any two lengths three of the four differ.
+    """Start positions of the four chirps that carry a length, one length per row. Any two lengths differ in at least
+    three of the four.
 
-    Of lengths below the number of chips all four do, and of neighbours in opposite directions, so that a carrier
-    measured wrongly by one bin makes no length another.
+    Two lengths below the number of chips differ in all four. Neighbouring lengths differ in opposite directions, so a
+    carrier error of one bin does not change one length into another.
 
     :param lengths: bytes, below 32 times ``chips``
-    :param chips: of a chirp, 128 or more
+    :param chips: chips of a chirp, 128 or more
     """
     high, low = np.divmod(np.array(lengths), chips)
     ways = np.array([1, -1, 1, -1])[:_TELLING]

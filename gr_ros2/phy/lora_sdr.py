@@ -51,7 +51,7 @@ _PAY_LEN = pmt.intern("pay_len")
 def load() -> Any:
     """The module.
 
-    :raises BackendMissingError: where it is not installed
+    :raises BackendMissingError: if it is not installed
     """
     try:
         return import_module("gnuradio.lora_sdr")
@@ -69,8 +69,8 @@ class SdrFrame:
     :param oversampling: samples per chip
     :param sync_word: two nibbles, none of them 0
     :param ldro: low data rate optimisation: two bits fewer per symbol
-    :param gap: zero samples behind each packet
-    :param carrier: the radio's carrier frequency over the chirp's bandwidth, None = not known
+    :param gap: zero samples after each packet
+    :param carrier: the radio's carrier frequency divided by the chirp's bandwidth, None = unknown
     """
 
     packet_len: int
@@ -112,7 +112,7 @@ class SdrFrame:
         return min(_LARGEST, round(self.carrier * bandwidth)), bandwidth
 
     def wrap(self, packet: bytes) -> bytes:
-        """Nibbles of the frame: header, payload whitened, its CRC-16."""
+        """Nibbles of the frame: header, whitened payload, CRC-16 of the payload."""
         payload = packet + zlib.crc32(packet).to_bytes(CRC_LEN, "little")
         head = len(payload) << 4 | self.coding_rate << 1 | 1
         check = 0
@@ -125,14 +125,14 @@ class SdrFrame:
         return header + body + bytes(crc >> shift & 15 for shift in (0, 4, 8, 12))
 
     def unwrap(self, payload: bytes) -> bytes | None:
-        """The packet of a payload, or None where its CRC-32 does not match."""
+        """The packet of a payload, or None if its CRC-32 does not match."""
         packet, crc = payload[: self.packet_len], payload[self.packet_len : self.packet_len + CRC_LEN]
         return packet if zlib.crc32(packet).to_bytes(CRC_LEN, "little") == crc else None
 
 
 @lru_cache
 def whitening(length: int) -> Octets:
-    """LoRa's: x^8 + x^6 + x^5 + x^4 + 1, all ones at the start, a byte per step."""
+    """LoRa's whitening sequence: x^8 + x^6 + x^5 + x^4 + 1, all ones at the start, one byte per step."""
     state, out = 0xFF, np.empty(length, np.uint8)
     for i in range(length):
         out[i] = state
@@ -164,7 +164,7 @@ class SdrTransmitter(TransmitterBlock):
 
     @property
     def refused(self) -> int:
-        """PDUs that were no packet of the right length."""
+        """PDUs that were not a packet of the right length."""
         return self._framer.refused
 
 

@@ -67,7 +67,7 @@ def record(phy: Phy, count: int, seed: int = 0) -> SampleRecording:
 def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
     """The samples that a PHY's transmitter makes of packets, one after the other.
 
-    :param packets: of lengths the PHY takes
+    :param packets: of lengths that the PHY allows
     :raises PhyError: for a PHY without samples, or when the samples do not come
     """
     top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
@@ -114,11 +114,11 @@ def pdr(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> float:
 class BatchChannel:
     """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
 
-    The batches do not overlap on the air; each has its own noise and fading.
+    The batches do not overlap in time; each has its own noise and fading.
 
-    :param phy: with samples
-    :param channel: its settings that act on samples
-    :raises ConfigError: for a channel this PHY cannot have
+    :param phy: a PHY with samples
+    :param channel: its settings that act on samples are used
+    :raises ConfigError: for a channel that this PHY does not support
     """
 
     def __init__(self, phy: Phy, channel: ChannelConfig) -> None:
@@ -127,7 +127,7 @@ class BatchChannel:
         self._channel = channel
         self._batches = 0
         self.batch = max(1, _BATCH_SAMPLES // phy.airtime_samples())
-        """Packets at most at a time, for their samples to fit in memory."""
+        """Most packets at a time, so that their samples fit in memory."""
 
     def send(self, packets: Sequence[bytes]) -> list[tuple[int, bytes]]:
         """Send a batch; returns, for each packet that arrived, its index among the packets sent and its bytes, in

@@ -1,8 +1,8 @@
 """The `ofdm` PHY: the frames of GNU Radio's OFDM blocks, sent and received by this package's modem or by those blocks.
 
-Invariant: both implementations send the same samples for the same packet, except for the number in the header, and take
-the same time except for the gap (not for packets whose CRC-32 does not fit the stock header). Ours are as long as they
-need where ``lengths`` is not fixed, and the stock receiver understands them all the same.
+Invariant: both implementations send the same samples for the same packet, except for the number in the header. They
+take the same time, except for the gap. This does not hold for packets whose CRC-32 does not fit the stock header. Our
+frames are only as long as needed unless ``lengths`` is ``fixed``; the stock receiver understands them as well.
 """
 
 from __future__ import annotations

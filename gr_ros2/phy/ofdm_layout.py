@@ -39,8 +39,8 @@ class OfdmLayout:
 
     :param fft_len: carriers, used or not, a power of 2 from 64 on
     :param cp_len: samples of the cyclic prefix
-    :param modulation: of the payload, a name of ``BITS``
-    :param scramble: header and payload bits
+    :param modulation: modulation of the payload, a name of ``BITS``
+    :param scramble: scramble header and payload bits
     :param edge: outermost carrier used, on either side of the unused middle carrier; None = 26 of 64
     :param pilot_places: carriers of the pilots; None = 7 and 21 on either side for 64 carriers, scaled for more
     :raises ConfigError: for carriers that do not exist, or too few carriers for data
@@ -89,7 +89,7 @@ class OfdmLayout:
 
     @property
     def multiple(self) -> int:
-        """What the bytes of a frame are a multiple of, so that it takes whole constellation points."""
+        """A frame's bytes are a multiple of this, so that it takes whole constellation points."""
         return 3 if self.bits_per_carrier % 3 == 0 else 1
 
     def fill(self, packet_len: int) -> int:
@@ -116,12 +116,12 @@ class OfdmLayout:
         return (head + tail + points * point_power(self.modulation)) / symbols
 
     def mask(self, length: int) -> NDArray[np.uint8]:
-        """The scrambling sequence for the bytes of a payload, zeros where scrambling is off."""
+        """The scrambling sequence for the bytes of a payload; zeros if scrambling is off."""
         seed = _SCRAMBLER["seed"] if self.scramble else 0
         return np.packbits(_register(seed, 8 * length), bitorder="little")
 
     def header_mask(self) -> NDArray[np.uint8]:
-        """What scrambling adds to the bits of the header, zeros where it is off. Behind its 32 bits there are zeros."""
+        """The scrambling sequence for the bits of the header; zeros if scrambling is off, and after its 32 bits."""
         return _register(_HEADER_SEED if self.scramble else 0, len(self.data[0]))
 
     @property

@@ -1,9 +1,10 @@
 """OFDM bursts without GNU Radio's scheduler: detected by a repeated half symbol, demodulated with all symbols as
 reference.
 
-Invariants: what sounds like a preamble is a burst only if its two sync words are those of the layout; the channel is a
-short impulse response, so its estimate at a carrier uses all of them; it is followed through the payload by what the
-payload is decided to be, weighted with how sure that is; how long that is the header says, where lengths differ.
+Invariants: a detected preamble is a burst only if its two sync words are those of the layout; the channel is a short
+impulse response, so its estimate at one carrier uses all carriers; the estimate is tracked through the payload with the
+decided payload symbols, weighted by their certainty; if packets may have different lengths, the header carries the
+length.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ _RIDGE = 0.001
 _TURN = 0.4
 """Largest error of the carrier offset after the sync words, radians per symbol."""
 _DOUBT = 1e-3
-"""Share of the power sent: with less uncertainty than this, symbols are not decided again for a better estimate."""
+"""Share of the power sent: if the uncertainty is below this, symbols are not decided again for a better estimate."""
 _TINY = 1e-20
 _FILL_MARK = 0x555
-"""In the number field of a header, for each byte that the frame is filled up with."""
+"""Value added to the number field of a header for each byte that fills up the frame."""
 
 
 class _FramePlace(NamedTuple):
@@ -72,9 +73,9 @@ class _Channel(NamedTuple):
 class OfdmModem(BurstModem):
     """See :class:`gr_ros2.phy.ofdm.OfdmOptions`. The reference sample is the first of the first sync word's prefix.
 
-    :param frames: what bursts carry, lowest bit of a byte first
+    :param frames: the frames that bursts carry, lowest bit of a byte first
     :param layout: carriers and constellation
-    :param threshold: of the preamble's metric, 0..1; None = by the share of false alarms
+    :param threshold: threshold of the preamble's metric, 0..1; None = from the share of false alarms
     """
 
     def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None) -> None:
@@ -218,11 +219,11 @@ class OfdmModem(BurstModem):
         return start + self._needed(self._head(rows)[1])
 
     def _needed(self, packet_len: int) -> int:
-        """Samples from the reference sample on that reading a packet of so many bytes needs."""
+        """Samples from the reference sample on that are needed to read a packet of ``packet_len`` bytes."""
         return self.samples_of(packet_len) - self._back
 
     def _head(self, rows: Complexes) -> tuple[_Channel, int]:
-        """What sync words and header tell: the channel, and the bytes of the packet."""
+        """Evaluates sync words and header: the channel, and the bytes of the packet."""
         all_used = np.ones((1, len(self._data)), bool)
         channel = self._first_estimate(rows[:2])
         channel, likely, _, _ = self._decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
@@ -299,7 +300,7 @@ class OfdmModem(BurstModem):
         return ModemConstants("ofdm", values, points * self.constellation.bits, points)
 
     def _place(self, samples: Samples, at: int) -> _FramePlace:
-        """Examine a position closely where the first half of a symbol is repeated."""
+        """Examine closely a position at which the first half of a symbol is repeated."""
         at = max(0, at)
         window = samples[at : at + self._window + self._half]
         step = self._repeat * np.vdot(window[: -self._half], window[self._half :])

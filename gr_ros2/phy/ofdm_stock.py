@@ -1,11 +1,11 @@
 """GNU Radio's OFDM blocks as a transmitter and a receiver: `detection_threshold: stock`.
 
-Invariants: wired as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, at equal settings with the same samples; every packet
-is followed by ``gap`` zero samples, so that the receiver never sees two frames back to back (its header/payload
-demultiplexer then swallows a trigger now and then) and the last frame is pushed out of it at once; transmitter and
-receiver use different tag keys, so that a loopback cannot leak a length past the channel; every buffer holds a whole
+Invariants: the blocks are connected as in GNU Radio's ``ofdm_tx`` and ``ofdm_rx``, and give the same samples at equal
+settings; every packet is followed by ``gap`` zero samples, so that the receiver never gets two frames back to back (its
+header/payload demultiplexer would sometimes miss a trigger) and the last frame leaves it at once; transmitter and
+receiver use different tag keys, so that a loopback cannot pass a length around the channel; every buffer holds a whole
 frame, since a tagged stream block that cannot get one stalls the flowgraph; frames whose bits do not fill whole points
-are filled up with bytes the receiver takes off again, since the stock header cannot tell it of parts of a point.
+are filled up with bytes that the receiver removes, since the stock header cannot describe parts of a point.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import lift_message_limit, log_warnings_only
 
 STOCK_THRESHOLD = 0.9
-"""What GNU Radio's ``ofdm_rx`` uses. A lower one gains some dB, but sometimes triggers outside a frame."""
+"""The threshold of GNU Radio's ``ofdm_rx``. A lower one gains some dB, but sometimes triggers outside a frame."""
 
 _TX_KEY, _RX_KEY, _RX_FRAME_KEY, _RX_PACKET_KEY = (
     f"gr_ros2_{name}" for name in ("tx_len", "rx_len", "rx_frame", "rx_packet")
@@ -38,17 +38,17 @@ SPINNING_NICE = 10
 """Added to the nice value of such a thread: a tenth of the weight of the others."""
 _THREADS_WAIT_S = 0.2
 _SMALLEST_BUFFER = 32768
-"""Bytes GNU Radio gives every buffer anyway."""
+"""Bytes that GNU Radio gives every buffer by default."""
 
 
 @dataclass(frozen=True)
 class StockFrame:
     """The frame of a packet.
 
-    A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames go without
-    it: the packet's own CRC-16 alone protects them, and damaged ones reach the sink, which refuses and counts them.
+    A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames have none: only
+    the packet's own CRC-16 protects them, and damaged ones reach the sink, which refuses and counts them.
 
-    :param gap: zero samples behind each packet
+    :param gap: zero samples after each packet
     """
 
     layout: OfdmLayout
@@ -78,7 +78,7 @@ class StockFrame:
     def fit_buffers(self, parts: list[Any]) -> None:
         """Give each block buffer space for two frames where GNU Radio's default is too small.
 
-        Not elsewhere: larger buffers than needed cost small frames a factor of two to three in throughput.
+        Other blocks keep the default: for small frames, larger buffers lower the throughput to a half or a third.
         """
         for part in parts:
             signature = part.output_signature()
@@ -96,9 +96,10 @@ class StockFrame:
 def idle_spinning_threads() -> None:
     """Lower the priority of the receiver's demultiplexer threads: they spin while waiting for their header.
 
-    By a nice value, not by SCHED_IDLE. With time to spare SCHED_IDLE is a little better (single packets of 64 B, p99:
-    3 ms, here 6, without 7); but where other programs keep every core busy such a thread hardly runs at all, and
-    packets wait in the receiver (beyond their airtime, p50: 1.7 s, here 13 ms).
+    It uses a nice value, not SCHED_IDLE. If there is processor time to spare, SCHED_IDLE is a little better (single
+    packets of 64 B, p99: 3 ms; here 6 ms, without any change 7 ms). If other programs keep every core busy, however, a
+    SCHED_IDLE thread hardly runs at all, and packets wait in the receiver (beyond their airtime, p50: 1.7 s; here
+    13 ms).
     """
     tasks = Path("/proc/self/task")
     deadline = time.monotonic() + _THREADS_WAIT_S
@@ -106,7 +107,7 @@ def idle_spinning_threads() -> None:
     found = False
     while tasks.is_dir() and not found and time.monotonic() < deadline:
         for task in tasks.iterdir():
-            with suppress(OSError):  # threads come and go
+            with suppress(OSError):  # threads may end at any time
                 if (task / "comm").read_text().startswith(_SPINNING_THREAD):
                     os.setpriority(os.PRIO_PROCESS, int(task.name), nice)
                     found = True
@@ -179,7 +180,7 @@ class OfdmModulator(gr.hier_block2):  # type: ignore[misc]
     """Tagged bytes in, tagged samples out.
 
     :param key: name of the length tag
-    :param with_crc32: at the end of each frame
+    :param with_crc32: whether each frame ends with one
     """
 
     def __init__(self, layout: OfdmLayout, key: str, with_crc32: bool) -> None:
@@ -219,7 +220,7 @@ class OfdmDemodulator(HierBlock):
     """Samples in, tagged bytes out: frames whose CRC-32 is right.
 
     :param packet_key, frame_key: names of the length tags of packets and frames, not that of the transmitter
-    :param with_crc32: at the end of each frame
+    :param with_crc32: whether each frame ends with one
     """
 
     def __init__(self, layout: OfdmLayout, packet_key: str, frame_key: str, with_crc32: bool) -> None:

@@ -25,11 +25,11 @@ _LOOK = 1024
 class LinkCounts:
     """Packets at each place of the link, since the start.
 
-    :param passed: let through by the gate
-    :param backlog: in the gate, waiting for the air or on it
-    :param transmitted: left the transmitter as samples
-    :param received: came out of the receiver, where they are counted
-    :param losses: dropped on purpose after the receiver, by the channel's setting that did it
+    :param passed: packets that the gate let through
+    :param backlog: packets in the gate, waiting for the channel or occupying it
+    :param transmitted: packets that left the transmitter as samples
+    :param received: packets that came out of the receiver, if they are counted
+    :param losses: packets dropped on purpose after the receiver, by the channel's setting that caused it
     """
 
     passed: int
@@ -72,25 +72,24 @@ class PacketPath:
         )
 
     def samples(self) -> Samples | None:
-        """Newest samples at the receiver's antenna, after the channel; None where there is no tap or no samples
-        came."""
+        """Newest samples at the receiver's antenna, after the channel; None without a tap, or if no samples arrived."""
         return None if self._tap is None else self._tap.samples()
 
     def symbols(self) -> Samples | None:
-        """Newest equalised payload symbols; None where there is no tap, or the PHY shows none."""
+        """Newest equalised payload symbols; None if there is no tap, or the PHY shows none."""
         return None if self._symbols is None else self._symbols.samples()
 
     @property
     def snr_db(self) -> float | None:
-        """SNR of the newest packets received, dB over the sampled band; None before the first, or where the PHY does
-        not measure it."""
+        """SNR of the newest packets received, dB over the sampled band; None before the first, or if the PHY does not
+        measure it."""
         return None if self._receiver is None else self._receiver.snr_db
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Set the SNR of the received signal, dB, None = no noise; see :meth:`Channel.set_snr_db`.
 
         :raises ConfigError: out of range
-        :raises PhyError: where no simulated channel was built in
+        :raises PhyError: if no simulated channel was built in
         """
         self._change("snr_db", snr_db, self._faded)
 
@@ -98,7 +97,7 @@ class PacketPath:
         """Set the carrier frequency offset of the received signal, fraction of the sample rate.
 
         :raises ConfigError: out of range
-        :raises PhyError: where no simulated channel was built in
+        :raises PhyError: if no simulated channel was built in
         """
         self._change("frequency_offset", frequency_offset, self._faded)
 
@@ -106,7 +105,7 @@ class PacketPath:
         """Set the probability that a received packet is dropped.
 
         :raises ConfigError: out of range
-        :raises PhyError: where nothing that loses packets was built in
+        :raises PhyError: if nothing that loses packets was built in
         """
         self._change("packet_loss", probability, self._loss)
 
@@ -126,11 +125,11 @@ class PacketPath:
         return f"phy {self.phy.name}"
 
     def _offered(self) -> int:
-        """Packets that entered the path, where there is no gate to count them."""
+        """Packets that entered the path, if there is no gate to count them."""
         return 0
 
     def _handled(self) -> int:
-        """Packets that the end of the path has processed, where it counts them."""
+        """Packets that the end of the path has processed, if it counts them."""
         return 0
 
     def _transmit(self, packets: Any) -> Any:

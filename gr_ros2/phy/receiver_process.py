@@ -44,7 +44,7 @@ class _Report(NamedTuple):
 class ReceiverProcess:
     """A :class:`BurstReceiver` in another process.
 
-    :param modem: modulation and frame length
+    :param modem: modulation and frames
     :param deliver: called with each packet, in a thread of its own
     """
 
@@ -53,7 +53,7 @@ class ReceiverProcess:
         self._deliver = deliver
         self._report = _Report([], 0, np.empty(0, np.complex64), None)
         self._here: BurstReceiver | None = None
-        """Receives instead of the process after that has ended."""
+        """Receiver in this process that is used after the other process has ended."""
         self._process: Any = None
         self._thread: threading.Thread | None = None
         reading, writing = os.pipe()
@@ -148,7 +148,7 @@ def _start(reports: int) -> Any:
 def serve(descriptor: int) -> None:
     """The process: a modem and samples on standard input, reports on a file descriptor.
 
-    :param descriptor: to write to
+    :param descriptor: file descriptor to write to
     """
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the parent process has ended
     samples = os.fdopen(sys.stdin.fileno(), "rb")

@@ -59,7 +59,7 @@ class Points:
         return np.asarray((parts @ self._twice - self._squares) * scale)
 
     def soft(self, likely: NDArray[np.float32]) -> Soft:
-        """Soft bits of received points, in the order they were sent in."""
+        """Soft bits of received points, in the order in which the bits are sent."""
         bits = [likely[:, ones].max(1) - likely[:, zeros].max(1)
                 for ones, zeros in zip(self._ones, self._zeros, strict=True)]  # fmt: skip
         return np.asarray(np.stack(bits, axis=1).reshape(-1), np.float32)

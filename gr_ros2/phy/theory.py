@@ -87,16 +87,16 @@ def coded_success(points: NDArray[np.complex64], snr: float, data_bits: int, cod
     The normal approximation of Polyanskiy, Poor and Verdu (IEEE Trans. Inf. Theory 56-5, 2010): the information of a
     frame's points is approximately normal, and must exceed the data.
 
-    :param points: of the constellation, equally likely
+    :param points: constellation points, equally likely
     :param snr: mean energy of a point over N0
-    :param coded_bits: on the air, log2 of the number of points each
+    :param coded_bits: number of bits sent; each point carries log2 of the number of points
     """
     told = _information(points.tobytes(), round(10 * log10(max(snr, 1e-6)), 2))
     return _enough(coded_bits / log2(len(points)), *told, data_bits)
 
 
 def coded_orthogonal_success(order: int, error: float, data_bits: int, count: int) -> float:
-    """The same for ``count`` orthogonal signals, each decided independently.
+    """The same as :func:`coded_success` for ``count`` orthogonal signals, each decided independently.
 
     :param order: signals to choose from
     :param error: probability that a decision is wrong

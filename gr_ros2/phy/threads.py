@@ -44,19 +44,19 @@ def shorten_switch_interval() -> None:
 def lift_message_limit() -> None:
     """Let message ports without a handler, such as that of ``pdu_to_tagged_stream``, keep every message.
 
-    GNU Radio prunes such a port when it holds more than ``max_messages`` (8192), but counts without a lock: with no
-    more than 40 messages ever waiting it dropped about one in four million. A limit that is never reached turns that
-    off. This affects flowgraphs started afterwards in this process; a value set by the user stays.
+    GNU Radio prunes such a port when it holds more than ``max_messages`` (8192), but it counts without a lock: although
+    no more than 40 messages ever waited, it dropped about one in four million. A limit that is never reached turns this
+    off. This affects flowgraphs started afterwards in this process; a value set by the user is kept.
     """
     os.environ.setdefault(_MAX_MESSAGES, "-1")
 
 
 def start_flowgraph(start: Callable[[], None]) -> None:
-    """Start a flowgraph, and repeat this where GNU Radio could not map a buffer.
+    """Start a flowgraph, and try again if GNU Radio could not map a buffer.
 
     Ctrl-C is delayed until it has started, so that the caller can stop it.
 
-    :raises PhyError: when GNU Radio still cannot after many attempts, or refuses the flowgraph
+    :raises PhyError: when GNU Radio fails after many attempts, or refuses the flowgraph
     """
     failed: Exception | None = None
     with uninterrupted():

@@ -26,7 +26,7 @@ _JOIN_S = 1.0
 
 
 class CreditWindow(gr.basic_block):  # type: ignore[misc]
-    """Message port `credit` out: an integer, how many more packets may come.
+    """Message port `credit` out: an integer, the number of further packets that may come.
 
     :param progress: returns how many packets have passed
     :param window: packets in progress, 1 or more

@@ -1,7 +1,7 @@
 """The wire format: packets to bytes and back, one module per version. No IO, no state.
 
 No module outside this package knows a byte offset or the width of a field; it asks a :class:`Format`. ``v0`` is the
-paper's (section 5), ``v1`` the one that repairs, seals and announces.
+version of the paper (section 5). ``v1`` is the version with repair, sealing and announcements.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ __all__ = [
 ]
 
 FORMATS: Mapping[int, Format] = {V0.version: V0, V1.version: V1}
-"""By version."""
+"""The formats by version."""
 
 
 def format_of(version: int) -> Format:
     """The format of a version.
 
-    :raises VersionError: for one that is not known here
+    :raises VersionError: for an unknown version
     """
     if version not in FORMATS:
         raise VersionError(f"version {version}; known are {', '.join(map(str, FORMATS))}")
@@ -78,13 +78,13 @@ def format_of(version: int) -> Format:
 
 
 def decode(data: bytes, packet_len: int, accept: Collection[int] = FORMATS.keys()) -> Packet:
-    """The packet in these bytes, read by the version that its first four bits say.
+    """The packet in these bytes, read by the version that its first four bits give.
 
-    Bytes with a version nibble that is not accepted are refused in the way of the lowest accepted version: by the CRC
-    if they are damaged (a damaged version nibble is damage like any other), otherwise by the version.
+    Bytes with a version nibble that is not accepted are checked by the rules of the lowest accepted version. Damaged
+    bytes are refused by the CRC (a damaged version nibble is damage like any other), all others by the version.
 
-    :param packet_len: of the link
-    :param accept: versions to take, at least one
+    :param packet_len: packet length of the link, bytes
+    :param accept: accepted versions, at least one
     :raises WireError: see the ``decode`` of each version
     """
     version = data[0] >> 4 if data else -1

@@ -1,6 +1,6 @@
-"""Entries of version 1 that carry no message: hellos, requests and reports.
+"""Entries of version 1 that are not messages: hellos, requests and reports.
 
-Invariant: an entry begins with its name and its length, one byte each, so that a decoder skips what it does not know.
+Invariant: an entry begins with its kind and its length, one byte each, so that a decoder can skip unknown entries.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Hello(NamedTuple):
     """Announces a robot.
 
     :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
-    :param turns: how often the 16-bit packet number has come round, 0..2^32-1
-    :param capabilities: ``CAN_HEAR`` and ``ENCRYPTS``; other bits are to be ignored
-    :param digest: CRC-32 of the robot's table of topics, 0 where it has none
-    :param marks: (topic id, CRC-32 of the message as it is on the air) of messages kept for robots that join late
+    :param turns: how often the 16-bit packet number has wrapped around, 0..2^32-1
+    :param capabilities: ``CAN_HEAR`` and ``ENCRYPTS``; other bits are ignored
+    :param digest: CRC-32 of the robot's table of topics, 0 if it has none
+    :param marks: (topic id, CRC-32 of the message as transmitted) of messages kept for robots that join late
     """
 
     boot: int
@@ -40,7 +40,7 @@ class Hello(NamedTuple):
     marks: tuple[tuple[int, int], ...] = ()
 
     def describe(self) -> str:
-        """What it says, in words."""
+        """The entry in words."""
         words = [f"hello, boot {self.boot}, turns {self.turns}"]
         words += ["hears and reports"] * (self.capabilities & CAN_HEAR != 0)
         words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
@@ -52,33 +52,33 @@ class Hello(NamedTuple):
 CAN_HEAR = 1
 """The robot receives too, and reports what it hears."""
 ENCRYPTS = 2
-"""Bodies of the robot's packets are encrypted; otherwise sealed packets are authenticated only."""
+"""Bodies of the robot's packets are encrypted; without this bit, sealed packets are only authenticated."""
 
 
 class Ask(NamedTuple):
     """A request for messages kept for robots that join late.
 
-    :param src_id: whose messages
-    :param topic_ids: of which topics, 240 for the table
+    :param src_id: the robot that keeps the messages
+    :param topic_ids: the topics, 240 for the table
     """
 
     src_id: int
     topic_ids: bytes
 
     def describe(self) -> str:
-        """What it says, in words."""
+        """The entry in words."""
         return f"ask, of robot {self.src_id} topics {' '.join(map(str, self.topic_ids))}"
 
 
 class Report(NamedTuple):
-    """What arrived of one robot's packets.
+    """Which packets of one robot arrived.
 
-    :param src_id: whose packets
+    :param src_id: the robot whose packets are reported
     :param boot: the low 16 bits of that robot's boot number
-    :param number: newest number that the map is about, mod 2^16
+    :param number: newest number that the map covers, mod 2^16
     :param arrived: bit i says that packet ``number - i`` is here, 64 bits
-    :param settled: nothing older than the map is wanted
-    :param loss: share of packets lost lately, 0..127 in 1/128
+    :param settled: no packet older than the map is needed
+    :param loss: recent share of packets lost, 0..127 in 1/128
     """
 
     src_id: int
@@ -89,7 +89,7 @@ class Report(NamedTuple):
     loss: int
 
     def describe(self) -> str:
-        """What it says, in words."""
+        """The entry in words."""
         older = ", nothing older wanted" if self.settled else ""
         return (
             f"report, of robot {self.src_id} (boot ends in {self.boot:04x}), number {self.number}, "
@@ -98,18 +98,18 @@ class Report(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The sender has heard a start of another robot. To that robot it proves that the packet is no replay of an
+    """The sender has heard a start of another robot. This proves to that robot that the packet is not a replay of an
     earlier one.
 
-    :param src_id: of the other robot
-    :param boot: number of its start, 0..2^32-1
+    :param src_id: id of the other robot
+    :param boot: boot number of its start, 0..2^32-1
     """
 
     src_id: int
     boot: int
 
     def describe(self) -> str:
-        """What it says, in words."""
+        """The entry in words."""
         return f"heard, robot {self.src_id}, boot {self.boot}"
 
 
@@ -140,9 +140,9 @@ def write_control(entry: Control) -> bytes:
 
 
 def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | None]:
-    """Where the entry after the one at ``position`` begins, and that one; None for a kind that is not known.
+    """Where the entry after the one at ``position`` begins, and the entry itself; None for an unknown kind.
 
-    :raises EntryBoundsError: it runs past ``end``, or is no multiple of what it holds
+    :raises EntryBoundsError: it runs past ``end``, or its length is not a multiple of the size of its items
     """
     name = body[position]
     start = position + 2

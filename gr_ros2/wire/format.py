@@ -1,4 +1,4 @@
-"""The interface of every version of the wire format, and what is the same in all of them.
+"""The interface of every version of the wire format, and the constants that all of them share.
 
 Invariants: a format object has no state; sizes are in bytes; a size that a scheduler asks for is exact or too small,
 never too large.
@@ -14,7 +14,7 @@ BROADCAST = 255
 
 QOS_DEFAULT, QOS_LATENCY, QOS_BULK = 0, 1, 2
 QOS_NAMES = ("default", "latency", "bulk")
-"""By their code."""
+"""QoS classes by their code."""
 
 
 class Entry(Protocol):
@@ -30,20 +30,20 @@ class Entry(Protocol):
 
     @property
     def name(self) -> int:
-        """Number of the message on the wire, among those of its source and topic."""
+        """Number of the message on the wire, unique among the messages of its source and topic."""
 
     @property
     def label(self) -> str:
         """Which message, and which part of it, in a few characters."""
 
     def describe(self) -> str:
-        """The same in words."""
+        """The same as ``label``, in words."""
 
 
 class Packet(Protocol):
     """A packet as a value: the fields that tools can read in every version.
 
-    ``seq`` is the packet's number as the wire has it, ``Format.number_bits`` wide.
+    ``seq`` is the packet's number on the wire, ``Format.number_bits`` wide.
     """
 
     @property
@@ -70,8 +70,8 @@ class Span(NamedTuple):
     """A range of a packet's bytes.
 
     :param kind: head, ids, entry, control, repair, pad or crc (or the tag in its place)
-    :param size: bytes, an entry's own header included
-    :param entry: where it is one
+    :param size: bytes, with an entry's own header included
+    :param entry: the entry, if the range is one
     """
 
     kind: str
@@ -92,11 +92,11 @@ class Format(Protocol):
 
     @property
     def id_bits(self) -> int:
-        """Width of the number of a message among those of its source and topic, bits."""
+        """Width of a message's number (unique within its source and topic), bits."""
 
     @property
     def max_topics(self) -> int:
-        """Topic ids are below it."""
+        """Topic ids are below this number."""
 
     @property
     def max_entries(self) -> int:
@@ -116,33 +116,33 @@ class Format(Protocol):
 
     @property
     def entry_cost(self) -> int:
-        """Most bytes that a further entry takes beside its payload."""
+        """Most bytes that a further entry takes in addition to its payload."""
 
     def largest_message(self, packet_len: int) -> int:
-        """Most bytes that a message can have."""
+        """Most bytes of a message."""
 
     def smallest_packet_len(self, size: int) -> int | None:
-        """Smallest ``packet_len`` that carries a message of ``size`` bytes, None where none does."""
+        """Smallest ``packet_len`` that carries a message of ``size`` bytes, None if none does."""
 
     def room(self, packet_len: int, entries: int, payload: int) -> int:
         """Payload bytes that one more entry may have.
 
         :param entries: in the packet so far
         :param payload: bytes of payload in the packet so far, all entries together
-        :return: negative where no further entry fits
+        :return: negative if no further entry fits
         """
 
     def single_entry_payload(self, packet_len: int) -> int:
         """Most payload bytes of a packet with one entry."""
 
     def equal_entry_payload(self, packet_len: int, entries: int) -> int:
-        """Most payload bytes of each of so many equal entries; negative where they do not fit."""
+        """Most payload bytes of each of this many equal entries; negative if they do not fit."""
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
-        """Bytes of a packet with entries of these payloads, padding aside."""
+        """Bytes of a packet with entries of these payload lengths, without padding."""
 
     def layout(self, packet: Any, packet_len: int) -> list[Span]:
-        """What stands where in a packet, in the order of its bytes."""
+        """The fields of a packet, in the order of its bytes."""
 
     def encode(self, packet: Any, packet_len: int) -> bytes:
         """A packet's bytes.
@@ -154,5 +154,5 @@ class Format(Protocol):
     def decode(self, data: bytes, packet_len: int) -> Packet:
         """The packet in these bytes.
 
-        :raises WireError: they are none of this version
+        :raises WireError: they are not a packet of this version
         """

@@ -1,13 +1,13 @@
-"""Numbers that come round on the wire, and what they count."""
+"""Counters that wrap around on the wire."""
 
 from __future__ import annotations
 
 
 def unwrap(low: int, least: int, bits: int) -> int:
-    """The number not below ``least`` of which the wire says the lowest bits.
+    """The smallest number, not below ``least``, with the lowest bits that the wire carries.
 
-    A counter that may be up to ``n`` behind the newest number seen has ``least = newest - n``; then up to
-    ``2**bits - 1 - n`` ahead of it is told apart from behind.
+    A counter may be up to ``n`` behind the newest number seen; then ``least = newest - n``. Numbers up to
+    ``2**bits - 1 - n`` ahead of the newest are then told apart from numbers behind it.
 
     :param low: as received, 0..2**bits - 1
     :param bits: width on the wire

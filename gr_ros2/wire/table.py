@@ -1,7 +1,7 @@
 """The table of topics that a robot announces: a message of version 1 on topic ``TABLE_TOPIC``.
 
 Invariants: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(rows)) == rows``; equal tables
-have equal bytes, so that their CRC-32 says whether a receiver has the newest.
+have equal bytes, so a receiver can tell from their CRC-32 whether it has the newest.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Row(NamedTuple):
     :param qos: 0 default, 1 latency, 2 bulk
     :param reliable: its publishers are reliable: messages are delivered in their order
     :param latched: its publishers keep messages for late joiners (transient-local)
-    :param depth: of their history, 1..255; 0 not known
-    :param codec: how its messages are coded where they are, '' not at all; up to the codec what it says
+    :param depth: history depth of its publishers, 1..255; 0 if unknown
+    :param codec: how its messages are coded, '' if they are not; the codec defines the text
     """
 
     topic_id: int
@@ -40,7 +40,7 @@ class Row(NamedTuple):
     codec: str = ""
 
     def describe(self) -> str:
-        """What it says, in words."""
+        """The row in words."""
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
         words += ["reliable"] * self.reliable + ["latched"] * self.latched
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
@@ -68,7 +68,7 @@ def write_table(rows: Iterable[Row]) -> bytes:
 def read_table(data: bytes) -> tuple[Row, ...]:
     """The rows of a table.
 
-    :raises WireError: VersionError (a layout that is not known), EntryBoundsError (cut off) or EntryKindError
+    :raises WireError: VersionError (an unknown layout), EntryBoundsError (cut off) or EntryKindError
     """
     if data[:1] != bytes((_FORMAT,)):
         raise VersionError(f"a table of topics of layout {data[:1].hex() or 'none'}")

@@ -1,7 +1,7 @@
 """Version 0 of the wire format, byte for byte (the paper, section 5 and table 3): packets, arithmetic, codec.
 
 Invariants: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for
-every packet that ``encode`` takes; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
+every packet that ``encode`` accepts; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Entry:
     """One fragment of one message.
 
     :param topic_id: registry row, 0..15
-    :param entry_id: names the message among those of its source and topic, 0..255
+    :param entry_id: number of the message, unique among those of its source and topic, 0..255
     :param index: position of the fragment, from 0
     :param total: fragments of the message, 1..255
     :param payload: bytes of the serialized message
@@ -70,13 +70,13 @@ class Entry:
         return f"#{self.entry_id}[{self.index}/{self.total}]"
 
     def describe(self) -> str:
-        """The same in words."""
+        """The same as ``label``, in words."""
         return f"entry_id {self.entry_id}, index {self.index} of {self.total}"
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet, without its length: that is a property of the link.
+    """One packet. Its length is not stored here: it is a property of the link.
 
     :param src_id: 0..254 (a received one may be 255)
     :param dst_id: 0..255, 255 = broadcast
@@ -139,12 +139,12 @@ class FormatV0:
         return _MAX_TOTAL * self.single_entry_payload(packet_len)
 
     def smallest_packet_len(self, size: int) -> int | None:
-        """Smallest packet_len that carries a message of ``size`` bytes, None where none does."""
+        """Smallest packet_len that carries a message of ``size`` bytes, None if none does."""
         packet_len = self.packed_len([max(-(-size // _MAX_TOTAL), 1)])
         return packet_len if packet_len <= _MAX_PACKET_LEN else None
 
     def room(self, packet_len: int, entries: int, payload: int) -> int:
-        """Payload bytes that one more entry may have; negative where no further entry fits."""
+        """Payload bytes that one more entry may have; negative if no further entry fits."""
         if entries >= _MAX_ENTRIES:
             return -1
         count = entries + 1
@@ -155,11 +155,11 @@ class FormatV0:
         return packet_len - overhead(1) - _ENTRY_HEADER_LEN
 
     def equal_entry_payload(self, packet_len: int, entries: int) -> int:
-        """k*(E), most payload bytes of each of E equal entries (section 5.2); negative where E entries do not fit."""
+        """k*(E), most payload bytes of each of E equal entries (section 5.2); negative if E entries do not fit."""
         return (packet_len - overhead(entries)) // entries - _ENTRY_HEADER_LEN
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
-        """Bytes of header, topic ids, entries and CRC: L_pad of section 5.3 is ``packet_len`` less this."""
+        """Bytes of header, topic ids, entries and CRC. L_pad of section 5.3 is ``packet_len`` minus this number."""
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
     def layout(self, packet: Packet, packet_len: int) -> list[Span]:
@@ -219,7 +219,7 @@ class FormatV0:
         """
         if len(data) != packet_len or packet_len < _HEADER_LEN + _CRC_LEN:
             raise LengthError(f"{len(data)} bytes where packet_len is {packet_len}")
-        # Over the whole packet, the CRC included, the remainder of an intact one is 0.
+        # The remainder over a whole intact packet, including its CRC, is 0.
         if crc_hqx(data, 0):
             raise CrcError("CRC-16 does not match")
         flags, src_id, dst_id, seq, hop_count = _header.unpack_from(data)

@@ -1,11 +1,12 @@
-"""Version 1 on the wire, byte for byte; ``docs/reference/wire-format.md`` is its page.
+"""Version 1 on the wire, byte for byte; ``docs/reference/wire-format.md`` describes it.
 
 A packet is a header, a body and a trailer. A *source* packet carries entries and has a number of its own. A *standing*
-packet stands at the number of a source packet, told apart from others there by its row: a *repair* combines the bodies
-of source packets, a *control* packet carries hellos, reports and requests.
+packet uses the number of a source packet; its row distinguishes it from other packets with this number. There are two
+kinds of standing packets: a *repair* combines the bodies of source packets, and a *control* packet carries hellos,
+reports and requests.
 
-Invariants: everything that reads raises nothing but a named WireError, whatever the bytes; what is written reads back
-as the same values; a body says nothing of the number of its packet, so that it can be combined with others and
+Invariants: every function that reads raises nothing but a named WireError, whatever the bytes; what is written reads
+back as the same values; a body does not depend on the number of its packet, so that it can be combined with others and
 recovered.
 """
 
@@ -38,24 +39,24 @@ HEADER_LEN = 4
 ADDRESS_LEN = 2
 """Bytes that destination and hop count add to the header of an addressed packet."""
 STANDING_LEN = 2
-"""Bytes of window and row. A source packet leaves as many free, so that its body fits a repair."""
+"""Bytes of window and row. A source packet leaves the same number of bytes free, so that its body fits in a repair."""
 CRC_LEN = 4
 TAG_LEN = 8
 
 QOS_STANDING = 3
-"""Value of the two QoS bits in packets that are no source packets."""
+"""Value of the two QoS bits in packets that are not source packets."""
 ROWS = 128
-"""Standing packets at one number at most."""
+"""Most standing packets at one number."""
 MAX_WINDOW = 127
-"""Numbers that a repair spans at most."""
+"""Most numbers that a repair spans."""
 
 MAX_TOPICS = 240
 TABLE_TOPIC = 240
-"""Topic id of the table of topics (``table``), which is a message like any other."""
+"""Topic id of the table of topics (``table``), which is sent like any other message."""
 MAX_MESSAGE = 1 << 24
 """Bytes of the largest message."""
 MAX_BACK = (1 << 21) - 1
-"""Packets that a message may span at most."""
+"""Most packets that a message may span."""
 
 _SEALED, _ADDRESSED = 8, 4
 _MASKED = _CLEAR = _OLDEST = 0x80
@@ -69,10 +70,10 @@ _session = Struct(">II")
 class Header(NamedTuple):
     """The header: the bytes before the body.
 
-    :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is no source packet
+    :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is not a source packet
     :param sealed: the trailer is an 8-byte tag, not a CRC-32
     :param src_id: 0..254
-    :param number: of the source packet, or of the one at which a standing packet stands; mod 2^16
+    :param number: number of the source packet, or the number at which a standing packet stands; mod 2^16
     :param dst_id: 0..254 in an addressed packet, otherwise 255
     :param hop: hop count of an addressed packet, 0..255
     """
@@ -98,7 +99,7 @@ class Part(NamedTuple):
     :param back: how many source packets ago the message began
     :param offset: where in the message the payload stands, bytes
     :param last: whether the message ends with it
-    :param coded: whether the message is coded (compressed), its first byte naming how
+    :param coded: whether the message is coded (compressed); its first byte then says how
     """
 
     topic_id: int
@@ -110,18 +111,18 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> int:
-        """``back``: with its packet's number, what names the message."""
+        """``back``. Together with its packet's number, it identifies the message."""
         return self.back
 
     @property
     def label(self) -> str:
-        """``[whole]``, or ``-back[offset..end)`` and ``]`` where the message ends."""
+        """``[whole]``, or ``-back[offset..end)``; ``]`` instead of ``)`` where the message ends."""
         if self.last and not self.offset:
             return "[whole]"
         return f"-{self.back}[{self.offset}..{self.offset + len(self.payload)}{']' if self.last else ')'}"
 
     def describe(self) -> str:
-        """The same in words."""
+        """The same as ``label``, in words."""
         if self.last and not self.offset:
             return "whole"
         end = ", its last" if self.last else ""
@@ -132,12 +133,12 @@ Entry = Part | Control
 
 
 class Standing(NamedTuple):
-    """What follows the header of a packet that is no source packet.
+    """The fields after the header of a packet that is not a source packet.
 
-    :param row: 0..127; with the number, the packet's identity
+    :param row: 0..127; number and row together identify the packet
     :param mask: bit i says that source packet ``number - i`` is part of the combination; 0 in a control packet
-    :param oldest: nothing older than the window is worth anything any more
-    :param clear: the entries are not encrypted (a hello, without which nobody could decrypt anything)
+    :param oldest: no packet older than the window is needed any more
+    :param clear: the entries are not encrypted (as in a hello, without which nothing could be decrypted)
     :param size: bytes on the wire
     """
 
@@ -186,7 +187,7 @@ def write_header(header: Header) -> bytes:
 
 
 def read_header(data: bytes, packet_len: int) -> Header:
-    """The header of a packet of at most ``packet_len`` bytes; nothing is checked beyond it.
+    """The header of a packet of at most ``packet_len`` bytes; nothing after it is checked.
 
     :raises LengthError: too long, or too short for header and trailer
     :raises VersionError: not version 1
@@ -207,7 +208,7 @@ def read_header(data: bytes, packet_len: int) -> Header:
 
 
 def write_standing(standing: Standing) -> bytes:
-    """Window, row and mask. A mask is written where the combination leaves out packets of its window.
+    """The bytes of window, row and mask. A mask is written if the combination leaves out packets of its window.
 
     :raises EncodeError: for a field out of range
     """
@@ -227,7 +228,7 @@ def read_standing(data: bytes, start: int, end: int) -> Standing:
     """Window, row and mask from byte ``start`` of a packet whose trailer begins at ``end``.
 
     :raises EntryBoundsError: they run into the trailer
-    :raises WindowError: bits that do not go together
+    :raises WindowError: bits that contradict each other
     """
     if start + STANDING_LEN > end:
         raise EntryBoundsError(f"window and row run past byte {end}")
@@ -254,9 +255,9 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
     :param room: bytes free
     :param remaining: bytes of the message not yet sent
     :param back: source packets since it began; without meaning at offset 0
-    :param offset: bytes of it sent
-    :return: bytes of payload (-1 where nothing goes in) and bytes of the entry. A fragment that is not the last one
-        fills the body.
+    :param offset: bytes of it already sent
+    :return: bytes of payload (-1 if nothing fits) and bytes of the entry. A fragment that is not the last one fills the
+        body.
     """
     head = 2 + (_varint_len(back) + _varint_len(offset) if offset else 0)
     if remaining < room - head:
@@ -268,9 +269,9 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
 
 
 def write_body(entries: Sequence[Entry], room: int) -> bytes:
-    """The bytes of some entries, no padding.
+    """The bytes of some entries, without padding.
 
-    :param room: the longest body; the last entry ends there without saying its length where it can
+    :param room: bytes of the longest body; if the last entry ends there, it leaves out its length where possible
     :raises EncodeError: a field out of range, or more bytes than ``room``
     """
     parts: list[bytes] = []
@@ -285,7 +286,7 @@ def write_body(entries: Sequence[Entry], room: int) -> bytes:
 
 
 def read_body(body: bytes, room: int) -> list[Entry]:
-    """The entries of a body. Zeros may follow them; entries of kinds that are not known are left out.
+    """The entries of a body. Zeros may follow them; entries of unknown kinds are left out.
 
     :param room: the longest body on this link
     :raises WireError: EntryBoundsError, EntryKindError, VarintError or PadError
@@ -356,7 +357,7 @@ def _write_part(part: Part, room: int) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Seven bits a byte, the lowest first; the top bit says that more follow."""
+    """Seven bits per byte, the lowest first; the top bit says that more bytes follow."""
     if value < 128:
         return bytes((value,))
     parts = bytearray()
@@ -391,9 +392,9 @@ class Packet(NamedTuple):
     """A packet as a value.
 
     :param body: entries of a source or control packet, as far as they can be read
-    :param standing: of a repair or control packet
-    :param combined: of a repair, as long as the longest body that it combines
-    :param encrypted: the body was encrypted
+    :param standing: the fields of a repair or control packet
+    :param combined: the combination in a repair, as long as the longest body that it combines
+    :param encrypted: whether the body was encrypted
     """
 
     header: Header
@@ -416,12 +417,12 @@ class Packet(NamedTuple):
 
     @property
     def seq(self) -> int:
-        """Number of the source packet, or of the one at which it stands, mod 2^16."""
+        """Number of the source packet, or the number at which a standing packet stands, mod 2^16."""
         return self.header.number
 
     @property
     def qos(self) -> int:
-        """Of its messages; default where it carries none."""
+        """QoS class of its messages; default if it carries none."""
         return self.header.qos if self.standing is None else 0
 
     @property
@@ -440,7 +441,7 @@ class Packet(NamedTuple):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Entries that are no messages, in their order."""
+        """Entries that are not messages, in their order."""
         return tuple([entry for entry in self.body if not isinstance(entry, Part)])
 
 
@@ -448,7 +449,7 @@ def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed:
     """The bytes of a packet that is not sealed.
 
     :param packet_len: bytes of the longest packet on this link
-    :param fixed: whether every packet has as many; otherwise only as many as needed
+    :param fixed: whether every packet has ``packet_len`` bytes; otherwise it has only as many as needed
     :raises EncodeError: a field out of range, or more than fits
     """
     header, entries, standing, combined, _ = packet
@@ -507,27 +508,27 @@ class FormatV1:
         return MAX_MESSAGE
 
     def smallest_packet_len(self, size: int) -> int | None:
-        """Smallest packet_len that carries a message of ``size`` bytes, None where none does."""
+        """Smallest packet_len that carries a message of ``size`` bytes, None if none does."""
         return self.min_packet_len if size <= MAX_MESSAGE else None
 
     def room(self, packet_len: int, entries: int, payload: int) -> int:
-        """Payload bytes that one more entry may have; negative where no further entry fits."""
+        """Payload bytes that one more entry may have; negative if no further entry fits."""
         return body_room(packet_len) - self.entry_cost * (entries + 1) - payload
 
     def single_entry_payload(self, packet_len: int) -> int:
-        """Payload bytes of a packet with one entry; one more fits, since it may fill the body."""
+        """Payload bytes of a packet with one entry; this can be one byte more, because the entry may fill the body."""
         return self.room(packet_len, 0, 0)
 
     def equal_entry_payload(self, packet_len: int, entries: int) -> int:
-        """Most payload bytes of each of so many equal entries; negative where they do not fit."""
+        """Most payload bytes of each of this many equal entries; negative if they do not fit."""
         return body_room(packet_len) // entries - self.entry_cost
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
-        """Bytes of a packet with entries of these payloads, padding aside."""
+        """Bytes of a packet with entries of these payload lengths, without padding."""
         return HEADER_LEN + STANDING_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
 
     def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """What stands where in a packet, in the order of its bytes."""
+        """The fields of a packet, in the order of its bytes."""
         header, standing = packet.header, packet.standing
         trailer = TAG_LEN if header.sealed else CRC_LEN
         spans = [Span("head", header.size + (standing.size if standing is not None else 0))]
@@ -542,15 +543,16 @@ class FormatV1:
         return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
 
     def encode(self, packet: Packet, packet_len: int) -> bytes:
-        """A packet's bytes, of the first start that a sender may have: see ``encode`` of this module.
+        """A packet's bytes, for the lowest boot number of a sender: see ``encode`` of this module.
 
         :raises EncodeError: a field out of range, or more than fits
         """
         return encode(packet, packet_len, 0)
 
     def decode(self, data: bytes, packet_len: int) -> Packet:
-        """Read a packet as far as it says what it is without the hello of its sender: its trailer is checked only where
-        it carries that hello itself, and of a sealed packet nothing but a hello is read.
+        """Read a packet as far as this is possible without the hello of its sender.
+
+        The trailer is checked only if the packet itself carries that hello. Of a sealed packet, only a hello is read.
 
         :raises WireError: LengthError, VersionError, CrcError, WindowError, EntryBoundsError, EntryKindError,
             VarintError or PadError

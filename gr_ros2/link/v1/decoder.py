@@ -1,13 +1,14 @@
-"""The receiver's side of repair: which source packets of one sender are here, and which follow from repairs.
+"""The receiver's side of repair: which source packets of one sender are known, and which follow from repairs.
 
-What is held beside the bodies is a system of linear equations over GF(256) in the missing ones, in echelon form: each
-equation is known by its oldest packet, its *pivot*, whose coefficient is 1. A repair spans at most 127 numbers, so does
-every equation made of repairs, and the work per packet stays bounded however long the window is.
+The decoder holds the bodies that are known. For the missing ones it holds a system of linear equations over GF(256) in
+echelon form. Each equation is stored under its oldest packet, its *pivot*, whose coefficient is 1. A repair spans at
+most 127 numbers, and so does every equation made of repairs. The work per packet therefore stays bounded, however long
+the window is.
 
-Invariants: a body given out is the one that was sent, or the packet's own check failed to notice damage; a body that
-follows from equations but cannot be parsed is not believed, and all equations go with it, since one wrong one would
-spread; the numbers never come round here (the caller counts how often they have); memory is bounded by ``span`` bodies
-and as many equations as numbers are missing among them.
+Invariants: a body that the decoder returns is the one that was sent, unless the packet's own check failed to notice
+damage; a body that follows from equations but cannot be parsed is dropped together with all equations, since one wrong
+equation would spread; packet numbers do not wrap around here (the caller counts how often they have); memory is bounded
+by ``span`` bodies and as many equations as numbers are missing among them.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from gr_ros2.link.v1.gf256 import CAUCHY, INVERSE, TIMES
 from gr_ros2.wire.v1 import MAX_WINDOW
 
 Found = list[tuple[int, bytes]]
-"""Source packets that are known now and were not before: (number, body)."""
+"""Source packets that have become known: (number, body)."""
 
 
 class RepairDecoder:
-    """The packets of one sender.
+    """The source packets of one sender that are known, and the equations for the missing ones.
 
     :param room: bytes of the longest body
-    :param plausible: whether a recovered body can be one
+    :param plausible: whether a recovered body can be valid
     :param span: numbers remembered, counted back from the newest
     """
 
     def __init__(self, room: int, plausible: Callable[[bytes], bool], span: int) -> None:
         self.counts: Counter[str] = Counter()
-        """``recovered`` packets; repairs that were ``redundant``, ``too_old`` or held for later (``held``); and
-        ``implausible`` results, each of which cost all equations."""
+        """Counts: ``recovered`` packets; repairs that were ``redundant``, ``too_old`` or stored for later (``held``);
+        ``implausible`` results. Each implausible result discards all equations."""
         self.newest = -1
-        """The newest number heard of."""
+        """The newest number seen."""
         self.floor = 0
         """The oldest number remembered."""
         self._room = room
@@ -43,7 +44,7 @@ class RepairDecoder:
         self._span = span
         self._bodies: dict[int, bytes] = {}
         self._rows: dict[int, tuple[bytes, bytes]] = {}
-        """Pivot: its coefficients from the pivot on, and its right side."""
+        """By pivot: the coefficients of the equation from the pivot on, and its right side."""
 
     def __contains__(self, number: int) -> bool:
         """Whether a source packet is known."""
@@ -51,16 +52,16 @@ class RepairDecoder:
 
     @property
     def equations(self) -> int:
-        """Repairs held that do not yet tell a packet."""
+        """Number of equations held that do not determine a packet yet."""
         return len(self._rows)
 
     def begin(self, number: int) -> None:
-        """Nothing older than this number will be asked for."""
+        """Ignore all packets older than this number."""
         if number > self.floor:
             self._forget(number)
 
     def advance(self, number: int) -> None:
-        """The sender has come to this number."""
+        """The sender has reached this number."""
         if number > self.newest:
             self.newest = number
             floor = number - self._span + 1
@@ -68,9 +69,9 @@ class RepairDecoder:
                 self._forget(floor)
 
     def source(self, number: int, body: bytes) -> Found:
-        """A source packet came, or is known otherwise.
+        """Take a source packet that arrived or is known in another way.
 
-        :return: it and what follows from it; nothing where it was known, or is too old
+        :return: this packet and those that follow from it; nothing if it was known already or is too old
         """
         if number in self._bodies or number < self.floor:
             return []
@@ -81,13 +82,13 @@ class RepairDecoder:
         return self._learn([(number, body)])
 
     def repair(self, number: int, mask: int, row: int, combined: bytes) -> Found:
-        """A repair came.
+        """Take a repair.
 
         :param number: newest number of its window
-        :param mask: bit i says that ``number - i`` is part of it
-        :param row: of its coefficients
-        :param combined: the combination
-        :return: the packets that follow
+        :param mask: bit i says that packet ``number - i`` is part of it
+        :param row: row of its coefficients
+        :param combined: the linear combination of the bodies
+        :return: the packets that follow from it
         """
         self.advance(number)
         bodies = self._bodies
@@ -112,7 +113,7 @@ class RepairDecoder:
         return self._learn(self._insert(pivot, left, right))
 
     def _insert(self, pivot: int, left: int, right: int) -> Found:
-        """Take an equation in, reduced by those held; the packet that it tells by itself."""
+        """Reduce an equation by those held and store it; return the packet that it determines by itself."""
         rows, room = self._rows, self._room
         while left:
             shift = ((left & -left).bit_length() - 1) >> 3
@@ -138,7 +139,7 @@ class RepairDecoder:
         return []
 
     def _learn(self, found: Found) -> Found:
-        """Put packets that are known into the equations; these and all that follow."""
+        """Put packets that have become known into the equations; return these and all that follow."""
         bodies, rows, room = self._bodies, self._rows, self._room
         done = 0
         while done < len(found):
@@ -172,7 +173,7 @@ class RepairDecoder:
         return found
 
     def _naming(self, number: int) -> list[int]:
-        """Pivots, older than it, of the equations that have a packet in them."""
+        """Pivots, older than this packet, of the equations that contain it."""
         rows = self._rows
         if len(rows) < MAX_WINDOW:
             pivots = [pivot for pivot in rows if pivot < number]
@@ -181,20 +182,20 @@ class RepairDecoder:
         return [pivot for pivot in pivots if number - pivot < len(rows[pivot][0]) and rows[pivot][0][number - pivot]]
 
     def _believe(self, number: int, body: bytes) -> Found:
-        """A body that follows from equations, if it can be one."""
+        """Return a body that follows from equations, if it is plausible."""
         if not self._plausible(body):
             return self._disbelieve()
         self.counts["recovered"] += 1
         return [(number, body)]
 
     def _disbelieve(self) -> Found:
-        """Something in the equations is wrong, and nobody knows what."""
+        """Discard all equations: one of them is wrong, and it is not known which."""
         self.counts["implausible"] += 1
         self._rows.clear()
         return []
 
     def _forget(self, floor: int) -> None:
-        """Remember nothing older than ``floor``."""
+        """Forget everything older than ``floor``."""
         bodies, rows = self._bodies, self._rows
         if floor - self.floor > len(bodies):
             for number in [number for number in bodies if number < floor]:

@@ -1,11 +1,13 @@
 """One robot's end of a link that speaks version 1: messages in, packets out; packets in, messages out.
 
-*What leaves.* When a packet is asked for: a hello that cannot wait, then new messages, then what there is to say about
-others' packets, then repair (``link.repair``). Reports ride along where a packet of messages has room for one.
+*Order of sending.* When the caller asks for a packet, the endpoint chooses in this order: a hello that cannot wait, new
+messages, control entries about other robots' packets (reports and requests), repair (``link.repair``). Reports are also
+added to a packet of messages that has room for one.
 
-Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason;
-``receive`` never raises, whatever the bytes; packets come out only when the pace (rate or credit) allows; a number is
-sent once, a row once per number; no clock, no randomness, no IO: time, boot number and stored state are handed in.
+Invariants: every submitted message is accepted once; it then leaves whole or is refused with a named reason;
+``receive`` never raises, whatever the bytes; packets leave only when the pace (rate or credit) allows; each number is
+sent once, and each row once per number; there is no clock, no randomness and no IO here: the caller passes in the time,
+the boot number and the stored state.
 """
 
 from __future__ import annotations
@@ -72,25 +74,25 @@ from gr_ros2.wire.v1 import (
 )
 
 FORCED = 20
-"""New packets after which a report that found no room goes by itself: 5 % of the slots."""
+"""New packets after which a report that found no room is sent in a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
-"""Settings that may change while it runs; others of a sending block that do not concern version 1 are left out."""
+"""Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
 _INTERVALS = 15
 _POLL_S = 0.02
-"""s after which a thrifty sender with doubts thinks again."""
+"""s after which a thrifty sender that is in doubt checks again."""
 
 
 class Endpoint:
     """Both directions of one robot.
 
-    :param topics: what it sends; None where it only receives
-    :param boot: number of this start: greater than all before it
-    :param keys: what packets are sealed with
+    :param topics: topics that it sends; None if it only receives
+    :param boot: number of this start; it is greater than all earlier ones
+    :param keys: keys that seal its packets
     :param codec: codes the messages sent
-    :param decoder_for: makes what decodes a robot's messages of its table of topics
+    :param decoder_for: makes the decoder for a robot's messages from its table of topics
     :param rows: topics of robots that announce none
     :param heard: what ``save`` stored before this start
-    :param save: stores how far a robot was heard; needed where ``keys`` are to keep replays out after a restart
+    :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
     """
 
@@ -119,7 +121,7 @@ class Endpoint:
         self._decoder_for = decoder_for
         self._rows = rows
         self._marks: dict[int, dict[int, int]] = {}
-        """CRC-32 of the latched messages of every robot, across its restarts."""
+        """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
         sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
         self._trailer = self.keys.own(settings.src_id, boot)
@@ -144,7 +146,7 @@ class Endpoint:
         self._hello_number = -1
         self._repeat_at = inf
         self._unheard = 0
-        """New packets since a report was due and found no room."""
+        """New packets since a report became due and found no room."""
         self._sender: Neighbour | None = None
 
     # ---- sending
@@ -161,7 +163,7 @@ class Endpoint:
 
     @property
     def idle(self) -> bool:
-        """Whether no message waits, and nothing that has left is worth repairing."""
+        """Whether no message waits, and no packet that has left is worth repairing."""
         mending = self.paced and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
@@ -173,26 +175,26 @@ class Endpoint:
         self.outbox.submit(topic_id, payload, now)
 
     def missed(self, topic_id: int, total: int) -> None:
-        """Take down how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
+        """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
         new = total - self.sent.missed[topic_id]
         if new > 0:
             self.sent.missed[topic_id] = total
             self._tell(Missed(topic_id, new))
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """Policy and deadline (s, 0 none) of a topic's queue."""
+        """Policy and deadline (s, 0 for none) of a topic's queue."""
         return self.outbox.queue(topic_id)
 
     def depth(self, topic_id: int) -> int:
-        """Messages of a topic that may wait, 0 unbounded."""
+        """Number of messages of a topic that may wait, 0 for unbounded."""
         return self.outbox.depth(topic_id)
 
     def room(self, topic_id: int) -> bool:
-        """Whether a message of that topic could be submitted without pushing another out."""
+        """Whether a message of that topic could be submitted without dropping another one."""
         return self.outbox.room(topic_id)
 
     def queued(self) -> dict[int, int]:
-        """Messages waiting or under way, per topic id."""
+        """Messages that wait or are partly sent, per topic id."""
         return self.outbox.queued()
 
     def reconfigure(self, **changes: Any) -> None:
@@ -210,11 +212,11 @@ class Endpoint:
             self._slot = -inf
 
     def knows(self, src_id: int) -> bool:
-        """Whether a robot has a place at present."""
+        """Whether the state of a robot is held at present."""
         return self.neighbours.get(src_id) is not None
 
     def rows(self, src_id: int) -> Mapping[int, TableRow]:
-        """What a robot's topic ids mean, as far as it has announced them."""
+        """The topics of a robot by topic id, as far as it has announced them."""
         neighbour = self.neighbours.get(src_id)
         return {} if neighbour is None else neighbour.inbox.rows
 
@@ -224,10 +226,10 @@ class Endpoint:
         return sum(neighbour.inbox.held for neighbour in self.neighbours)
 
     def keep_incomplete(self, timeout_s: float) -> None:
-        """Nothing: an incomplete message is kept while it may be repaired."""
+        """Do nothing: an incomplete message is kept as long as it may be repaired."""
 
     def unpublished(self, event: Delivered) -> Lost:
-        """Book a message that was given out but did not come onto the ROS graph. It may come again when it is kept."""
+        """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
         neighbour = self.neighbours.get(event.src_id)
         if neighbour is not None:
             neighbour.inbox.marks.pop(event.topic_id, None)
@@ -248,17 +250,17 @@ class Endpoint:
             self._credits -= 1
             self._busy_since = now if not self._credits and not self.outbox.idle else inf
         if rate := self._rate:
-            # A slot missed by less than its length is made up for, so that late wake-ups cost no rate.
+            # A slot missed by less than its length is made up for, so that late wake-ups do not lower the rate.
             self._slot = max(self._slot, now - 1 / rate) + 1 / rate
         return data
 
     def use_credit(self) -> None:
-        """From now on a packet leaves only for a credit."""
+        """From now on, a packet leaves only when there is a credit."""
         if self._credits is None:
             self._credits = 0
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take so many further packets."""
+        """Add credits: the PHY can take this number of further packets."""
         self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
 
     @property
@@ -273,13 +275,13 @@ class Endpoint:
 
     @property
     def _rate(self) -> float:
-        """Packets/s at most, 0 without limit."""
+        """Most packets/s, 0 without limit."""
         return 0.0 if self.settings.packet_rate == AUTO else self.settings.packet_rate
 
     def follow(
         self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
     ) -> bool:
-        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+        """Take over the QoS of a topic's publishers, where the configuration leaves it open.
 
         :return: whether that changed its queue
         """
@@ -291,14 +293,14 @@ class Endpoint:
 
     @property
     def interval(self) -> float:
-        """s from one packet to the next while busy; 0 where not known."""
+        """s from one packet to the next while there is always one to send; 0 if unknown."""
         if self._rate:
             return 1 / self._rate
         return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
 
     @property
     def paced(self) -> bool:
-        """Whether something says when there is a slot, and so when one is idle."""
+        """Whether the slots are known (from a rate or from credits), so that an idle slot can be noticed."""
         return self._rate > 0 or (self._credits is not None and not self.unpaced)
 
     # ---- receiving
@@ -311,7 +313,7 @@ class Endpoint:
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Do what has become due at the receiving side: go on without what is missing, let go of who is silent."""
+        """Do what has become due on the receiving side: give up missing packets, and forget robots that are silent."""
         self._now = max(self._now, now)
         for neighbour in self.neighbours:
             self._report_all(neighbour.inbox.handle_timeout(now))
@@ -324,13 +326,13 @@ class Endpoint:
         return events
 
     def next_timeout(self) -> float | None:
-        """When ``handle_timeout`` has something to do, if nothing is called before."""
+        """When ``handle_timeout`` has something to do, if no other method is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
         return min(times, default=None)
 
     def next_departure(self) -> float | None:
-        """When ``next_packet`` may have something, if nothing is called before."""
+        """When ``next_packet`` may have something, if no other method is called before."""
         now = self._now
         if self.out_of_credit or not self._speaks:
             return None
@@ -423,7 +425,7 @@ class Endpoint:
         return self._leave(data, Packet(header, tuple(entries), standing, combined, encrypted), kind, now)
 
     def _control(self, entries: Sequence[Entry], kind: AirKind, now: float, *, clear: bool = False) -> bytes:
-        """A packet of entries that are no messages; it stands at the newest number."""
+        """A packet of entries that are not messages; it stands at the newest number."""
         row = self.window.take_row(self.window.newest)
         if row is None:
             return self._source([], self.window.exhausted(now), 0, (), now)
@@ -448,17 +450,17 @@ class Endpoint:
             self._hello_number = -1
             return self._source(
                 [], (), 0, (), now
-            )  # a receiver that has restarted takes nothing below a number it knew
+            )  # a receiver that restarts takes nothing below the number that it had stored
         self._hello_number = self.window.newest
         outbox = self.outbox
         if self._talk.starting and not self.window.receivers():
-            outbox.ask(TABLE_TOPIC, now)  # nobody says whether it has come
+            outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
         entries = self._talk.hello(self._room, turns, outbox.digest, marks, now)
         return self._control(entries, "hello", now, clear=True)
 
     def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
-        """Reports, and requests where there is room."""
+        """A packet with reports, and with requests where there is room."""
         entries: list[Entry] = []
         free = self._room
         for neighbour in due:
@@ -555,7 +557,7 @@ class Endpoint:
             self._report_all(inbox.heard(number, now))
 
     def _meet(self, opened: Opened, now: float) -> None:
-        """A robot that was not known, or is heard again."""
+        """A robot is heard for the first time, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
             self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
@@ -569,7 +571,7 @@ class Endpoint:
         self._report_all([Met(neighbour.src_id, neighbour.boot, hears)])
 
     def _entry(self, entry: Control) -> None:
-        """An entry that is no message, of the robot whose packet it came in."""
+        """Handle an entry that is not a message, from the sender of the packet that is processed."""
         assert self._sender is not None
         own, now = self.settings.src_id, self._now
         if isinstance(entry, Report):

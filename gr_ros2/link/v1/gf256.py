@@ -1,11 +1,11 @@
 """Arithmetic in GF(256), and the coefficients of repairs.
 
-The field is that of the polynomial 0x11D (x^8 + x^4 + x^3 + x^2 + 1) with generator 2. Adding is XOR. A row of bytes is
-multiplied by one ``bytes.translate`` with a table of 256 bytes, and added as one long integer: that is faster in Python
-than numpy for rows of a packet's size.
+The field is defined by the polynomial 0x11D (x^8 + x^4 + x^3 + x^2 + 1), and its generator is 2. Addition is XOR. A row
+of bytes is multiplied by one ``bytes.translate`` with a table of 256 bytes, and added as one long integer. For rows of
+a packet's size, this is faster in Python than numpy.
 
-Invariant: any square part of the Cauchy matrix ``coefficient(row, number)`` is invertible as long as its rows differ
-mod 128 and its numbers differ mod 128. So as many different repairs as packets are missing always bring them back.
+Invariant: any square part of the Cauchy matrix ``coefficient(row, number)`` is invertible if its rows differ mod 128
+and its numbers differ mod 128. So n missing packets can always be recovered from n different repairs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TIMES: tuple[bytes, ...] = (
     bytes(256),
     *(bytes((0, *(_POWER[_LOG[a] + _LOG[b]] for b in range(1, 256)))) for a in range(1, 256)),
 )
-"""``row.translate(TIMES[a])`` is the row times a."""
+"""``row.translate(TIMES[a])`` is the row multiplied by a."""
 
 INVERSE = bytes((0, *(_POWER[255 - _LOG[a]] for a in range(1, 256))))
 """1 / a for a in 1..255."""
@@ -44,19 +44,19 @@ CAUCHY: tuple[bytes, ...] = tuple(TIMES[a] for a in INVERSE)
 
 
 def coefficient(row: int, number: int) -> int:
-    """By what the body of a source packet is multiplied in a repair, 1..255.
+    """The factor of a source packet's body in a repair, 1..255.
 
-    :param row: of the repair
-    :param number: of the source packet
+    :param row: row of the repair
+    :param number: number of the source packet
     """
     return INVERSE[(_HALF | row % _HALF) ^ number % _HALF]
 
 
 def combine(bodies: Iterable[tuple[int, bytes]], row: int) -> bytes:
-    """The linear combination of some bodies, as long as the longest; shorter ones count as followed by zeros.
+    """The linear combination of some bodies. It is as long as the longest body; shorter ones are padded with zeros.
 
     :param bodies: (number, body) of each
-    :param row: of the repair
+    :param row: row of the repair
     """
     shifted = _HALF | row % _HALF
     total = longest = 0

@@ -1,11 +1,12 @@
-"""One robot heard: its packets to messages, in order.
+"""The receiving side for one robot: it turns packets into messages, in order.
 
-*Order.* A message of a topic whose publishers are reliable waits until every packet before the one in which it began is
-here, or given up: it is not known what those carried. A packet is given up for this purpose when its sender says that
-it is over, or ``hold_s`` after it was missed; and at once while hardly any missing packet comes back. Messages of other
-topics are delivered as they come, and never after a later one.
+*Order.* A message of a topic with reliable publishers waits until every packet before the one in which it began is here
+or given up, because it is not known which messages those packets carried. A missing packet is given up for this purpose
+in three cases: its sender says that the packet is over; ``hold_s`` have passed since it was missed; or hardly any
+missing packet comes back, in which case it is given up at once. Messages of other topics are delivered as they arrive,
+but never after a later message of the same topic.
 
-Invariants: nothing is delivered twice, nor after a later message of its topic; every message of which something came
+Invariants: no message is delivered twice, or after a later message of its topic; every message of which a part arrived
 ends in one Delivered or Lost; memory is bounded.
 """
 
@@ -34,18 +35,18 @@ from gr_ros2.wire.v1 import TABLE_TOPIC, Entry, Part, read_body
 Events = list[Delivered | Lost | Announced]
 
 _PACKET_COST = 150
-"""Bytes of bookkeeping counted per packet held."""
+"""Bytes of bookkeeping that are counted per packet held."""
 _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
 _REPORT_S = 0.1
-"""s after which even one packet is reported."""
+"""s after which a report is due, even about a single packet."""
 _WAITING = 256
-"""Messages of topics not known yet that are kept until the table comes."""
+"""Number of messages of unknown topics that are kept until the table arrives."""
 
 
 @dataclass(slots=True)
 class _Ready:
-    """A message that is here whole and waits for its turn."""
+    """A complete message that waits for its turn."""
 
     topic_id: int
     order: tuple[int, int]
@@ -56,14 +57,14 @@ class _Ready:
 
 
 class Inbox:
-    """What arrives of one start of one robot.
+    """What arrives from one start of one robot.
 
-    :param first: number of the first packet that may be wanted
+    :param first: number of the first packet that may be needed
     :param room: bytes of its longest body
     :param rows: its topics, where they are known beforehand
-    :param decoder_for: makes what decodes its messages of its table
-    :param stats: where it counts, beside others
-    :param control: takes entries that are no messages
+    :param decoder_for: makes the decoder for its messages from its table of topics
+    :param stats: receiver statistics, shared with other inboxes
+    :param control: called with entries that are not messages
     """
 
     def __init__(
@@ -82,12 +83,12 @@ class Inbox:
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.counts: Counter[str] = Counter()
-        """Packets by what became of them: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
+        """Packets by result: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
         self.rows: dict[int, TableRow] = {}
         self.digest = 0
-        """CRC-32 of the table that is known."""
+        """CRC-32 of the table of topics that is known."""
         self.loss = 0.0
-        """Share of packets lost lately."""
+        """Recent share of lost packets."""
         self._settings = settings
         self._room = room
         self._control = control
@@ -99,30 +100,30 @@ class Inbox:
         self.decoder.begin(first)
         self.decoder.newest = first - 1
         self._low = self._wanted = first
-        """No packet before these is waited for, and wanted."""
+        """Packets before this number are neither waited for nor needed."""
         self._dead = first
-        """No packet before is worth anything to its sender."""
+        """The sender does not repair packets before this number any more."""
         self._void: set[int] = set()
         """Packets that their sender has left out of a repair."""
         self._gaps: deque[tuple[float, int]] = deque()
-        """Packets that were missing, and since when; none that is not remembered."""
+        """Packets that are missing, and since when (s); only numbers that are still remembered."""
         self._hope = 1.0
-        """Share of missing packets that come back in time."""
+        """Share of missing packets that are recovered in time."""
         self._reassembly = Reassembly(settings.max_source_bytes)
         self._ready: dict[int, list[_Ready]] = {}
         """Messages waiting for their turn, by topic."""
         self._unknown: deque[_Ready] = deque()
         self._waiting = 0
-        """Bytes of these."""
+        """Bytes of the messages that wait for their turn."""
         self._last: dict[int, tuple[int, int]] = {}
-        """The newest message delivered, by topic."""
+        """The newest message that was delivered, by topic."""
         self.marks = marks
-        """CRC-32 of the newest message of each latched topic, as it was on the air."""
+        """CRC-32 of the newest message of each latched topic, in the form in which it was transmitted."""
         self._events: Events = []
         self._now = 0.0
         self._unreported = 0
         self._missed = False
-        """Whether a packet has been missed since the last report."""
+        """Whether a packet went missing since the last report."""
         self._reported_at = 0.0
         self._old_turn = False
         if rows:
@@ -130,14 +131,14 @@ class Inbox:
 
     @property
     def newest(self) -> int:
-        """The newest packet number heard of."""
+        """The newest packet number seen."""
         return self.decoder.newest
 
     def source(self, number: int, body: bytes, entries: Sequence[Entry], qos: int, now: float) -> Events:
-        """A source packet came.
+        """Take a source packet.
 
         :param body: as it stood in the packet, padding included
-        :param entries: what it says
+        :param entries: the entries of the packet
         """
         self._unreported += 1
         if number in self.decoder:
@@ -163,7 +164,7 @@ class Inbox:
         return self._given()
 
     def repair(self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float) -> Events:
-        """A repair came."""
+        """Take a repair."""
         self._unreported += 1
         self._advance(number, now, here=False)
         window = mask.bit_length()
@@ -179,13 +180,13 @@ class Inbox:
         return self._given()
 
     def heard(self, number: int, now: float) -> Events:
-        """A packet that is neither stands at this number."""
+        """Note the number at which a packet stands that is neither a source packet nor a repair."""
         self._advance(number, now, here=False)
         self._settle()
         return self._given()
 
     def handle_timeout(self, now: float) -> Events:
-        """Go on without what has been waited for long enough."""
+        """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
         for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
@@ -215,7 +216,7 @@ class Inbox:
         return self._given()
 
     def lacks(self, mark: tuple[int, int], now: float) -> bool:
-        """Whether a latched message is not here and not under way either."""
+        """Whether a latched message is not here and is not arriving either."""
         topic_id, value = mark
         return self.marks.get(topic_id) != value and not self._reassembly.growing(topic_id, now - 1.0)
 
@@ -227,7 +228,7 @@ class Inbox:
         return self._reported_at + _REPORT_S
 
     def report(self, now: float) -> Report:
-        """What has arrived, newest part and oldest missing part in turn."""
+        """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
         self._unreported = 0
         self._missed = False
         self._reported_at = now
@@ -268,7 +269,7 @@ class Inbox:
         return True
 
     def _advance(self, number: int, now: float, *, here: bool) -> None:
-        """The sender has come to this number: what is between it and the newest is missing for now."""
+        """The sender has reached this number: the packets between the newest one and this one are missing for now."""
         self._now = now
         newest = self.decoder.newest
         if number <= newest:
@@ -291,7 +292,7 @@ class Inbox:
         self._take(number, read_body(body, self._room), -1, repaired=True)
 
     def _take(self, number: int, entries: Sequence[Entry], qos: int, *, repaired: bool) -> None:
-        """The entries of a packet that is here now."""
+        """Process the entries of a packet that is known now."""
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):
                 self._control(entry)
@@ -319,7 +320,7 @@ class Inbox:
         self._arrived(_Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
 
     def _arrived(self, ready: _Ready) -> None:
-        """A message is here whole."""
+        """A message is complete."""
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload)
             return
@@ -337,7 +338,7 @@ class Inbox:
             self._deliver(ready, row)
 
     def _settle(self) -> None:
-        """See how far everything is here or given up, and deliver what waited for that."""
+        """Find up to which packet everything is here or given up, and deliver the messages that waited for that."""
         decoder, dead, void = self.decoder, max(self._dead, self.decoder.floor), self._void
         newest, low = decoder.newest, self._low
         if self._gaps:
@@ -358,7 +359,7 @@ class Inbox:
                     self._release(self.rows[topic_id], line)
 
     def _give_up(self, low: int, dead: int) -> int:
-        """Up to where missing packets have been waited for long enough; sees how many come back."""
+        """The number up to which missing packets are given up; also updates the share of packets that are recovered."""
         gaps, decoder, hold_s = self._gaps, self.decoder, self._settings.hold_s
         while gaps and gaps[0][0] + hold_s <= self._now:
             number = gaps.popleft()[1]
@@ -435,5 +436,5 @@ class Inbox:
 
 
 def _passed_over(row: TableRow) -> LedgerRow:
-    """Where a message ends that is not delivered since a later one of its topic was."""
+    """The ledger row of a message that is not delivered because a later one of its topic was."""
     return LedgerRow.GIVEN_UP if row.reliable else LedgerRow.OVERTAKEN

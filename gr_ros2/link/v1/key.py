@@ -1,6 +1,6 @@
-"""What names a message of version 1 among all messages of its sender.
+"""The key of a version 1 message: it identifies the message among all messages of its sender.
 
-Invariant: no two messages of a sender have the same key, over all its starts.
+Invariant: no two messages of a sender have the same key, even across restarts.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Key(NamedTuple):
-    """A message of one sender: boot number, number of the packet in which it began, place among the entries there."""
+    """Key of a message of one sender: boot number, number of the packet in which it began, place among its entries."""
 
     boot: int
     number: int

@@ -1,13 +1,16 @@
-"""The robots heard: which start of each, how its packets are opened, and what is refused.
+"""The robots that are heard: the current start of each, how its packets are opened, and which packets are refused.
 
-A robot's packets can be opened once a hello has told its boot number; what came shortly before is kept until then. The
-newest boot number of every robot is remembered across one's own restarts, where packets are sealed, together with a
-packet number below which nothing is taken: it is stored before a packet above it is used, so whatever was heard before
-a restart is refused after it. A robot that stands still is taken again below that number once it has heard this start
-of ours, which only it can say and only now.
+A robot's packets can be opened once a hello has told its boot number. Packets that arrive shortly before the hello are
+kept until then.
 
-Invariants: nothing is given out that was not opened; no standing packet is given out twice; an older start of a robot
-is never gone back to where packets are sealed.
+Where packets are sealed, the newest boot number of every robot is stored, together with a packet number below which
+nothing is accepted. This number is stored before a packet above it is used. So after a restart of this robot, every
+packet heard before the restart is refused. A robot that stands still (its packet number does not grow) is accepted
+below that number once it says that it has heard the present start of this robot: only that robot can say so, and only
+after the restart.
+
+Invariants: no body is given out that was not opened; no standing packet is given out twice; where packets are sealed,
+an older start of a robot is never accepted again.
 """
 
 from __future__ import annotations
@@ -35,15 +38,15 @@ from gr_ros2.wire.v1 import (
 )
 
 Save = Callable[[int, int, int], None]
-"""Stores robot id, boot number and the packet number below which nothing more is taken, before it returns."""
+"""Stores robot id, boot number and the packet number below which nothing more is accepted. Stores before it returns."""
 
 _HALF = 1 << 15
 _EARLY = 64
-"""Packets kept that cannot be opened yet, per robot."""
+"""Number of packets kept per robot that cannot be opened yet."""
 _START = 64
-"""A robot heard within so many packets of its start is heard from its start on."""
+"""If a robot is first heard within this number of packets of its start, its packets count from its start on."""
 _RETREAT_S = 1.0
-"""s of silence after which a robot that does not seal may go back to a smaller boot number."""
+"""s of silence after which a robot that does not seal may return with a smaller boot number."""
 _RESERVE = 16
 _MOST_RESERVED = 1 << 14
 _SAVING_S = 0.25
@@ -60,15 +63,15 @@ class Neighbour:
     hello: Hello
     heard: float
     floor: int = 0
-    """Stored packet number below which nothing is taken after a restart of ours."""
+    """Stored packet number below which nothing is accepted after a restart of this robot."""
     gone: bool = False
-    """It has been silent for long."""
+    """Whether it has been silent for long."""
     reserve: int = _RESERVE
     saved: float = 0.0
     rows: dict[int, int] = field(default_factory=dict)
-    """Bits of the rows of standing packets that carried entries, by number."""
+    """Rows of standing packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
-    """When which topic was asked for."""
+    """When each topic was requested."""
 
     @property
     def encrypts(self) -> bool:
@@ -76,7 +79,7 @@ class Neighbour:
         return self.trailer.size == TAG_LEN and self.hello.capabilities & ENCRYPTS != 0
 
     def number(self, low: int) -> int:
-        """The full packet number of 16 bits of it, nearest to the newest."""
+        """The full packet number for its low 16 bits: the one nearest to the newest."""
         newest = self.inbox.newest
         number = newest + ((low - newest + _HALF) & 0xFFFF) - _HALF
         if number < 0:
@@ -84,9 +87,9 @@ class Neighbour:
         return number
 
     def fresh(self, number: int, row: int) -> None:
-        """A standing packet with entries is used once.
+        """Check that a standing packet with entries is used only once.
 
-        :raises ReplayedError: it was here, or is too old to tell
+        :raises ReplayedError: it was used before, or is too old to decide
         """
         used = self.rows.get(number, 0)
         if used >> row & 1 or number <= self.inbox.newest - MAP:
@@ -98,10 +101,10 @@ class Neighbour:
 
 @dataclass(slots=True)
 class Opened:
-    """A packet that can be trusted as far as its trailer goes.
+    """A packet whose trailer was checked.
 
-    ``met``: of a start of a robot not known before, or of a robot that was taken for gone; ``replaced``: known no
-    longer.
+    ``met``: it is of a start that was not known before, or of a robot that was taken for gone; ``replaced``: the robot
+    start that is now forgotten, if any.
     """
 
     neighbour: Neighbour
@@ -115,11 +118,11 @@ class Opened:
 
 
 class Neighbours:
-    """All robots heard.
+    """All robots that are heard.
 
     :param own: id and boot number of this robot
     :param heard: what ``save`` has stored, by robot id: boot number and packet number
-    :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be wanted, bytes of its
+    :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be needed, bytes of its
         longest body)
     """
 
@@ -149,15 +152,15 @@ class Neighbours:
         return len(self._known)
 
     def get(self, src_id: int) -> Neighbour | None:
-        """A robot that is known."""
+        """A robot by its id; None if it is not known."""
         return self._known.get(src_id)
 
     def early(self, src_id: int) -> list[bytes]:
-        """Packets of a robot that could not be opened before; they are given out once."""
+        """Packets of a robot that could not be opened before; they are returned once."""
         return list(self._early.pop(src_id, ()))
 
     def silent(self, before: float) -> list[Neighbour]:
-        """Robots not heard since a time. What is known of them is kept until another robot needs the room."""
+        """Robots not heard since a time. Their state is kept until another robot needs the room."""
         silent = [neighbour for neighbour in self._known.values() if neighbour.heard < before and not neighbour.gone]
         for neighbour in silent:
             neighbour.gone = True
@@ -166,8 +169,8 @@ class Neighbours:
     def open(self, data: bytes, header: Header, now: float) -> Opened | None:
         """Open a packet.
 
-        :return: None for one that is kept until a hello tells how to open it
-        :raises WireError: it cannot be, or must not be, opened
+        :return: None if it is kept until a hello tells how to open it
+        :raises WireError: the packet cannot be opened, or must not be
         """
         start, end = header.size, len(data) - self._keys.trailer_len
         standing = None
@@ -193,7 +196,7 @@ class Neighbours:
         return Opened(neighbour, header, number, standing, body, met=met)
 
     def settle(self, now: float) -> None:
-        """Store how far robots that are quiet have been heard, exactly."""
+        """Store the exact packet number reached by robots that are quiet."""
         if self._save is None:
             return
         for neighbour in self._known.values():
@@ -203,7 +206,7 @@ class Neighbours:
                 self._store(neighbour, exact, now)
 
     def _hello(self, data: bytes, header: Header, standing: Standing, now: float) -> Opened:
-        """A packet that says itself how it is opened."""
+        """Open a packet with a hello, which itself says how the packet is opened."""
         src_id, start = header.src_id, header.size + standing.size
         room = body_room(self._settings.packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
         entries = read_body(data[start : len(data) - self._keys.trailer_len], room)
@@ -258,14 +261,14 @@ class Neighbours:
         raise failed
 
     def _heard(self, neighbour: Neighbour, number: int, now: float) -> bool:
-        """A packet of a robot that is known; whether it was taken for gone."""
+        """A packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
         self._guard(neighbour, number, now)
         return back
 
     def _room_for(self, src_id: int) -> Neighbour | None:
-        """The robot that gives its place to another one, where there is no more."""
+        """The robot whose state is dropped to make room for another one, if there is no more room."""
         if len(self._known) < self._settings.max_sources:
             return None
         quiet = min(self._known.values(), key=lambda neighbour: neighbour.heard)
@@ -279,7 +282,7 @@ class Neighbours:
         self._early.setdefault(src_id, deque(maxlen=_EARLY)).append(data)
 
     def _guard(self, neighbour: Neighbour, number: int, now: float) -> None:
-        """Store that a robot has come to this number, before the packet is used."""
+        """Store that a robot has reached this number, before the packet is used."""
         if number < neighbour.floor or self._save is None:
             return
         if now - neighbour.saved < _SAVING_S:

@@ -1,18 +1,19 @@
 """What waits to be sent, and what goes into the next packet.
 
-*Order.* Messages of class latency go first, then default, then bulk; within a class the most valuable per byte of air,
-``weight * g^2 / c`` (see ``link.freshness``). Every ``TURN``-th packet begins with the topic whose last turn is longest
-ago, so that nothing starves.
+*Order.* Messages of class latency go first, then default, then bulk. Within a class, the message with the largest value
+per byte sent goes first, ``weight * g^2 / c`` (see ``link.freshness``). Every ``TURN``-th packet begins with the topic
+whose last turn is longest ago, so that no topic starves.
 
-*Cuts.* A message that fits goes whole. A fragment that is not the last one fills its packet, so the cut follows from
-what is free, and nothing about it is fixed beforehand.
+*Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
+the free bytes of the packet; it is not fixed beforehand.
 
-*Life.* For how long a message is worth repairing follows from its topic: ``latest`` until a newer one has left whole;
-with a lifespan, until that is over; otherwise until ``depth`` newer ones have left, or newer ones that fill a repair.
-Where receivers report they say when they have it, and no more than the publishers' depth limits it.
+*Lifetime.* The topic decides how long a message is worth repairing. With ``latest``, it is until a newer message has
+left whole. With a lifespan, it is until that has passed. Otherwise it is until ``depth`` newer messages have left, or
+enough newer ones to fill a repair. Receivers that report say when they have a message; then only the publishers' depth
+limits the lifetime.
 
-Invariants: a topic's messages begin one after the other, each after the one before has left whole; every message ends
-in being sent or in a Refused with its row.
+Invariants: the messages of a topic begin one after the other, each after the one before has left whole; every message
+ends in being sent or in a Refused with its row.
 """
 
 from __future__ import annotations
@@ -44,14 +45,15 @@ from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
 
 SHARE = 3
-"""What others leave of a packet is used for a fragment from this part of a packet's room on: a message in more packets
-than it needs is lost with any of them. Of class latency, whatever fits goes."""
+"""A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
+lost with any of them. A message of class latency uses any space that is free."""
 TABLE_FIRST = 2
-"""Packets up to which the table of topics goes before messages."""
+"""Number of packets up to which the table of topics goes before messages."""
 SETTLING_S = 1.0
-"""s after which a latched message is named in hellos: who lacks it then has not merely not got it yet."""
+"""s after which a latched message is named in hellos: a receiver that lacks it then has lost it, not just not received
+it yet."""
 STARTING_S = 2.0
-"""s from the start for which the table is repaired though nobody reports."""
+"""s from the start during which the table is repaired even if no receiver reports."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -59,7 +61,7 @@ Observer = Callable[[Accepted | Refused | Missed], None]
 
 @dataclass(slots=True, eq=False)
 class Message(Outgoing):
-    """A message on its way out. ``begin``: packet in which it began; ``place``: among the entries there."""
+    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there."""
 
     life: Life = field(default_factory=Life)
     begin: int = 0
@@ -76,7 +78,7 @@ class _Kept:
     coded: bool
     mark: int
     named: float = inf
-    """s from when on hellos name it."""
+    """Time in s from which on hellos name it."""
 
 
 @dataclass(slots=True)
@@ -93,8 +95,8 @@ class Filling:
 class Outbox:
     """The queues of one sender.
 
-    :param topics: what it may send; the table that it announces is made of them
-    :param boot: of this start, for keys
+    :param topics: topics that it may send; the announced table is made from them
+    :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
     """
 
@@ -122,10 +124,10 @@ class Outbox:
             topic_id: deque() for topic_id in (*self._queues, TABLE_TOPIC)
         }
         self._packets_of: Counter[int] = Counter()
-        """Packets of these lives, by topic."""
+        """Lifetimes that packets refer to, by topic."""
         self._kept: dict[int, deque[_Kept]] = {}
         self._open: dict[int, Sequence[Outgoing]] = {}
-        """What may go on or start now, by topic."""
+        """Messages that may continue or start now, by topic."""
         self._newest: dict[int, float] = {}
         self._turns = Turns()
         self._holder = -1
@@ -133,17 +135,17 @@ class Outbox:
         self.stats = SenderStats()
         self._starting_until = inf
         self.reported = False
-        """Whether receivers report, so that they say when a message is over."""
+        """Whether receivers report, so that it is known when a message is over."""
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
         self._ordered: dict[int, bool] = {}
         self.digest = 0
-        """CRC-32 of the table, 0 where there is nothing to announce."""
+        """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
             self._queues[TABLE_TOPIC] = TopicQueue("latest")
             self._tabulate()
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a message; it may be refused, and may push out others of its topic."""
+        """Take a message. It may be refused, or cause other messages of its topic to be dropped."""
         assert self._topics is not None
         topic = self._topics[topic_id]
         serial = self._serial
@@ -165,14 +167,14 @@ class Outbox:
         self._admit(Message(serial, topic_id, payload, qos, now, topic.options.weight, coded=codec is not None))
 
     def ask(self, topic_id: int, now: float) -> None:
-        """Somebody lacks what is kept of a topic: send it again, unless it waits already."""
+        """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
         self._starting_until = min(self._starting_until, now + STARTING_S)
         queue = self._queues.get(topic_id)
         if queue is None or any(message.repeat for message in queue):
             return
         for kept in self._kept.get(topic_id, ()):
             if topic_id == TABLE_TOPIC:
-                # Nothing is delivered without it. A long one does not hold up what is urgent.
+                # Nothing is delivered without the table. A long table does not delay urgent messages.
                 qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
                 queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
             else:
@@ -185,13 +187,13 @@ class Outbox:
             self.stats.repeats += 1
 
     def announce(self, now: float) -> None:
-        """Send everything that is kept: to robots that cannot ask."""
+        """Send all kept messages, for robots that cannot ask."""
         for topic_id in self._kept:
             if not self._queues[topic_id]:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the messages kept."""
+        """What hellos name: (topic id, CRC-32) of the kept messages."""
         return [
             (topic_id, kept.mark)
             for topic_id, messages in self._kept.items()
@@ -201,9 +203,9 @@ class Outbox:
         ]
 
     def follow(self, topic_id: int, *, reliable: bool, depth: int, lifespan_s: float, period_s: float) -> bool:
-        """Let a topic follow the QoS of its publishers, as far as the configuration leaves it open.
+        """Take over the QoS of a topic's publishers, where the configuration leaves it open.
 
-        :return: whether the table of topics is another one now
+        :return: whether the table of topics has changed
         """
         assert self._topics is not None
         queue = self._queues[topic_id]
@@ -216,16 +218,16 @@ class Outbox:
         return self.digest != before
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """Policy and deadline (s, 0 none) of a topic's queue."""
+        """Policy and deadline (s, 0 for none) of a topic's queue."""
         queue = self._queues[topic_id]
         return queue.policy, queue.deadline_s
 
     def reconfigure(self, settings: Settings) -> None:
-        """Other settings from now on."""
+        """Use other settings from now on."""
         self._settings = settings
 
     def expire(self, now: float, interval: float) -> None:
-        """Drop what would be too late."""
+        """Drop messages that would arrive too late."""
         for queue in self._with_deadline:
             if queue:
                 self._drop(list(queue.expire(now, interval, LEAD_S, self._room - _ENTRY)))
@@ -233,9 +235,9 @@ class Outbox:
     def fill(self, number: int, room: int, now: float) -> Filling | None:
         """Take what goes into the next source packet.
 
-        :param number: of that packet
+        :param number: number of that packet
         :param room: bytes that its body may have
-        :return: None where nothing may go
+        :return: None if nothing may be sent
         """
         if self.idle:
             return None
@@ -266,7 +268,7 @@ class Outbox:
         return self._take(picks, number, used, now)
 
     def next_timeout(self, now: float) -> float | None:
-        """When ``fill`` may have something; None while nothing waits."""
+        """When ``fill`` may have something; None if nothing waits."""
         times = [
             max(queue.opens(now) if queue.opens(now) < inf else now, self._flush(queue, now))
             for queue in self._queues.values()
@@ -276,7 +278,7 @@ class Outbox:
 
     @property
     def urgent(self) -> bool:
-        """Whether a message of class latency waits, the table of topics apart: it follows a hello."""
+        """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
         return any(queue and queue[0].qos == 1 for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC)
 
     @property
@@ -285,11 +287,11 @@ class Outbox:
         return not any(self._queues.values())
 
     def queued(self) -> dict[int, int]:
-        """Messages waiting or under way, per topic id."""
+        """Messages that wait or are partly sent, per topic id."""
         return {topic_id: len(queue) for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC}
 
     def room(self, topic_id: int) -> bool:
-        """Whether a message of that topic could be submitted without pushing another out."""
+        """Whether a message of that topic could be submitted without dropping another one."""
         return self._queues[topic_id].room(self.depth(topic_id))
 
     def _tabulate(self) -> None:
@@ -313,7 +315,7 @@ class Outbox:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def depth(self, topic_id: int) -> int:
-        """Messages of a topic that may wait, 0 unbounded."""
+        """Number of messages of a topic that may wait, 0 for unbounded."""
         depth = AUTO if self._topics is None else self._topics[topic_id].options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
@@ -321,7 +323,7 @@ class Outbox:
         self._drop(self._queues[message.topic_id].admit(message, self.depth(message.topic_id)))
 
     def _heap(self, now: float) -> list[tuple[int, float, int, int]]:
-        """Topics that may go on, the most urgent and most valuable first."""
+        """Topics that may send, the most urgent and most valuable first."""
         self._open = {topic_id: queue.open(now) for topic_id, queue in self._queues.items() if queue}
         heap = []
         for topic_id, queue in self._open.items():
@@ -336,7 +338,7 @@ class Outbox:
         return heap
 
     def _may_cut(self, message: Message, taken: int, used: int, room: int) -> bool:
-        """Whether a fragment of so many bytes is worth its header."""
+        """Whether a fragment of this many bytes is worth its header."""
         if not used:
             return True
         if taken < max(self._settings.min_fragment, 0 if message.qos == 1 else room // SHARE):
@@ -374,7 +376,7 @@ class Outbox:
         return Filling(parts, sent, lives, qos, used)
 
     def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
-        """A message has left whole: what it overtakes is over."""
+        """A message has left whole: older messages that it replaces are over."""
         topic_id = message.topic_id
         self._newest[topic_id] = max(message.submitted, self._newest.get(topic_id, 0.0))
         self.stats.sent[topic_id] += not message.repeat
@@ -394,7 +396,7 @@ class Outbox:
             if kept.payload is message.payload and kept.named == inf:
                 kept.named = now + SETTLING_S
         if topic_id == TABLE_TOPIC and not self.reported:
-            # Later it comes again, and is small; at the start nothing can be delivered without it.
+            # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
             message.life.expires = self._starting_until
         elif topic_id in self._kept and not self.reported:
             message.life.expires = min(message.life.expires, now + 2 * (now - message.submitted) + 2.0)

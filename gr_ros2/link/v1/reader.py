@@ -1,10 +1,11 @@
-"""Packets of version 1 as somebody reads them who only looks on: a capture, a log, a line of hex.
+"""Decodes packets of version 1 for an observer: a capture, a log, a line of hex.
 
-What a receiver learns in time, a reader is told beforehand: the hellos, without which no trailer can be checked, and
-the keys of the fleet. What it cannot check or open it says, and shows what stands in the clear.
+A receiver learns some facts from the packets it receives over time. A reader is given them beforehand: the hellos,
+without which no trailer can be checked, and the keys of the fleet. Where it cannot check or open a packet, it says so
+and shows the part that is not encrypted.
 
-Invariants: ``read`` raises nothing but a named WireError; what it gives out as checked belongs to a hello that was
-learned.
+Invariants: ``read`` raises nothing but a named WireError; a packet that it reports as checked belongs to a hello that
+was learned.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ _NO_KEY = "tag not checked: no key"
 class Look:
     """What is known of a packet.
 
-    :param number: the packet number in full where it is known, otherwise its low 16 bits
-    :param check: of the trailer, in words
-    :param entries: of a source or control packet, as far as they can be read
-    :param combined: of a repair
-    :param hidden: bytes of a body that is encrypted, and not opened
+    :param number: the full packet number if it is known, otherwise its low 16 bits
+    :param check: result of the trailer check, in words
+    :param entries: entries of a source or control packet, as far as they can be read
+    :param combined: linear combination of a repair
+    :param hidden: bytes of a body that is encrypted and was not opened
     :param announced: the table of topics that is complete with this packet
     """
 
@@ -61,30 +62,30 @@ class Look:
     announced: tuple[Row, ...] = ()
 
     def message(self, index: int) -> Part | None:
-        """An entry, where it is a message or a fragment of one."""
+        """An entry, if it is a message or a fragment of one."""
         entry = self.entries[index]
         return entry if isinstance(entry, Part) else None
 
 
 @dataclass(slots=True)
 class _Start:
-    """A start of a robot that a hello told of."""
+    """A start of a robot that a hello announced."""
 
     hello: Hello
     trailers: Sequence[Trailer]
     newest: int
 
     def number(self, low: int) -> int:
-        """The full packet number of 16 bits of it, nearest to the newest; none is negative."""
+        """The full packet number for its low 16 bits: the one nearest to the newest; never negative."""
         number = self.newest + ((low - self.newest + _HALF) & 0xFFFF) - _HALF
         return number if number >= 0 else low
 
 
 class Reader:
-    """Reads packets in the order in which they came.
+    """Reads packets in the order in which they arrived.
 
     :param packet_len: bytes of the longest packet on the link
-    :param keys: 32 bytes each; none where nothing sealed is to be opened
+    :param keys: 32 bytes each; empty if no sealed packet is to be opened
     :raises ConfigError: a key of another length
     """
 
@@ -93,13 +94,13 @@ class Reader:
         self._keys = Keys(keys, "encrypt") if keys else None
         self._starts: dict[int, list[_Start]] = {}
         self._current: dict[int, int] = {}
-        """Which start of a robot is heard now, by its id."""
+        """The boot number of each robot that is heard now, by its id."""
         self._tables: dict[int, Reassembly] = {}
         self.topics: dict[int, dict[int, Row]] = {}
-        """What robots announced, by robot and topic id."""
+        """The topics that robots announced, by robot and topic id."""
 
     def learn(self, data: bytes) -> None:
-        """Take from a packet, wherever it stands among the others, how its sender's packets are read."""
+        """Learn from a packet, whatever its position among the others, how its sender's packets are read."""
         try:
             header, standing, start, end = self._clear(data)
             if standing is None or not standing.clear:
@@ -113,9 +114,9 @@ class Reader:
             starts.append(_Start(hello, trailers, _number(header, hello)))
 
     def read(self, data: bytes) -> Look:
-        """One packet.
+        """Read one packet.
 
-        :raises WireError: it is none, or its trailer does not belong to it
+        :raises WireError: the bytes are not a packet, or its trailer does not belong to it
         """
         header, standing, start, end = self._clear(data)
         if standing is not None and standing.clear:
@@ -134,7 +135,7 @@ class Reader:
         return Look(header, number, standing, check, entries, announced=self._announced(header.src_id, number, entries))
 
     def _clear(self, data: bytes) -> tuple[Header, Standing | None, int, int]:
-        """What stands before the body, and where that begins and ends."""
+        """Header and other fields before the body, and where the body begins and ends."""
         header = read_header(data, self._packet_len)
         start, end = header.size, len(data) - (TAG_LEN if header.sealed else CRC_LEN)
         if header.qos != QOS_STANDING:
@@ -154,7 +155,7 @@ class Reader:
     def _check_hello(
         self, header: Header, hello: Hello, data: bytes, start: int, row: int
     ) -> tuple[list[Trailer], str]:
-        """What opens the packets of a start, and what is to be said of its hello's own trailer."""
+        """The trailer that opens the packets of a start, and the result of checking the hello's trailer, in words."""
         if header.sealed and self._keys is None:
             return [], _NO_KEY
         number = _number(header, hello)
@@ -176,7 +177,7 @@ class Reader:
     def _open(
         self, data: bytes, header: Header, standing: Standing | None, start: int, end: int
     ) -> tuple[int, bytes | None, str]:
-        """Full packet number, body (None where it stays hidden) and what is to be said of the trailer."""
+        """Full packet number, body (None if it stays encrypted) and the result of the trailer check, in words."""
         src_id, row = header.src_id, SOURCE_ROW if standing is None else standing.row
         starts = self._starts.get(src_id, [])
         if not starts:
@@ -209,7 +210,7 @@ class Reader:
                 known.newest = max(known.newest, number)
 
     def _announced(self, src_id: int, number: int, entries: Sequence[Entry]) -> tuple[Row, ...]:
-        """The table of topics, if it is complete now and not known yet."""
+        """The table of topics, if it has become complete and was not known yet."""
         found: tuple[Row, ...] = ()
         for place, part in enumerate(entries):
             if not isinstance(part, Part) or part.topic_id != TABLE_TOPIC:

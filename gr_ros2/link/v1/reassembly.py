@@ -1,10 +1,10 @@
-"""Fragments of one sender back to messages.
+"""Joins the fragments of one sender to messages.
 
-A fragment names its message by the packet in which that began, and says where in it it belongs. Packet numbers are full
-ones here, of one start of the sender, so two messages cannot be taken for one.
+A fragment names its message by the packet in which the message began, and gives its offset in the message. Packet
+numbers are full numbers here, of one start of the sender, so two messages cannot be confused.
 
-Invariants: memory grows with what has arrived, never with what was announced; what it holds is bounded, the message
-longest without a fragment goes first.
+Invariants: memory grows with what has arrived, never with what was announced; the memory held is bounded, and the
+message longest without a new fragment is given up first.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from dataclasses import dataclass, field
 from gr_ros2.wire.v1 import Part
 
 _FRAGMENT_COST = 100
-"""Bytes of bookkeeping counted per fragment held."""
+"""Bytes of bookkeeping that are counted per fragment held."""
 
 
 @dataclass(slots=True, eq=False)
 class Partial:
-    """A message of which not all is here.
+    """A message of which a part is missing.
 
-    :param place: among the entries of the packet in which it began; -1 until that one is here
+    :param place: its place among the entries of the packet in which it began; -1 until that packet is here
     """
 
     topic_id: int
@@ -36,7 +36,7 @@ class Partial:
     repaired: bool = False
 
     def payload(self) -> bytes | None:
-        """The message; None where its fragments do not join."""
+        """The message; None if its fragments do not join."""
         parts = []
         offset = 0
         for start in sorted(self.pieces):
@@ -50,13 +50,13 @@ class Partial:
 class Reassembly:
     """The incomplete messages of one sender.
 
-    :param most: bytes held at most
+    :param most: most bytes held
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._partials: OrderedDict[tuple[int, int], Partial] = OrderedDict()
-        """By topic id and packet in which they began, longest without a fragment first."""
+        """By topic id and packet in which they began; the message longest without a new fragment first."""
         self._held = 0
 
     @property
@@ -67,10 +67,10 @@ class Reassembly:
     def add(self, part: Part, number: int, place: int, *, repaired: bool, now: float) -> Partial | None:
         """Take a fragment.
 
-        :param number: of its packet
-        :param place: among the entries there
-        :param repaired: it did not come the first time
-        :return: its message, if it is complete now; it is held no longer then
+        :param number: number of its packet
+        :param place: its place among the entries there
+        :param repaired: the packet did not arrive when it was first sent
+        :return: its message, if that is complete now; it is then no longer held here
         """
         begin = number - part.back
         name = (part.topic_id, begin)
@@ -96,14 +96,14 @@ class Reassembly:
         return partial
 
     def overflowing(self) -> list[Partial]:
-        """Give up the oldest where memory is over its bound."""
+        """Give up the oldest messages while memory is above its bound."""
         ended = []
         while self._held > self._most:
             ended.append(self._release(next(iter(self._partials.values()))))
         return ended
 
     def expired(self, before: float) -> list[Partial]:
-        """Give up what has had no fragment since a time."""
+        """Give up messages without a new fragment since a time."""
         ended = []
         for partial in list(self._partials.values()):
             if partial.last > before:
@@ -112,7 +112,7 @@ class Reassembly:
         return ended
 
     def overtaken(self, topic_id: int, begin: int) -> list[Partial]:
-        """Give up what began before another message of its topic that has been delivered."""
+        """Give up messages that began before a later message of the same topic that has been delivered."""
         names = [name for name in self._partials if name[0] == topic_id and name[1] < begin]
         return [self._release(self._partials[name]) for name in names]
 
@@ -128,7 +128,7 @@ class Reassembly:
         return any(name[0] == topic_id and partial.last > since for name, partial in self._partials.items())
 
     def next_timeout(self) -> float | None:
-        """Since when the one longest without a fragment has waited."""
+        """The time of the last fragment of the message that is longest without a new one."""
         for partial in self._partials.values():
             return partial.last
         return None

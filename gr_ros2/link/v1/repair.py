@@ -1,22 +1,22 @@
 """What an idle slot carries: the sender's side of repair.
 
-*The rule.* New packets always go first. In a slot that no new packet wants:
+*The rule.* New packets always go first. In a slot without a new packet:
 
-1. if there is one receiver and its reports name a lost packet that is still alive: that packet again as it was, the
-   newest first;
-2. otherwise a linear combination over GF(256) of the newest live packets, up to ``GROUP``; where more are alive, of
-   those in windows of 127 numbers, which move over all of them and overlap.
+1. if there is one receiver and its reports name a lost packet that is still alive, that packet is sent again unchanged;
+   the newest such packet goes first;
+2. otherwise the slot carries a linear combination over GF(256) of the newest live packets, up to ``GROUP``. If more
+   packets are alive, the combination is taken from windows of 127 numbers, which move over all of them and overlap.
 
-A packet is *alive* until every receiver that reports has confirmed it, or all messages in it are over: late, or
-overtaken. With one live packet the rule is repetition, which is age-optimal. Windows that overlap even out the losses
-of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, after 1.36 times in
-separate groups of 64.
+A packet is *alive* until every receiver that reports has confirmed it, or until all messages in it are over: late, or
+replaced by newer ones. With one live packet the rule is repetition, which is age-optimal. Windows that overlap even out
+the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, and after 1.36
+times as many in separate groups of 64.
 
-*Overload.* Where the idle slots cannot make up for the losses, a long window decodes nothing at all. It shrinks then:
-to ``FEW`` packets, and to those of the newest message.
+*Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
+reduced to ``FEW`` packets, and to those of the newest message.
 
-Invariants: a standing packet's row is used once per number; coefficients of a window are never those of another repair
-of the same packets; nothing alive is older than ``span`` numbers.
+Invariants: a standing packet's row is used once per number; no two repairs of the same packets have the same
+coefficients; no live packet is more than ``span`` numbers old.
 """
 
 from __future__ import annotations
@@ -34,32 +34,32 @@ from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
 RepairMode = Literal["idle", "thrifty", "off"]
 
 GROUP = 64
-"""Packets that a repair combines, as long as no more are alive."""
+"""Number of packets that a repair combines, as long as no more are alive."""
 FEW = 8
-"""The same where repair cannot keep up."""
+"""The same when repair cannot keep up with the losses."""
 SPAN = 30_000
-"""Numbers that a sender repairs and a receiver remembers, if its memory allows; of a circle of 65,536."""
+"""Numbers that a sender repairs and a receiver remembers, if its memory allows; numbers are mod 65,536."""
 MAP = 64
-"""Packets that a report tells of."""
+"""Number of packets that a report covers."""
 
 TURN = 3
-"""One repair in this many is for short messages, while a long one is alive."""
+"""While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
 _DECAY = 0.98
 _DELAYS = 16
 _ENOUGH = 0.05
-"""Packets' worth of doubt that is not worth a repair (thrifty)."""
+"""Expected number of lost packets that is too small for a repair (thrifty)."""
 _TIMES = 512
 _PATIENCE_S = 0.2
-"""s beyond which a packet of which no report tells is taken for lost as likely as not."""
+"""s after which a packet that no report covers counts as lost with probability 1/2."""
 
 
 @dataclass(slots=True, eq=False)
 class Life:
     """How long a message is worth repairing.
 
-    :param expires: s, when it is of no more use
-    :param over: it was overtaken, or needs no repair
+    :param expires: time in s at which it is of no more use
+    :param over: it was replaced by a newer message, or needs no repair
     """
 
     expires: float = inf
@@ -68,7 +68,7 @@ class Life:
 
 @dataclass(slots=True, eq=False)
 class Sent:
-    """A source packet that left. ``confirmed`` has a bit per receiver; ``at``: when it left last, s."""
+    """A source packet that left. ``confirmed`` has one bit per receiver; ``at``: when it was last sent, s."""
 
     number: int
     body: bytes
@@ -88,9 +88,9 @@ class Repair(NamedTuple):
     """A combination to be sent.
 
     :param number: the newest number of its window
-    :param mask: bit i says that ``number - i`` is part of it
-    :param row: of its coefficients
-    :param oldest: nothing older than the window is alive
+    :param mask: bit i says that packet ``number - i`` is part of it
+    :param row: row of its coefficients
+    :param oldest: no packet older than the window is alive
     """
 
     number: int
@@ -102,7 +102,7 @@ class Repair(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Receiver:
-    """What reports of one receiver have told."""
+    """What the reports of one receiver have told."""
 
     bit: int
     heard: float
@@ -114,17 +114,17 @@ class Receiver:
 
     @property
     def delay(self) -> float:
-        """s from a packet's departure to the report that tells of it, at best."""
+        """Shortest time in s from a packet's departure to the report that covers it."""
         return min(self.delays) if self.delays else 0.0
 
 
 class RepairWindow:
-    """The source packets of one sender that are still worth something.
+    """The source packets of one sender that are still worth repairing.
 
-    :param mode: ``idle`` uses every slot it is offered; ``thrifty`` only as many as losses are known or expected;
-        ``off`` none
+    :param mode: ``idle`` uses every slot it is offered; ``thrifty`` uses only as many as losses are known or expected;
+        ``off`` uses none
     :param room: bytes of the longest body
-    :param expected_loss: share of packets lost, as long as no report tells
+    :param expected_loss: share of packets lost, used until a report arrives
     """
 
     def __init__(self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN) -> None:
@@ -135,32 +135,32 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """Everything from the oldest live packet on, by number."""
+        """All packets from the oldest live one on, by number."""
         self._oldest = 0
-        """No record is older."""
+        """No older packet is recorded."""
         self.newest = 0
         """Number of the last source packet; 0 before the first."""
         self._receivers: dict[int, Receiver] = {}
         self._everybody = 0
         self._resend: list[int] = []
-        """Negated numbers that the only receiver lacks."""
+        """Negated numbers of the packets that the only receiver lacks."""
         self._rows: dict[int, int] = {}
-        """Bits of the rows used up, by number."""
+        """Rows already used, as bits, by number."""
         self._row = 0
         self._turn = 0
         self._place = 0.0
         self._flight: deque[tuple[float, int, int]] = deque()
-        """Until when a repair may be under way unheard of, and its window."""
+        """The time until which a repair may be on its way without a report about it, and its window."""
         self._times: dict[int, float] = {}
         self._slots = [0.0, 0.0]
-        """New packets and idle slots, lately."""
+        """Recent numbers of new packets and of idle slots."""
 
     def sent(self, number: int, body: bytes, data: bytes, lives: tuple[Life, ...], now: float) -> None:
         """A source packet left.
 
         :param body: its entries, without padding
         :param data: the packet as it was sent
-        :param lives: of the messages in it; () for one that is not worth repairing
+        :param lives: lifetimes of the messages in it; () for a packet that is not worth repairing
         """
         self.newest = number
         self._times[number] = now
@@ -176,7 +176,7 @@ class RepairWindow:
                 self._trim(number - self._span + 1)
 
     def meet(self, receiver: int, now: float) -> Receiver:
-        """A receiver that reports is there; nothing is over before it has confirmed it."""
+        """A receiver that reports is known; from now on, a packet is confirmed only after this one confirmed it too."""
         peer = self._receivers.get(receiver)
         if peer is None:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
@@ -187,10 +187,10 @@ class RepairWindow:
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
         """A receiver says what it has.
 
-        :param number: newest number that it tells of
-        :param arrived: bit i says that it has ``number - i``
-        :param settled: it wants nothing older than those 64
-        :param loss: share of packets that it lost lately
+        :param number: newest number that the report covers
+        :param arrived: bit i says that the receiver has ``number - i``
+        :param settled: the receiver needs no packet older than those 64
+        :param loss: recent share of packets that it lost
         """
         if number > self.newest:
             return
@@ -230,11 +230,11 @@ class RepairWindow:
                 record.confirmed &= ~peer.bit
 
     def receivers(self) -> dict[int, tuple[float, float]]:
-        """Who reports: when they were heard last, and the share of packets that they lost."""
+        """The receivers that report: when each was last heard, and the share of packets that it lost."""
         return {name: (peer.heard, peer.loss) for name, peer in self._receivers.items()}
 
     def take_row(self, number: int) -> int | None:
-        """A row that no standing packet at this number has had; None where all are used up."""
+        """A row that no standing packet at this number has used; None if all are used."""
         used = self._rows.get(number, 0)
         if used == (1 << ROWS) - 1:
             return None
@@ -254,7 +254,7 @@ class RepairWindow:
         return bool(self._records)
 
     def next(self, now: float) -> Sent | Repair | None:
-        """What an idle slot carries: a packet again as it was, a combination, or nothing."""
+        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing."""
         slots = self._slots
         slots[0] *= _DECAY
         slots[1] = slots[1] * _DECAY + 1
@@ -272,8 +272,8 @@ class RepairWindow:
         return self._combination(window, now)
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
-        """What the newest live packet carries, if no standing packet can stand at the newest number any more and
-        something is alive; a packet with these lives and no content makes room. Otherwise ()."""
+        """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and
+        something is alive; otherwise (). A packet with these lifetimes and no content makes room for repairs."""
         if self._rows.get(self.newest, 0) == (1 << ROWS) - 1:
             for number in range(self.newest, self._oldest - 1, -1):
                 record = self._records.get(number)
@@ -282,7 +282,7 @@ class RepairWindow:
         return ()
 
     def _lost(self, now: float) -> Sent | None:
-        """The newest live packet that the only receiver lacks and has not been sent again since."""
+        """The newest live packet that the only receiver lacks and that has not been sent again since."""
         (peer,) = self._receivers.values()
         while self._resend:
             number = -heappop(self._resend)
@@ -311,7 +311,7 @@ class RepairWindow:
             return found
         if not self._long(now):
             return self._shrunk(found)
-        # A long message must not keep short ones from being repaired soon, nor these it from being repaired at all.
+        # A long message must not delay the repair of short ones, and short ones must not prevent that of a long one.
         self._turn += 1
         counts = Counter(life for record in found for life in record.lives)
         longest = max(counts, key=lambda life: counts[life])
@@ -321,7 +321,7 @@ class RepairWindow:
         return self._in_turn(now)
 
     def _shrunk(self, window: list[Sent]) -> list[Sent]:
-        """The window, or less of it where idle slots cannot make up for the losses."""
+        """The window, or a part of it if idle slots cannot make up for the losses."""
         loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
         new, idle = self._slots
         need = loss / (1 - loss) * new if loss < 1 else inf
@@ -333,7 +333,7 @@ class RepairWindow:
         return [record for record in window[:FEW] if last & set(record.lives)]
 
     def _long(self, now: float) -> bool:
-        """Whether more is alive than one repair can name."""
+        """Whether more packets are alive than one repair can name."""
         if self.newest - self._oldest < GROUP:
             return False
         for count, record in enumerate(self._live(self._oldest, self.newest, now)):
@@ -351,23 +351,23 @@ class RepairWindow:
                 yield record
 
     def _in_turn(self, now: float) -> list[Sent]:
-        """The next of the windows over all that is alive, newest first.
+        """The next of the windows over all live packets, newest first.
 
-        Their places follow the golden section, which spreads any number of them evenly; those that would reach beyond
-        the ends are moved to the ends, so that the packets there are in as many windows as the others.
+        The positions of the windows follow the golden section, which spreads any number of them evenly. Windows that
+        would reach beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
         """
         self._place = (self._place + _GOLDEN) % 1
         span = self.newest - self._oldest + 1
         first = self._oldest + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
         found = list(self._live(first, min(first + MAX_WINDOW - 1, self.newest), now))
-        if not found:  # all over there: go on from there to what is not
+        if not found:  # no live packet there: continue at the next live one
             for record in self._live(first, self.newest, now):
                 found = list(self._live(record.number, min(record.number + MAX_WINDOW - 1, self.newest), now))
                 break
         return found[::-1]
 
     def _worth(self, window: list[Sent], now: float) -> bool:
-        """Whether more is missing, or expected to be, than repairs are under way (thrifty)."""
+        """Whether more packets are missing, or expected to be missing, than repairs are on their way (thrifty)."""
         flight = self._flight
         while flight and flight[0][0] <= now:
             flight.popleft()
@@ -390,7 +390,7 @@ class RepairWindow:
         return False
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
-        """The combination of a window, its mask left out where it does not fit beside the bodies."""
+        """The combination of a window; of all packets in its span if a mask does not fit beside the bodies."""
         window = self._anchored(window)
         if not window:
             return None
@@ -411,7 +411,10 @@ class RepairWindow:
         return Repair(newest, mask, row, oldest, combined)
 
     def _anchored(self, window: list[Sent]) -> list[Sent]:
-        """The window, its newest packet one at which a repair can stand yet: a later one is added, or some left out."""
+        """The window, changed so that a repair can stand at its newest packet.
+
+        A later packet is added, or the newest ones are left out.
+        """
         full = (1 << ROWS) - 1
         newest = window[0].number
         if self._rows.get(newest, 0) != full:
@@ -430,7 +433,7 @@ class RepairWindow:
             self._flight.append((now + wait, first, last))
 
     def _retire(self, now: float) -> None:
-        """Let go of the oldest packets that are not alive."""
+        """Forget the oldest packets that are not alive."""
         records, everybody = self._records, self._everybody
         oldest = self._oldest
         while oldest <= self.newest:
@@ -444,7 +447,7 @@ class RepairWindow:
         self._oldest = oldest
 
     def _trim(self, first: int) -> None:
-        """Give up what is older than ``first``."""
+        """Forget all packets older than ``first``."""
         for number in range(self._oldest, first):
             self._records.pop(number, None)
         self._oldest = first

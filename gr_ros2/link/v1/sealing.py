@@ -1,14 +1,15 @@
-"""The trailers of version 1: a CRC-32, or the 8-byte tag of AES-CCM (RFC 3610, RFC 6655) that nobody without the key
-can make.
+"""The trailers of version 1: a CRC-32, or the 8-byte tag of AES-CCM (RFC 3610, RFC 6655), which cannot be made without
+the key.
 
-A fleet shares keys. Each start of each robot seals with a key of its own, derived from the fleet's by HKDF (RFC 5869)
-with the robot's id and the number of the start, its *boot number*. The nonce is the packet's number, not cut to 16
-bits, and its row. So no pair of key and nonce comes twice as long as boot numbers grow, a number is sent once, and a
-row is used once per number; a packet that is sent again is the same packet, byte for byte.
+A fleet shares keys. Each start of each robot seals with its own key. That key is derived from the fleet's key by HKDF
+(RFC 5869), with the robot's id and the number of the start, its *boot number*. The nonce consists of the full packet
+number (not only 16 bits of it) and the packet's row. No pair of key and nonce is used twice as long as boot numbers
+grow, a number is sent once, and a row is used once per number. A packet that is sent again is the same packet, byte for
+byte.
 
-Invariants: ``open`` gives out a body only if the trailer belongs to the packet's bytes (but for the hop count of a
-sealed packet, which relays change), its sender's boot number and its full packet number; otherwise it raises a named
-WireError.
+Invariants: ``open`` returns a body only if the trailer belongs to the packet's bytes, its sender's boot number and its
+full packet number; otherwise it raises a named WireError. The hop count of a sealed packet is not covered, because
+relays change it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
 SealMode = Literal["none", "authenticate", "encrypt"]
 
 SOURCE_ROW = 255
-"""Stands in the nonce of a source packet, where others have their row."""
+"""Takes the place of the row in the nonce of a source packet."""
 
 _SUBKEY_LEN = 16
 _SALT = b"gr-ros2 version 1"
@@ -41,9 +42,9 @@ _info = Struct(">BI")
 class Trailer(Protocol):
     """Closes and opens the packets of one start of one robot.
 
-    ``clear`` is what stands before the body: header, and in a standing packet window, row and mask. ``number`` is the
-    packet number in full; ``row`` is the row of a standing packet, ``SOURCE_ROW`` of another. ``plain``: the body is
-    not encrypted whatever the mode (a hello's).
+    ``clear`` is what stands before the body: the header, and in a standing packet also window, row and mask.
+    ``number`` is the full packet number. ``row`` is the row of a standing packet; for other packets it is
+    ``SOURCE_ROW``. ``plain``: the body is not encrypted, whatever the mode (as in a hello).
     """
 
     size: int
@@ -60,7 +61,7 @@ class Trailer(Protocol):
 
 
 class Checksum:
-    """CRC-32 over boot number, turns and packet: finds damage, and packets of another start; forged by anybody.
+    """CRC-32 over boot number, turns and packet. It detects damage and packets of another start. Anybody can forge it.
 
     :param boot: boot number of the sender
     """
@@ -91,10 +92,10 @@ class Checksum:
 class Seal:
     """AES-128-CCM with a tag of 8 bytes.
 
-    :param key: 32 bytes, the fleet's
-    :param src_id: of the sender
+    :param key: 32 bytes, the fleet's key
+    :param src_id: id of the sender
     :param boot: boot number of the sender
-    :param encrypt: whether bodies are encrypted; otherwise everybody can read them, and nobody change them
+    :param encrypt: whether bodies are encrypted; otherwise everybody can read them, but nobody can change them
     """
 
     size = TAG_LEN
@@ -124,7 +125,7 @@ class Seal:
 
 
 def without_hop(clear: bytes) -> bytes:
-    """Header and what else stands before the body, without the hop count of an addressed packet."""
+    """Header and other bytes before the body, without the hop count of an addressed packet."""
     return clear[:_HOP] + clear[_HOP + 1 :] if clear[0] & 4 else clear
 
 
@@ -134,11 +135,11 @@ def subkey(key: bytes, src_id: int, boot: int) -> bytes:
 
 
 class Keys:
-    """What a fleet seals with.
+    """The keys of a fleet, and how its packets are sealed.
 
-    :param keys: 32 bytes each; the first is used, all are accepted; none where nothing is sealed
-    :param mode: ``none`` sends and takes packets with a CRC; otherwise sealed ones only, whether encrypted or not
-    :raises ConfigError: a key of another length, or a mode that does not go with them
+    :param keys: 32 bytes each; the first is used, all are accepted; empty if nothing is sealed
+    :param mode: ``none`` sends and accepts packets with a CRC; other modes accept only sealed packets, encrypted or not
+    :raises ConfigError: a key of another length, or a mode that does not fit the keys
     """
 
     def __init__(self, keys: Sequence[bytes] = (), mode: SealMode = "none") -> None:
@@ -166,13 +167,13 @@ class Keys:
         return self.mode == "encrypt"
 
     def own(self, src_id: int, boot: int) -> Trailer:
-        """What one's own packets end with."""
+        """The trailer of this robot's packets."""
         if not self._keys:
             return Checksum(boot)
         return Seal(self._keys[0], src_id, boot, encrypt=self.encrypts)
 
     def candidates(self, src_id: int, boot: int, *, encrypt: bool) -> list[Trailer]:
-        """What another robot's packets may end with."""
+        """The trailers that another robot's packets may have."""
         if not self._keys:
             return [Checksum(boot)]
         return [Seal(key, src_id, boot, encrypt=encrypt) for key in self._keys]

@@ -1,6 +1,6 @@
-"""What an endpoint of version 1 is told about itself and its radio.
+"""The settings of an endpoint of version 1, about itself and its radio.
 
-Invariant: values only; everything has the default that suits a radio of some kB/s between two robots.
+Invariant: this module holds values only; every default suits a radio of some kB/s between two robots.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Settings:
 def settings_of(
     source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False, fixed: bool = True
 ) -> Settings:
-    """The settings of an end from those of its blocks.
+    """The settings of an end, made from those of its blocks.
 
-    :param hears: whether it receives and can say what
-    :param fixed: whether every packet has to be as long as the longest
-    :raises ConfigError: neither names the robot, and it would have something to say
+    :param hears: whether it receives and can report
+    :param fixed: whether every packet must be as long as the longest
+    :raises ConfigError: neither block names the robot, although it would send something
     """
     send = SourceConfig() if source is None else source
     take = SinkConfig() if sink is None else sink

@@ -1,10 +1,10 @@
-"""When a robot says who it is, what it says, and what it asks others for.
+"""When a robot sends hellos, what they contain, and what it requests from others.
 
-Hellos leave at the start, a few in the first second since any may be lost; whenever the table of topics changes; at
-once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about 50 bytes/s. Where
-messages wait they are late: by half a second, or by two where receivers report.
+Hellos are sent at the start, several in the first second because any of them may be lost; whenever the table of topics
+changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
+50 bytes/s. While messages wait, hellos are delayed: by half a second, or by two seconds if receivers report.
 
-Invariant: a hello never says of a message that it is kept before whoever listens had time to get it the first time.
+Invariant: a hello names a kept message only after the receivers had time to get it when it was first sent.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, HEARD_LEN, HELLO_LEN, MARK_
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
-"""When hellos leave after the start, s."""
+"""Times in s after the start at which hellos are sent."""
 HELLO_BYTES_S = 50.0
-"""Bytes/s that hellos take, as far as that means one every ``OFTEN_S`` to ``SELDOM_S``."""
+"""Bytes/s that hellos take, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
 OFTEN_S, SELDOM_S = 1.0, 2.0
 LATENCY_S = 0.15
-"""s that a hello lets messages of class latency go first."""
+"""s for which a hello lets messages of class latency go first."""
 ASK_S = 0.5
-"""s after which a request is made again."""
+"""s after which a request is repeated."""
 LOOK_S = 0.02
-"""s from one look at what is lacking to the next."""
+"""s between two checks of what is missing."""
 
 
 class Talk:
@@ -47,10 +47,10 @@ class Talk:
         self._mark = 0
         self._look_at = -inf
         self.due = -inf
-        """When the next hello is to leave, s."""
+        """When the next hello is due, s."""
 
     def start(self, now: float) -> None:
-        """The first packet may go now."""
+        """The first packet may be sent now."""
         self._starting = deque(now + after for after in STARTING_S)
         self.due = self._starting.popleft()
 
@@ -60,21 +60,21 @@ class Talk:
         return bool(self._starting)
 
     def met(self, src_id: int, boot: int, now: float) -> None:
-        """A start of a robot is heard for the first time: let it know, and again, since any hello may be lost."""
+        """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
         self._answers[src_id] = boot
         self._starting = deque(now + after for after in STARTING_S[1:])
         self.hurry(now)
 
     def hurry(self, now: float) -> None:
-        """The next hello leaves at once."""
+        """Send the next hello at once."""
         self.due = min(self.due, now)
 
     def urgent(self, now: float, *, idle: bool, latency: bool, heard: bool) -> bool:
         """Whether a hello goes before messages.
 
         :param idle: no message waits
-        :param latency: one of class latency waits
-        :param heard: somebody reports, so who is new here says so, and is answered at once
+        :param latency: a message of class latency waits
+        :param heard: some robot reports, so a new robot announces itself and is answered at once
         """
         late = now - self.due
         if late < 0 or idle:
@@ -84,12 +84,12 @@ class Talk:
         return late > (SELDOM_S if heard else OFTEN_S / 2) + latency * LATENCY_S
 
     def hello(self, room: int, turns: int, digest: int, marks: Sequence[tuple[int, int]], now: float) -> list[Control]:
-        """The entries of a hello; the next one is due later.
+        """The entries of a hello; also sets the time of the next one.
 
         :param room: bytes free for it
-        :param turns: how often the packet number has come round
-        :param digest: of the table of topics
-        :param marks: of the messages kept
+        :param turns: how often the packet number has wrapped around
+        :param digest: CRC-32 of the table of topics
+        :param marks: marks of the kept messages
         """
         free = room - HELLO_LEN
         answers = [Heard(*answer) for answer in list(self._answers.items())[: free // HEARD_LEN]]
@@ -104,7 +104,7 @@ class Talk:
         return [Hello(self._boot, turns, self._capabilities, digest, named), *answers]
 
     def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
-        """What other robots keep and this one lacks."""
+        """Requests for messages that other robots keep and this one lacks."""
         found: list[Ask] = []
         if now < self._look_at or not self._settings.hears:
             return found

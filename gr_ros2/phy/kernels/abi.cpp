@@ -1,6 +1,6 @@
 // The C interface of the kernels, for ctypes.
 //
-// Invariants: no exception leaves; arrays are the caller's; a call takes no lock and keeps nothing of what it was given.
+// Invariants: no exception leaves a function; arrays belong to the caller; a call takes no lock and keeps no argument.
 
 #include <cstddef>
 #include <exception>
@@ -28,7 +28,8 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 }  // namespace
 
-// Of this interface and of the parameters in `modem.h`: one more with each change. `kernels/library.py` has the same.
+// Version of this interface and of the parameters in `modem.h`. Increase it with each change, here and in
+// `kernels/library.py`.
 GR_ROS2_API int kernels_version() { return 2; }
 
 // What it was compiled for.

@@ -17,7 +17,7 @@ _FOLDER = Path(__file__).parent
 _EVERYWHERE, _AVX2 = "_baseline", "_avx2"
 """Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
 VERSION = 2
-"""That of ``abi.cpp``: a library left from before a change is not used."""
+"""Version of ``abi.cpp``. A library that was built before a change of it is not used."""
 _POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "kernels_version": (_INT, []),
@@ -37,7 +37,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 class Loaded:
     """Result of loading the library.
 
-    :param functions: the functions of ``abi.cpp``, None where there is no library
+    :param functions: the functions of ``abi.cpp``, None if there is no library
     :param about: what they were compiled for, such as ``AVX2``, or why there are none
     """
 

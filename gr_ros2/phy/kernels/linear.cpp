@@ -23,7 +23,7 @@ struct Track {
 };
 
 struct Scratch {
-    std::vector<Sample> head;                              // the points that tell the length
+    std::vector<Sample> head;                              // the points of the length word
     std::vector<float> head_soft;
     std::vector<float> re, im, power, match, chance;       // per sample, per position
     std::vector<Sample> symbols, spectrum, spare, rotation;  // per preamble symbol, per bin
@@ -102,18 +102,18 @@ class Linear final : public Modem {
     }
 
    private:
-    // Symbols behind the preamble.
+    // Number of symbols after the preamble.
     int symbols(int length) const {
         const int bits = lengths_.bits(length) + (lengths_.fixed() ? 0 : kWordBits);
         return (bits + p_.point_bits - 1) / p_.point_bits;
     }
 
-    // Samples from the reference sample on.
+    // Number of samples from the reference sample on.
     int64_t needed(int length) const {
         return static_cast<int64_t>(p_.preamble + symbols(length) - 1) * p_.sps + 1 + p_.slack;
     }
 
-    // What a preamble tells of what follows.
+    // Carrier, SNR and start of a burst, measured on its preamble.
     Track measured(Samples samples, int64_t start, const Carrier& found, Scratch& s) const {
         Track track;
         track.frequency = found.frequency + p_.turn;
@@ -123,7 +123,7 @@ class Linear final : public Modem {
         return track;
     }
 
-    // Bytes of the packet, from as many symbols as every burst has.
+    // Bytes of the packet, from the symbols that even the shortest burst has.
     int said(Samples samples, const Track& track, Scratch& s) const {
         const int payload = symbols(lengths_.shortest());
         s.head.resize(payload);

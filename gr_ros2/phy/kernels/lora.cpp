@@ -82,7 +82,7 @@ class Lora final : public Modem {
     int64_t end(Samples samples, int64_t start) const override {
         Scratch& s = prepared();
         const Place place = look(samples, start, s);
-        // What is no burst need not be waited for.
+        // If there is no burst, there is no need to wait for its samples.
         if (!place.found) return start + static_cast<int64_t>(p_.head + 1 + (p_.before ? p_.before + 1 : 0)) * p_.chips;
         straighten(place, s);
         return ending(place, said(samples, place, s));
@@ -111,18 +111,18 @@ class Lora final : public Modem {
     }
 
    private:
-    // Chirps of the payload.
+    // Number of chirps of the payload.
     int symbols(int length) const {
         const int block = kNibble * p_.spreading_factor;
         return (lengths_.bits(length) + block - 1) / block * p_.code_bits;
     }
 
-    // Of a burst clocks and channel may keep back a few samples.
+    // The end of a burst may be a few samples late, because of the clocks and the channel.
     int64_t ending(const Place& place, int length) const {
         return std::llrint(place.begin) + static_cast<int64_t>(p_.before + symbols(length)) * p_.chips - p_.sinc;
     }
 
-    // Into `turned` what makes tones of chirps.
+    // Fill `turned` with the factors that turn chirps into tones.
     void straighten(const Place& place, Scratch& s) const {
         Rotation(0, -kTau * place.carrier / p_.chips).fill(s.turned.data(), p_.chips);
         for (int k = 0; k < p_.chips; k++) s.turned[k] = mul(s.turned[k], down_[k]);

@@ -1,7 +1,7 @@
 // What a kernel is: a burst modem's search and reading (gr_ros2/phy/burst.py has the meaning of each).
 //
-// Invariants: a modem never changes once it is made, so that any number of threads may use it; what a call works in belongs to
-// its thread; samples outside of those given are never looked at, whatever the start.
+// Invariants: a modem never changes after it is made, so any number of threads may use it; the working memory of a call
+// belongs to its thread; only the given samples are read, whatever the start.
 
 #pragma once
 
@@ -25,16 +25,16 @@ struct Search {
     int64_t start;  // kNone: no burst (yet)
 };
 
-// What a burst says of itself beside its bits.
+// Values of a burst in addition to its bits.
 struct Report {
     double snr;
-    int64_t end;           // index behind its last sample that was needed
+    int64_t end;           // index after its last sample that was needed
     int64_t length;        // bytes of the packet
-    int64_t soft, points;  // how many of each
+    int64_t soft, points;  // number of soft bits and of points
 };
 
-// The lengths that packets may have, `shortest` to `longest` bytes, and the bits of each on the air. Where there is only one
-// nothing tells it.
+// The allowed packet lengths, `shortest` to `longest` bytes, and the bits sent for each. If there is only one length,
+// a burst does not carry it.
 class Lengths {
    public:
     Lengths(int32_t shortest, int32_t longest, const int32_t* bits)
@@ -54,7 +54,7 @@ class Lengths {
 
 constexpr int kWordBits = 32;
 
-// The row of signs that soft bits of a word are most alike: gr_ros2/phy/length_word.py.
+// The row of signs with the highest correlation with the soft bits of a word: gr_ros2/phy/length_word.py.
 inline int likeliest_word(const float* signs, int count, const float* soft) {
     int best = 0;
     float most = 0;
@@ -78,11 +78,10 @@ class Modem {
     // Index behind the last sample that `read` needs.
     virtual int64_t end(Samples samples, int64_t start) const = 0;
 
-    // Soft bits, points and what else a burst says; false where there is none after all.
+    // Soft bits, points and other values of a burst; false if it proves not to be a burst.
     virtual bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const = 0;
 
-    // The samples of the burst of a packet of so many bytes, from the bits of its frame; false where numpy does it as
-    // well.
+    // The samples of the burst of a packet of `length` bytes, from the bits of its frame; false if numpy does this.
     virtual bool modulate(const uint8_t* bits, int32_t length, Sample* out) const {
         (void)bits, (void)length, (void)out;
         return false;

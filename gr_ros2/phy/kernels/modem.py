@@ -68,7 +68,7 @@ _NUMBERS = {"int32": ctypes.c_int32, "float64": ctypes.c_double}
 
 
 class _Report(ctypes.Structure):
-    """That of ``modem.h``."""
+    """The struct of the same name in ``modem.h``."""
 
     _fields_ = (
         ("snr", ctypes.c_double),
@@ -80,7 +80,7 @@ class _Report(ctypes.Structure):
 
 
 class CompiledModem(BurstModem):
-    """The given modem, with search and demodulation of the compiled kernel.
+    """The given modem, with search and demodulation by the compiled kernel.
 
     :param reference: the numpy modem; its constants name the kernel
     :raises MemoryError: when memory is short

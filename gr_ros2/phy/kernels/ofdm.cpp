@@ -8,7 +8,7 @@ namespace {
 
 constexpr double kTiny = 1e-20;
 constexpr int kHead = 3;          // two sync words and the header
-constexpr int kFieldBits = 12;     // of the header: length, number
+constexpr int kFieldBits = 12;     // bits of each header field: length, number
 constexpr int kToneSize = 1024;   // the finest grid of `tone`
 constexpr float kSmallestNoise = 1e-6f;
 constexpr double kFar = 1e6;         // samples that no burst can be late
@@ -212,10 +212,10 @@ class Ofdm final : public Modem {
         return kHead + (lengths_.bits(length) + each - 1) / each;
     }
 
-    // Samples from the reference sample on.
+    // Number of samples from the reference sample on.
     int64_t needed(int length) const { return static_cast<int64_t>(symbols(length)) * symbol_ - back_; }
 
-    // What the header tells once the sync words have told the channel: bytes of the packet, and more of the channel.
+    // Read the header with the channel estimate of the sync words, and improve that estimate; returns the packet length.
     int head(Scratch& s, float noise) const {
         std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
         decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
@@ -226,7 +226,7 @@ class Ofdm final : public Modem {
         return said(s.header.data());
     }
 
-    // The length that a header says: of GNU Radio's blocks too, which count frames and send the longest only.
+    // The length in a header, also for headers of GNU Radio's blocks, which count frames and send only the longest.
     int said(const float* soft) const {
         uint32_t hard = 0;
         for (int bit = 0; bit < kWordBits; bit++) hard |= static_cast<uint32_t>(soft[bit] > 0) << bit;
@@ -241,7 +241,7 @@ class Ofdm final : public Modem {
 
     static uint32_t field(uint32_t header) { return header & ((1u << kFieldBits) - 1); }
 
-    // The header of a length, by its row.
+    // The header bits of a length, by its row in the table.
     uint32_t own(int row) const {
         uint32_t bits = 0;
         for (int bit = 0; bit < kWordBits; bit++)
@@ -249,7 +249,7 @@ class Ofdm final : public Modem {
         return bits;
     }
 
-    // Of length and number, each as 16 bits with the lower 8 first: polynomial 0x07, start 0xff.
+    // CRC-8 of length and number, each as 16 bits with the lower 8 first: polynomial 0x07, start 0xff.
     static uint32_t crc8(uint32_t header) {
         const uint32_t length = field(header), number = field(header >> kFieldBits);
         uint32_t crc = 0xff;
