@@ -1,7 +1,7 @@
-"""The program: what `gr-ros2` and `python -m gr_ros2.cli` start.
+"""The entry point of `gr-ros2` and of `python -m gr_ros2.cli`.
 
-Invariant: from the first line of `main` on, Ctrl-C and SIGTERM end the program with one line and one status, whatever
-is being loaded; nothing heavy is imported before that.
+Invariant: from the first line of `main` on, Ctrl-C and SIGTERM end the program with one line and one exit status, also
+during an import. No large package is imported before that.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ def main() -> None:
     try:
         status = run()
     finally:
-        # Nothing is open any more: whoever cannot wait for the interpreter's own end need not.
+        # Nothing is open any more, so a signal may end the program before the interpreter has finished.
         on_signals(_leave)
     raise SystemExit(status)
 
 
 def _leave(*_: object) -> None:
-    """End at once: an exception would come out in the middle of an import, where it passes for something else."""
+    """End at once. An exception in the middle of an import would look like another error."""
     os.write(2, b"gr-ros2: interrupted\n")
     os._exit(INTERRUPTED)
 

@@ -1,7 +1,7 @@
-"""Packets out of what people have: hex text, files of back-to-back packets, pcap and pcapng captures.
+"""Reads packets from hex text, files of back-to-back packets, and pcap and pcapng captures.
 
-Invariant: nothing is dropped in silence; what is no packet is handed on for the decoder to refuse, and what cannot be
-read as a capture at all is a ConfigError.
+Invariant: nothing is dropped silently. Bytes that are not a packet are passed on, and the decoder refuses them. A
+capture that cannot be read at all raises a ConfigError.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _UDP = 17
 
 
 def packets_in(data: bytes, packet_len: int | None, where: str) -> Iterator[tuple[bytes, int]]:
-    """The packets of one file, each with the length it ought to have: of a capture, of hex text with one packet a
-    line, or back to back.
+    """The packets of one file, each with its expected length. The file is a capture, hex text with one packet per line,
+    or packets back to back.
 
-    :param packet_len: None takes each hex line and record for a packet of its length, and cuts binary packets at
-        DEFAULT_PACKET_LEN; a rest that is shorter comes out as it is
+    :param packet_len: None: each hex line and each record is a packet of its own length, and binary data is cut into
+        packets of DEFAULT_PACKET_LEN; a shorter rest is returned unchanged
     :param where: name of the file, for errors
-    :raises ConfigError: a capture that is damaged
+    :raises ConfigError: when a capture is damaged
     """
     if data[:4] == _PCAPNG_MAGIC:
         packets: Iterable[bytes] = _pcapng(data, where)
@@ -47,7 +47,7 @@ def packets_in(data: bytes, packet_len: int | None, where: str) -> Iterator[tupl
 
 
 def from_hex(text: str) -> bytes | None:
-    """Bytes of hex digits, spaces and colons between them allowed; None where it is something else."""
+    """Bytes of hex digits, with or without spaces and colons between them; None for any other text."""
     digits = text.strip().removeprefix("0x").replace(" ", "").replace(":", "").replace("\t", "")
     try:
         return unhexlify(digits) if digits else None
@@ -109,7 +109,7 @@ def _pcapng(data: bytes, where: str) -> Iterator[bytes]:
 
 
 def _payload(record: bytes, link_type: int) -> bytes:
-    """A record is a packet, unless the capture was taken from an IP link: then what its UDP datagram carries is."""
+    """The packet in a record: the payload of the UDP datagram in a capture of an IP link, otherwise all of it."""
     at = _IP_OFFSET.get(link_type)
     if at is None or len(record) < at + 28 or record[at] >> 4 != 4 or record[at + 9] != _UDP:
         return record

@@ -7,7 +7,7 @@ from click.shell_completion import get_completion_class
 
 SHELLS = ("bash", "zsh", "fish")
 COMPLETE_VARIABLE = "_GR_ROS2_COMPLETE"
-"""What click's scripts set when they ask the program."""
+"""Environment variable that click's scripts set when they call the program."""
 
 
 @click.command()

@@ -1,10 +1,11 @@
-"""Unix sockets with which `gr-ros2 dashboard` finds the running programs of this user, and asks one to open its page.
+"""Unix sockets with which `gr-ros2 dashboard` finds the running programs of this user, and asks one to serve its page.
 
-Each program that can be looked at listens on a Unix socket named after its process in a folder only its user may enter;
-a client sends one line of JSON and gets one line back. Invariants: no other user can connect; a program that is killed
-leaves a socket that answers no more and is cleared away by the next client; a request never delays the program;
-whatever a client sends or does not send, the next client is answered; every wait has a deadline, and at most one line
-is kept from each side.
+Each program that can be observed listens on a Unix socket. The socket is named after the process id, in a folder that
+only its user may enter. A client sends one line of JSON and gets one line back.
+
+Invariants: no other user can connect. The socket of a killed program answers no more, and the next client removes it. A
+request never delays the program. Whatever a client sends or does not send, the next client gets an answer. Every wait
+has a deadline. At most one line is kept from each side.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from gr_ros2.errors import GrRos2Error, RunError
 
 _LINE = 4096
 _MAX_CLIENTS = 32
-"""Connected at a time; when one more comes, the one that has said nothing for longest is sent away."""
+"""Most clients at a time. When one more connects, the client that connected first is disconnected."""
 _SPEAK_S = 2.0
 """s that a client may take to send its request."""
 _PAUSE_S = 0.1
 _WAIT_S = 10.0
-"""s a client waits for the answer: a dashboard is drawn first."""
+"""s that a client waits for the answer. The program draws its dashboard before it answers."""
 
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 def folder() -> Path:
-    """The folder of this user's sockets; made if missing.
+    """The folder of this user's sockets, created if missing.
 
-    :raises RunError: when somebody else owns it
+    :raises RunError: when another user owns it
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     base = Path(runtime) if runtime and Path(runtime).is_dir() else Path(tempfile.gettempdir())
@@ -53,8 +54,8 @@ def folder() -> Path:
 class ControlSocket:
     """Answers clients while it is open.
 
-    :param name: what this program is doing, for clients that find several
-    :param answer: called in a thread of its own with what a client asks; a GrRos2Error becomes the client's
+    :param name: what this program is doing, for clients that find several programs
+    :param answer: called in a separate thread with the request of a client; a GrRos2Error is sent to the client
     """
 
     def __init__(self, name: str, answer: Answer) -> None:
@@ -97,7 +98,7 @@ class ControlSocket:
                 self._leave(client)
 
     def _turn(self) -> bool:
-        """Wait for what comes next and see to it; false when the socket is closed."""
+        """Wait for the next event and handle it. Return False when the socket is closed."""
         first = min((client.deadline for client in self._clients.values()), default=None)
         wait = None if first is None else max(0.0, first - time.monotonic())
         for key, _ in self._selector.select(wait):
@@ -116,7 +117,7 @@ class ControlSocket:
         except OSError as error:
             if self._closed:
                 return False
-            if not isinstance(error, BlockingIOError):  # no file descriptor is left: whoever waits has to wait
+            if not isinstance(error, BlockingIOError):  # no file descriptor is left, so new clients wait
                 time.sleep(_PAUSE_S)
             return True
         came.setblocking(False)
@@ -142,7 +143,7 @@ class ControlSocket:
         if more and b"\n" not in more and len(client.line) < _LINE:
             return
         if client.line:
-            with suppress(OSError):  # it left, or does not read what fits into its socket's buffer
+            with suppress(OSError):  # the client left, or its buffer is full because it does not read
                 client.socket.sendall(json.dumps(self._say(client.line)).encode() + b"\n")
         self._leave(client.socket)
 
@@ -154,14 +155,14 @@ class ControlSocket:
             return {"error": str(error)}
         except (ValueError, LookupError, TypeError, ArithmeticError):
             return {"error": "not understood"}
-        except Exception as error:  # noqa: BLE001 - whatever one client brings about, the next one is answered
+        except Exception as error:  # noqa: BLE001 - whatever error one client causes, the next one gets an answer
             return {"error": f"{type(error).__name__}: {error}"}
 
 
 class _Client:
     """A connected client.
 
-    :param deadline: when its line has to be complete, s, monotonic
+    :param deadline: time at which its line must be complete, s, monotonic
     """
 
     __slots__ = ("deadline", "line", "socket")
@@ -185,9 +186,9 @@ def running_programs() -> dict[int, str]:
 
 
 def request(pid: int, asked: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Ask a program.
+    """Send a request to a program and return its answer.
 
-    :raises RunError: when it is gone, does not answer, or refuses
+    :raises RunError: when the program has ended, does not answer, or refuses
     """
     try:
         said = _ask(folder() / f"{pid}.sock", asked)
@@ -199,7 +200,7 @@ def request(pid: int, asked: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def parse(line: bytes) -> Mapping[str, Any]:
-    """One line of JSON that is an object.
+    """Parse one line of JSON, which must be an object.
 
     :raises ValueError: for anything else
     """
@@ -213,10 +214,10 @@ def parse(line: bytes) -> Mapping[str, Any]:
 
 
 def receive(connection: socket.socket, most: int, deadline: float, end: bytes = b"") -> bytes:
-    """What comes until the other side closes, ``end`` is there, or it is enough.
+    """Receive data until the other side closes, ``end`` has arrived, or there are ``most`` bytes.
 
-    :param most: bytes
-    :param deadline: s, monotonic
+    :param most: most bytes to receive
+    :param deadline: time at which to stop, s, monotonic
     :raises TimeoutError: when the time is over
     """
     data = b""

@@ -1,4 +1,4 @@
-"""The live dashboard on the command line: `--dashboard` of a run, and `gr-ros2 dashboard` beside one that goes on."""
+"""The live dashboard on the command line: `--dashboard` of a new run, and `gr-ros2 dashboard` for a running one."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ dashboard_option = click.option(
 
 @contextmanager
 def audience(where: str | None, console: Console, name: str, *, instruments: bool = True) -> Iterator[LateObservers]:
-    """Whoever looks on at a run or a link: a dashboard from the start where one is wanted, and those asked for by
-    `gr-ros2 dashboard` in the meantime.
+    """The observers of a run or a link: a dashboard from the start if ``where`` is given, or later when
+    `gr-ros2 dashboard` asks for one.
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
-    :param name: what the program is doing, for those who look for it
+    :param name: what the program is doing, for clients that search for it
     :param instruments: see :class:`gr_ros2.run.observers.RunObserver`
-    :raises ConfigError: for a place where nothing can be served
+    :raises ConfigError: when the dashboard cannot be served at this place
     :raises BackendMissingError: when the package that draws it is not installed
     """
     from gr_ros2.run.observers import LateObservers
@@ -61,7 +61,7 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
 
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
-        # Closed before the dashboards are, so that nobody can ask for one more by then.
+        # The control socket closes before the dashboards, so that no client can ask for another one then.
         with ExitStack() as control_socket:
             try:
                 control_socket.enter_context(
@@ -79,7 +79,7 @@ def _make(address: str, port: int) -> Dashboard:
     except ModuleNotFoundError as error:
         package = (error.name or "bokeh").split(".")[0]
         raise BackendMissingError(f"the dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error
-    logging.getLogger("bokeh.protocol").setLevel(logging.CRITICAL)  # it prints what viewers send that is no message
+    logging.getLogger("bokeh.protocol").setLevel(logging.CRITICAL)  # it prints invalid messages of viewers
     for name in ("bokeh", "tornado"):  # they warn of every viewer that leaves
         logging.getLogger(name).setLevel(logging.ERROR)
     return Dashboard(address, port)
@@ -109,7 +109,7 @@ def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
 
 
 def _find(address: str, port: int, pid: int | None) -> str | None:
-    """Where a page is served, by who serves one already or by who is asked to; None where nothing runs."""
+    """Address of a page that is served already, or that a running program is asked to serve; None if none runs."""
     if pid is None and _answers(address, port):
         return f"http://{address}:{port}/"
     running = running_programs()
@@ -123,7 +123,7 @@ def _find(address: str, port: int, pid: int | None) -> str | None:
 
 
 def parse_place(text: str) -> tuple[str, int]:
-    """`5006`, or `192.168.1.5:5006`, or `[::1]:5006`, as address and port.
+    """Split `5006`, `192.168.1.5:5006` or `[::1]:5006` into address and port.
 
     :raises ConfigError: for anything else
     """
@@ -134,7 +134,7 @@ def parse_place(text: str) -> tuple[str, int]:
 
 
 def _answers(address: str, port: int) -> bool:
-    """Whether a dashboard is there. Whatever else is, it gets two seconds and a few thousand bytes."""
+    """Whether a dashboard answers there. Any other server is read for two seconds and a few thousand bytes at most."""
     deadline = time.monotonic() + _ANSWER_S
     try:
         with socket.create_connection((address, port), _ANSWER_S) as connection:

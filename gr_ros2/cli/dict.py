@@ -1,6 +1,6 @@
-"""`gr-ros2 dict`: dictionaries for message compression: train one on a recording, show what there is.
+"""`gr-ros2 dict`: train a dictionary for message compression on a recording, or list the dictionaries.
 
-Invariant: what `train` promises it has measured, on messages it did not train on.
+Invariant: `train` measures the sizes that it reports, on messages that it did not use for training.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gr_ros2.registry import Registry
 _HELD_BACK = 4
 """Every fourth message of a topic is kept for measuring."""
 _MAX_MESSAGES = 20_000
-"""Of one topic; what follows is left out."""
+"""Most messages of one topic. Later messages are left out."""
 _FEWEST = 8
 
 
@@ -103,7 +103,7 @@ def list_dictionaries(*, files: Sequence[Path]) -> None:
 
 
 def _gains(made: Dictionary, kinds: Mapping[str, str], messages: Mapping[str, Sequence[bytes]]) -> Table:
-    """Mean bytes per message, as it is, with the shipped dictionaries and with the new one."""
+    """Mean bytes per message: without compression, with the shipped dictionaries, and with the new one."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("topic", "type"):
         table.add_column(heading, overflow="fold")

@@ -1,4 +1,4 @@
-"""`gr-ros2 doctor`: what this machine has and lacks for a link, and the command that mends it."""
+"""`gr-ros2 doctor`: what this machine has and lacks for a link, and the commands that repair it."""
 
 from __future__ import annotations
 

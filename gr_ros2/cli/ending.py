@@ -9,7 +9,7 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
 def on_signals(handler: Callable[..., object]) -> None:
-    """Have Ctrl-C and SIGTERM call this; one that whoever started the program wants ignored stays so."""
+    """Let Ctrl-C and SIGTERM call ``handler``. A signal that is ignored from the start stays ignored."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, handler)

@@ -70,7 +70,7 @@ def link(
 ) -> int:
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph.
 
-    What the link is stands in the YAML file CONFIG, or follows from --robot and --radio.
+    The YAML file CONFIG describes the link. Without it, --robot and --radio do.
     """
     given = {name.replace("_", "-"): value for name, value in flags.items() if value not in (None, ())}
     if config is not None:
@@ -90,7 +90,7 @@ def link(
         with uninterrupted():  # GNU Radio may be loaded
             values = one_line(robot, radio, registry, given)
         settings = _in_one_line(values, overrides, save)
-    # These need GNU Radio, which a wrong setting must not wait for.
+    # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
         from gr_ros2.radio.link import RobotLink
         from gr_ros2.run.observers import RunObservers
@@ -106,7 +106,7 @@ def link(
             run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
-            pass  # how a link ends
+            pass  # the normal end of a link
         stats = running.stats()
         stack.close()
         console.print(status_line(stats), soft_wrap=True)
@@ -116,7 +116,7 @@ def link(
 
 
 def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path | None) -> LinkConfig:
-    """The settings of a link, which are printed as YAML, and written to ``save``."""
+    """Make the settings of a link, print them as YAML, and write them to ``save``."""
     values = settled(values, Path(), overrides)
     settings = link_from(values, values["name"])
     text = yaml_text({**values, "registry": portable_registry(values["registry"])})
@@ -131,7 +131,7 @@ def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path
 
 
 def _live(running: RobotLink) -> LiveRun:
-    """What observers see: this end alone, so no ledger."""
+    """The link as observers see it. They see only this end, so there is no ledger."""
     from gr_ros2.run.observers import LiveRun
 
     source = running.source
@@ -156,7 +156,7 @@ def _opening(running: Any) -> str:
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:
-    """Say what runs and what it waits for, with one status line until the time is over or nothing more can come."""
+    """Print what runs and what it waits for, with one status line until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import Waiting
 
     said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
@@ -181,7 +181,7 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
 
 
 def status_line(stats: Mapping[str, Any]) -> str:
-    """What passes, in one line, from :meth:`RobotLink.stats`."""
+    """The traffic of a link in one line, from :meth:`RobotLink.stats`."""
     source, sink, packets = stats["source"], stats["sink"], stats["packets"]
     taken = sum(topic["submitted"] for topic in source["topics"].values())
     given = sum(topic["delivered"] for topic in sink["topics"].values())

@@ -1,8 +1,8 @@
 """The command `gr-ros2`: finds a sub-command, runs it, and turns errors into one line and an exit status.
 
-Invariants: nothing but this package prints, exits or reads argv; a sub-command's module is imported only when it is
-chosen, so `--help` is quick and works without GNU Radio, DDS and ROS; exit status 2 means bad input, 1 a failed run,
-130 Ctrl-C or SIGTERM.
+Invariants: only this package prints, exits or reads argv. The module of a sub-command is imported only when the
+sub-command is chosen, so `--help` is quick and works without GNU Radio, DDS and ROS. Exit status 2 means bad input, 1 a
+failed run, 130 Ctrl-C or SIGTERM.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name, command, rest = super().resolve_command(ctx, args)
         if not isinstance(command, LazyGroup):
-            # Its modules are loaded. What it opens from now on is to be closed, and what it counts kept: after Ctrl-C,
-            # and after the SIGTERM of a service manager.
+            # The modules of the command are loaded. From now on, Ctrl-C and the SIGTERM of a service manager raise
+            # KeyboardInterrupt, so that the command closes what it has opened and keeps what it has counted.
             on_signals(signal.default_int_handler)
         return name, command, rest
 
@@ -118,11 +118,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except GrRos2Error as error:
         return _fail(str(error), BAD_INPUT if isinstance(error, _BAD_INPUT_ERRORS) else FAILED)
     except BrokenPipeError:
-        # Whoever read our output (`| head`) has gone: not an error, but Python must not flush into it at exit.
+        # The reader of our output (such as `| head`) has ended. This is no error, but Python must not flush at exit.
         sys.stdout = open(os.devnull, "w")
         return 0
     except OSError as error:
-        # Where a file is written it is named by who writes it; this is what is left, such as our own output.
+        # Code that writes a file reports its errors with its name. Other errors come here, such as those of our output.
         return _fail(f"{error.filename or 'a file or the output'}: {error.strerror or error}", FAILED)
     return status if isinstance(status, int) else 0
 

@@ -1,4 +1,4 @@
-"""`gr-ros2 packet decode`: what stands in a packet, or why it is none."""
+"""`gr-ros2 packet decode`: the fields of a packet, or the reason why it is refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gr_ros2.registry import Registry
 from gr_ros2.wire import BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
 
 _SHOWN = 16
-"""Payload bytes printed of an entry."""
+"""Most payload bytes of an entry that are printed."""
 
 
 @click.command("decode")
@@ -52,7 +52,7 @@ def decode_packets(
     packets = list(_packets(inputs or ("-",), packet_len))
     if not packets:
         raise ConfigError("nothing to decode: the input is empty")
-    # A sender without fixed lengths fills few packets: the longest tells what is the longest on its link.
+    # A sender without fixed lengths fills few packets. The longest packet gives the packet length of the link.
     longest = packet_len or max((len(data) for data, _ in packets if _is_version_1(data)), default=0)
     reader = Reader(longest, keys)
     for data, _ in packets:
@@ -79,7 +79,7 @@ def _is_version_1(data: bytes) -> bool:
 
 
 def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[bytes, int]]:
-    """Each packet and the length it ought to have. What reads as hex digits is no file name; write ./face for that."""
+    """Each packet with its expected length. Hex digits are not a file name; for a file named face, write ./face."""
     for text in inputs:
         if text == "-":
             data, where = sys.stdin.buffer.read(), "standard input"
@@ -144,14 +144,14 @@ def _looked_at(look: Look, data: bytes, reader: Reader, registry: Registry | Non
 
 
 def _name(topic_id: int, registry: Registry | None) -> str | None:
-    """Of a topic by its row in the registry; None without one."""
+    """Name of a topic by its row in the registry; None without a registry."""
     if registry is None:
         return None
     return registry[topic_id].name if topic_id < len(registry) else "not in the registry"
 
 
 def _of_topic(entry: Entry, name: str | None) -> str:
-    """A message or a fragment."""
+    """Describe a message or a fragment."""
     topic = f"{entry.topic_id} ({name})" if name is not None else str(entry.topic_id)
     return f"topic {topic}, {entry.describe()}, payload {len(entry.payload)} bytes: {_preview(entry.payload)}"
 

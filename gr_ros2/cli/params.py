@@ -15,7 +15,7 @@ from gr_ros2.settings_file import BUILTIN_DIR
 
 
 class ScenarioName(click.ParamType):
-    """A built-in scenario's name or a YAML file's path; which of them it is, ``load_scenario`` finds out."""
+    """The name of a built-in scenario or the path of a YAML file. ``load_scenario`` finds out which of them it is."""
 
     name = "scenario"
 
@@ -33,7 +33,7 @@ SCENARIO = ScenarioName()
 
 
 class OrAuto(click.ParamType):
-    """`auto`, or what another type takes."""
+    """`auto`, or a value of another type."""
 
     def __init__(self, other: click.ParamType) -> None:
         self._other = other
@@ -44,7 +44,7 @@ class OrAuto(click.ParamType):
 
 
 class RowName(click.ParamType):
-    """A name of a table of back-ends; whether there is such a row, the table says when it is loaded."""
+    """A name in a table of back-ends. The table checks the name later, when the row is loaded."""
 
     name = "name"
 
@@ -65,9 +65,9 @@ class RowName(click.ParamType):
 
 
 class Setting(click.ParamType):
-    """`KEY=VALUE`; what is completed is the key.
+    """`KEY=VALUE`. The shell completes the key.
 
-    :param settings: class of the configuration that has it
+    :param settings: class of the configuration that has the key
     """
 
     name = "setting"
@@ -85,7 +85,7 @@ class Setting(click.ParamType):
 
 
 def setting_keys(settings: type[Any], prefix: str = "") -> Iterator[str]:
-    """The keys of a configuration class, dots between those that are nested."""
+    """The keys of a configuration class, with dots between nested keys."""
     kinds = get_type_hints(settings)
     for field in fields(settings):
         if is_dataclass(kinds[field.name]):

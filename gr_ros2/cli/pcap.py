@@ -1,9 +1,10 @@
 """`--pcap FILE`: every packet that leaves or arrives, as a capture that Wireshark reads.
 
-A pcapng file of link type USER0 with two interfaces, `sent` (packets composed by a source of ours) and `received`
-(packets the PHY handed to the sink). Invariants: a packet is in the file as soon as its call returns; the file ends
-after a whole record whatever happens to the process or the disk; times are wall time, also of runs in simulated time,
-which start now.
+A pcapng file of link type USER0 with two interfaces: `sent` (packets that our source composed) and `received` (packets
+that the PHY passed to the sink).
+
+Invariants: a packet is in the file as soon as its call returns. The file ends after a whole record, whatever happens to
+the process or the disk. Times are wall-clock times. A run in simulated time starts at the current wall-clock time.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from gr_ros2.run.observers import LiveRun
 
 LINK_TYPE = 147
-"""DLT_USER0: ours to give a meaning; the dissector does."""
+"""DLT_USER0, for private use. The dissector gives it a meaning."""
 
 _SENT, _RECEIVED = 0, 1
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
@@ -39,10 +40,10 @@ _CLOSE_S = 1.0
 
 
 class PacketCapture:
-    """A capture under way: a :class:`gr_ros2.run.observers.RunObserver`, and for a link without runs its observer.
+    """An open capture: a :class:`gr_ros2.run.observers.RunObserver`, and also the observer of a link without runs.
 
-    :param path: file to write, replaced if it is there
-    :param clock: s, the clock of the events, until a run brings its own
+    :param path: file to write, replaced if it exists
+    :param clock: the clock of the events, s, until a run brings its own clock
     :raises ConfigError: when the file cannot be written
     """
 
@@ -63,7 +64,7 @@ class PacketCapture:
             options = _option(_OPT_NAME, name) + _option(_OPT_TIME_RESOLUTION, bytes([_NANOSECONDS]))
             head.append(_block(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0), options))
         try:
-            # Unbuffered: what a process wrote before it was killed is what there is to look at.
+            # Unbuffered, so that the file has all packets even if the process is killed.
             self._file = path.open("wb", buffering=0)
             self._put(b"".join(head))
         except OSError as error:
@@ -76,23 +77,23 @@ class PacketCapture:
         self._offset = time.time() - run.clock()
 
     def run_ended(self, result: Result | None) -> None:
-        """Whoever opened the capture closes it."""
+        """Do nothing: the code that opened the capture closes it."""
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
         """Write a packet that leaves.
 
-        :raises RunError: when that fails, and whenever it has failed before
+        :raises RunError: when this write fails, or an earlier one has failed
         """
         if isinstance(event, SentPacket):
             self._write(_SENT, event.data, event.now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Write a packet that arrived, whatever it is; see above."""
+        """Write a packet that arrived, accepted or rejected. Errors are the same as in :meth:`sender_event`."""
         if isinstance(event, Received | Rejected):
             self._write(_RECEIVED, event.data, now)
 
     def close(self) -> None:
-        """Idempotent. A write that hangs, as into a pipe nobody reads, is left behind."""
+        """Close the file. Idempotent. If a write hangs, such as into a pipe without a reader, the file stays open."""
         if self._lock.acquire(timeout=_CLOSE_S):
             with suppress(OSError):  # every record has been written by now
                 self._file.close()
@@ -119,14 +120,14 @@ class PacketCapture:
             try:
                 self._put(record)
             except OSError as error:
-                with suppress(OSError):  # a pipe keeps the half of a record that it took
+                with suppress(OSError):  # a pipe keeps the part of a record that it took
                     self._file.truncate(self._size)
                 self._failed = RunError(f"after {self.packets} packets: {error.strerror}")
                 raise self._failed from error
             self.packets += 1
 
     def _put(self, data: bytes) -> None:
-        """Write all of it: a disk that is nearly full takes a part first."""
+        """Write all bytes. A disk that is nearly full takes only a part of them at first."""
         left = memoryview(data)
         while left:
             left = left[self._file.write(left) :]
@@ -143,7 +144,7 @@ pcap_option = click.option(
 
 @contextmanager
 def capture(path: Path | None) -> Iterator[list[PacketCapture]]:
-    """The captures of a command: one where a file is named.
+    """The captures of a command: one if a file is named, otherwise none.
 
     :raises ConfigError: when the file cannot be written
     """

@@ -92,13 +92,13 @@ def _verdict(forecast: Forecast) -> str:
 
 
 def _air(forecast: Forecast) -> str:
-    """What packets are spent on, per message."""
+    """Packets per message, by purpose."""
     spent = ", ".join(f"{packets:.2f} {kind}" for kind, packets in forecast.air.items())
     return f"{sum(forecast.air.values()):.2f} packets per message sent: {spent}."
 
 
 def _line(advice: Advice) -> str:
-    """What a change makes better and worse, by how much; the strongest effects first."""
+    """What a change makes better and worse, and by how much. The strongest effects come first."""
     used, then = (f"{share:.0%}" for share in advice.used)
     parts = [f"{then} of the airtime" + (f" instead of {used}" if used != then else "")]
     for word, found in (

@@ -28,7 +28,7 @@ from gr_ros2.registry import MAX_TOPICS, Registry, Topic
 from gr_ros2.setting import AUTO, Auto
 
 _NO_MESSAGES = {"srv": "a service", "action": "an action"}
-"""Of types: the middle part where it is not ``msg``, and what has such types."""
+"""Middle part of a type name other than ``msg``, and what has such types."""
 _LATCHED = "durability"
 _QOS_COLUMNS = ("reliability", _LATCHED, "depth")
 _SHARED = [name for name, row in MIDDLEWARE.own.items() if row.scope == "shared"]
@@ -62,7 +62,7 @@ _out = click.option("--out", type=click.Path(dir_okay=False, path_type=Path), he
 
 
 class SharedGraph(click.ParamType):
-    """A middleware on whose graph a robot of another process can be; other packages' are looked up only when named."""
+    """A middleware whose graph other processes can join. Those of other packages are looked up only when named."""
 
     name = "middleware"
 
@@ -101,7 +101,7 @@ def from_graph(
 ) -> None:
     """Write a registry from the topics that are published on the ROS graph."""
     with join_graph(middleware, domain_id=domain_id, node_name="gr_ros2") as graph:
-        time.sleep(wait)  # discovery has no way to say that it is complete
+        time.sleep(wait)  # discovery does not report when it is complete
         found = graph.discover()
     _write(registry_csv(found, namespace, _names(topics)), unfit(found), out)
 
@@ -124,7 +124,7 @@ def from_bag(*, bag: Path, namespace: str, topics: str, out: Path | None) -> Non
 
 
 def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:
-    """Topics that no registry can have, by name, and why."""
+    """Topics that a registry cannot have, by name, with the reason."""
     types: dict[str, list[str]] = {}
     for info in found:
         types.setdefault(info.topic, []).append(info.type_name)
@@ -147,13 +147,14 @@ def registry_csv(
 ) -> str:
     """The text of a registry CSV with header.
 
-    :param found: topics of the graph or the bag; those that nobody publishes are left out, and :func:`unfit` ones
+    :param found: topics of the graph or the bag; those without a publisher and :func:`unfit` ones are left out
     :param namespace: only topics below it, by their names relative to it; '' takes all
-    :param wanted: only these names, in this order, with or without leading slash; [] takes all by name
-    :param bag: where the topics are from, which then get columns of the QoS their publishers offered; None: the graph,
-        which does not tell all of it, and where subscriptions adapt: a column of what is latched
-    :raises ConfigError: when nothing is left, a wanted topic is missing or unfit, the namespace is none of ROS, or more
-        than 16 topics remain
+    :param wanted: only these names, in this order, with or without leading slash; [] takes all, sorted by name
+    :param bag: the bag of the topics; the CSV then has columns with the QoS that their publishers offered. None: the
+        topics are of the graph, which does not tell all of the QoS, and where subscriptions adapt; the CSV then has a
+        column only for latched topics
+    :raises ConfigError: when nothing is left, a wanted topic is missing or unfit, the namespace is not valid in ROS, or
+        more than 16 topics remain
     """
     try:
         checked_namespace(namespace)
@@ -196,7 +197,7 @@ def registry_csv(
 
 
 def _offered(publishers: Sequence[Qos]) -> dict[str, str]:
-    """What all publishers of a topic offer, by column; of their depths the largest."""
+    """The QoS that all publishers of a topic offer, by column. The depth is the largest of theirs."""
     qos = settle(Qos(), publishers)
     depth = max(offer.depth for offer in publishers) if all(offer.depth for offer in publishers) else 0
     return {"reliability": str(qos.reliability), "durability": str(qos.durability), "depth": str(depth)}
@@ -207,7 +208,7 @@ def _names(text: str) -> list[str]:
 
 
 def _write(text: str, left_out: Mapping[str, str], out: Path | None) -> None:
-    """A registry to its file or to the terminal; what is not in it is said beside."""
+    """Write a registry to its file or to the terminal. Topics that are left out are reported on stderr."""
     for topic, why in left_out.items():
         click.echo(f"gr-ros2: {topic} is left out: {why}", err=True)
     if out is None:

@@ -1,4 +1,4 @@
-"""`gr-ros2 replay`: a recording through a link into a recording."""
+"""`gr-ros2 replay`: send a recording through a link, and record what arrives."""
 
 from __future__ import annotations
 

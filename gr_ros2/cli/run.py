@@ -78,7 +78,7 @@ def _run(
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
-    # Unthrottled, the flowgraph runs as fast as it can, so nothing is built in that nobody asked for.
+    # An unthrottled flowgraph runs as fast as it can, so it gets instruments only if a dashboard is requested.
     looked_at = audience(dashboard, console, scenario.name, instruments=scenario.time != "unthrottled")
     with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
         seen: list[RunObserver] = [run_observers, *captures]
@@ -96,7 +96,7 @@ def _run(
 
 
 def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
-    """Something that shows how far a run is."""
+    """A function that shows the progress of a run."""
     how_long = f"{scenario.duration_s:g} s" if scenario.duration_s else "its recording"
     if scenario.simulated:
         bar.console.print(f"{title}: {how_long} of simulated time, as fast as it can be computed", soft_wrap=True)
@@ -121,7 +121,7 @@ def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Pat
     _print(console, scenario, outcome)
     kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
     if outcome.result.interrupted:
-        # Who pressed Ctrl-C wants the prompt back, not a second of drawing.
+        # After Ctrl-C the prompt returns at once, without a second of drawing.
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
         return
     written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gr_ros2.study.sweep.run import SweepProgress
 
 _ESTIMATE_S = 3600.0
-"""Runs of the last so many seconds tell the time left: a single one may take minutes."""
+"""The time left is estimated from the runs of this period, s. A single run may take minutes."""
 
 
 @click.command()
@@ -71,7 +71,7 @@ def sweep(
         outcome = run_sweep(plan, out, scheduler=scheduler, workers=workers, fresh=fresh, on_progress=advance)
     wanted = sum(len(cell.runs) for cell in plan.cells)
     if outcome.interrupted:
-        # Who pressed Ctrl-C wants the prompt back, not seconds of drawing.
+        # After Ctrl-C the prompt returns at once, without seconds of drawing.
         console.print(
             f"stopped with {len(outcome.results)} of {wanted} runs kept in {out}; the same command goes on from there",
             soft_wrap=True,

@@ -1,4 +1,4 @@
-"""The path picture in the terminal, for those who do not open the file."""
+"""The picture of the paths in the terminal, for users who do not open the file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def path_text(sent: npt.ArrayLike, received: npt.ArrayLike, title: str) -> str:
     """Transmitted path in blue, received in red over it, axes in metres, with terminal colours.
 
     :param sent: positions (x, y), m, shape (n, 2)
-    :param received: likewise, in the order of reception
+    :param received: the same, in the order of reception
     """
     plotext.clear_figure()
     plotext.plot_size(WIDTH, HEIGHT)

@@ -1,4 +1,4 @@
-"""`gr-ros2 wireshark`: where the dissector lies, and how to give it to Wireshark."""
+"""`gr-ros2 wireshark`: print the path of the dissector, or install it for Wireshark."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DISSECTOR = Path(__file__).resolve().parent.parent / "wireshark" / "gr_ros2.lua"
 
 
 def plugin_folder() -> Path:
-    """Where Wireshark and tshark look for a user's own Lua plugins, in 2.6 and later."""
+    """Folder in which Wireshark and tshark 2.6 and later look for a user's own Lua plugins."""
     return Path(os.environ.get("HOME") or Path.home()) / ".local" / "lib" / "wireshark" / "plugins"
 
 

@@ -1,4 +1,4 @@
-"""The live dashboard: what a running link does, on a web page served by the program that runs it.
+"""The live dashboard: a web page that shows a running link. The program that runs the link serves the page.
 
-``state`` turns events into numbers (sans-IO), ``page`` draws them with Bokeh, ``server`` ties both to a run.
+``state`` turns events into numbers (sans-IO), ``live_page`` draws them with Bokeh, ``server`` connects both to a run.
 """

@@ -1,9 +1,9 @@
 """Admission of viewers: the limits of the dashboard's web server, and the page for viewers beyond the limit.
 
-Invariants: at most MAX_VIEWERS pages at a time, and one more is told so by a page that tries again; pages are made and
-drawn for the first time one after another, which in the long run takes at most a quarter of a core; connections are
-bounded, and those that say nothing are closed; whatever comes in on a WebSocket, the worst that follows is that it is
-closed; a WebSocket belongs to a page that was served here.
+Invariants: at most MAX_VIEWERS pages are open at a time. A further viewer gets a page that says so and tries again.
+Pages are made and drawn for the first time one after another; on average this takes at most a quarter of a core. The
+number of connections is bounded, and silent connections are closed. Whatever arrives on a WebSocket, the worst result
+is that this WebSocket is closed. A WebSocket belongs to a page that this server has served.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from tornado.iostream import IOStream
 from tornado.web import ErrorHandler
 
 MAX_VIEWERS = 8
-"""Pages at a time. Each takes about 2 % of a core and 2 MB."""
+"""Most pages at a time. Each takes about 2 % of a core and 2 MB."""
 _RETRY_S = 10
-"""s after which the page that says that there is no room tries again."""
+"""s after which the page for a refused viewer tries again."""
 SHARE, BURST_S = 0.25, 4.0
-"""Of a core, for making pages and drawing them for the first time; and s whose share may be used at once."""
+"""Share of a core for making pages and drawing them for the first time; and the s whose share may be used at once."""
 _MAX_SOCKETS = 2 * MAX_VIEWERS
-"""WebSockets at a time; a page that is reloaded has two for a moment."""
+"""Most WebSockets at a time. A page that is reloaded has two for a moment."""
 _MAX_CONNECTIONS = 256
-"""Connections that are no WebSocket, at a time; a browser opens up to six."""
+"""Most connections at a time that are not a WebSocket. A browser opens up to six."""
 _SILENT_S = 15
-"""s a connection may take for a request, or for an answer to a ping."""
+"""s that a connection may take for a request, or for an answer to a ping."""
 _MAX_BODY, _MAX_HEADER = 1 << 12, 1 << 14
 _MAX_FRAME = 65_536
-"""Bytes of a WebSocket message; a viewer sends positions of sliders."""
+"""Most bytes of a WebSocket message. A viewer sends positions of sliders."""
 _TRY_AGAIN_LATER, _NOT_UNDERSTOOD = 1013, 1002
-"""Status codes of a WebSocket that is closed (RFC 6455, section 7.4, and IANA's registry)."""
+"""Status codes with which a WebSocket is closed (RFC 6455, section 7.4, and IANA's registry)."""
 _UNDERSTOOD = ("PULL-DOC-REQ", "PATCH-DOC")
 _CHANGES = ("ModelChanged", "MessageSent")
 _log = logging.getLogger(__name__)
@@ -56,13 +56,13 @@ SETTINGS: dict[str, Any] = {
     "sign_sessions": True,
     "include_headers": [],
     "include_cookies": [],  # other programs' cookies on this host would make the token too long for a header
-    "keep_alive_milliseconds": 0,  # its pings expect no answer; these do:
+    "keep_alive_milliseconds": 0,  # Bokeh's pings expect no answer; these do:
     "websocket_ping_interval": _SILENT_S,
     "websocket_ping_timeout": _SILENT_S,
     "websocket_max_message_size_bytes": _MAX_FRAME,
     "log_function": lambda _handler: None,
 }
-"""Of the Bokeh application."""
+"""Settings of the Bokeh application."""
 
 
 class Admission:
@@ -81,7 +81,7 @@ class Admission:
         return len(self.documents) + self.waiting >= MAX_VIEWERS
 
     def enter(self, document: Document) -> bool:
-        """Whether there was room. Its place is free again when the session ends."""
+        """Admit a page if there is room. Return whether there was. Its place is free again when the session ends."""
         if len(self.documents) >= MAX_VIEWERS:
             return False
         self.documents.add(document)
@@ -90,7 +90,7 @@ class Admission:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """Run long work: one piece after another, and not more than the budget allows."""
+        """Run long work, one piece after another, within the budget."""
         async with self._busy:
             await asyncio.sleep(self.budget.wait_s(time.monotonic()))
             begin = time.thread_time()
@@ -116,20 +116,20 @@ class ProcessorBudget:
 
 
 def keep(pages: BokehTornado, admission: Admission) -> None:
-    """Put these bounds in front of an application."""
+    """Apply these limits to an application."""
     inside = {"application_context": pages.applications["/"], "bokeh_websocket_path": "/ws"}
     pages.add_handlers(
         ".*",
         [
             (r"/?", PageHandler, {**inside, "admission": admission}),
             (r"/ws", PageSocket, {**inside, "admission": admission}),
-            (r"/(?:metadata|autoload\.js)", ErrorHandler, {"status_code": 404}),  # they would make pages too
+            (r"/(?:metadata|autoload\.js)", ErrorHandler, {"status_code": 404}),  # they would create pages too
         ],
     )
 
 
 class BoundedServer(HTTPServer):  # type: ignore[misc]
-    """An HTTP server with bounds on connections, on what they send and on how long they take."""
+    """An HTTP server that limits the number of connections, the size of their data, and their duration."""
 
     def initialize(self, *arguments: Any, **options: Any) -> None:
         self._here = 0
@@ -149,7 +149,7 @@ class BoundedServer(HTTPServer):  # type: ignore[misc]
 
 
 class PageHandler(DocHandler):  # type: ignore[misc]
-    """The page, or the page that says that there is no room."""
+    """Serves the page, or the page that says that there is no room."""
 
     def initialize(
         self, application_context: ApplicationContext, bokeh_websocket_path: str, admission: Admission
@@ -162,7 +162,7 @@ class PageHandler(DocHandler):  # type: ignore[misc]
         if admission.full:
             self._refuse()
             return
-        # Whoever asks gets a page of its own: sessions are not chosen by those who come.
+        # Every request gets a new page: a client cannot choose a session.
         self.request.arguments.clear()
         self.request.headers.pop("Bokeh-Session-Id", None)
         admission.waiting += 1
@@ -200,7 +200,7 @@ class PageSocket(WSHandler):  # type: ignore[misc]
         self._admission.sockets.add(self)
         try:
             super().open()
-        except Exception:  # noqa: BLE001 - a token that is none, or none of ours, fails in many ways
+        except Exception:  # noqa: BLE001 - an invalid token, or one of another server, fails in many ways
             self.close(_NOT_UNDERSTOOD)
 
     async def _async_open(self, token: str) -> None:
@@ -208,11 +208,11 @@ class PageSocket(WSHandler):  # type: ignore[misc]
             await super()._async_open(token)
         except Exception:  # noqa: BLE001 - as above
             self.close(_NOT_UNDERSTOOD)
-        if not self._open:  # it left meanwhile, and nobody would tell its session
+        if not self._open:  # the viewer left meanwhile, and nothing else would tell its session
             self._leave()
 
     async def on_message(self, fragment: str | bytes) -> None:
-        """Take a part of a message; what is no message of a viewer's page closes the connection."""
+        """Take a part of a message. A message that a viewer's page does not send closes the connection."""
         if self.connection is None:
             self.close(_NOT_UNDERSTOOD)
             return
@@ -228,12 +228,12 @@ class PageSocket(WSHandler):  # type: ignore[misc]
             else:
                 answer = await ServerSession.patch(message, self.connection)
             await self.send_message(answer)
-        except Exception as error:  # noqa: BLE001 - parsers fail in many ways on what is not meant for them
+        except Exception as error:  # noqa: BLE001 - parsers fail in many ways on invalid data
             _log.info("a viewer's connection is closed, since it sent what is not understood: %r", error)
             self.close(_NOT_UNDERSTOOD)
 
     def on_pong(self, data: bytes) -> None:
-        """It is still there; that is all that is asked."""
+        """Do nothing: the answer shows that the viewer is still there."""
 
     def on_close(self) -> None:
         self._open = False
@@ -241,14 +241,14 @@ class PageSocket(WSHandler):  # type: ignore[misc]
         self._leave()
 
     def _leave(self) -> None:
-        """Give the session back. Once: a connection that has none cannot be asked for it."""
+        """Give the session back, only once. A connection without a session cannot give one back."""
         if self.connection is not None:
             super().on_close()
             self.connection = None
 
 
 def _is_viewers(message: Any) -> bool:
-    """Whether a message is one that the page of a viewer sends: it changes models, and neither adds nor removes any."""
+    """Whether a viewer's page sends such a message. The page may change models, but not add or remove them."""
     if message.msgtype not in _UNDERSTOOD:
         return False
     events = message.content.get("events", []) if message.msgtype == "PATCH-DOC" else []

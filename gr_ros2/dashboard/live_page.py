@@ -1,7 +1,8 @@
-"""The page one viewer sees: Bokeh models, made once and given new data with every snapshot.
+"""The page of one viewer: Bokeh models that are made once and get new data with every snapshot.
 
-Invariants: it only draws, and hands the viewer's settings to the monitor; data is replaced and never appended, so a
-page is as large after an hour as after a minute; a viewer who cannot keep up gets fewer pictures, not a queue of them.
+Invariants: the page only draws, and passes the viewer's settings to the monitor. Data is replaced and never appended,
+so a page is as large after an hour as after a minute. A viewer who cannot keep up gets fewer pictures, not a queue of
+them.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_htm
 from gr_ros2.dashboard.views import Snapshot
 
 AHEAD = 3
-"""Pictures a viewer may be behind before it is left out."""
+"""When a viewer is this number of pictures behind, it gets no new one."""
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SENT, _RECEIVED = "#1f5fbf", "#d62728"
@@ -55,7 +56,7 @@ class PictureCounter(DataModel):  # type: ignore[misc]
 class LivePage:
     """The models of one document.
 
-    :param instance: names the server, so that the browser notices when another one answers
+    :param instance: identifies the server, so that the browser notices when another server answers
     """
 
     def __init__(self, document: Document, monitor: RunMonitor, instance: str) -> None:
@@ -107,12 +108,12 @@ class LivePage:
         self.draw(self._monitor.snapshot, self._monitor.radio)
 
     def offer(self, snapshot: Snapshot, radio: RadioView, always: bool = False) -> None:
-        """Draw it when the document is free; not at all before there is a viewer, or where it is too far behind."""
+        """Draw it when the document is free. Skip it while there is no viewer, or when the viewer is too far behind."""
         if self._ready and (always or self.behind < AHEAD):
             self.document.add_next_tick_callback(partial(self.draw, snapshot, radio))
 
     def draw(self, snapshot: Snapshot, radio: RadioView) -> None:
-        """Show this. With the document's lock held."""
+        """Show a snapshot. The caller holds the lock of the document."""
         self._html["tiles"].text = tiles_html(snapshot, radio.backlog, radio.snr_db)
         self._html["topics"].text = topics_html(snapshot)
         self._html["paths"].text = paths_html(snapshot)
@@ -186,7 +187,7 @@ class LivePage:
     # -- the channel --------------------------------------------------------------------------------------------
 
     def _listen(self) -> None:
-        """Hand on what the viewer sets."""
+        """Pass the viewer's settings to the monitor."""
         monitor = self._monitor
 
         def listen(widget: Any, attribute: str, change: Callable[[float], None]) -> None:
@@ -203,7 +204,7 @@ class LivePage:
         listen(self._loss, "value", lambda value: monitor.set_packet_loss(value / 100))
 
     def _show_channel(self, radio: RadioView) -> None:
-        """Follow what others set, and leave the widgets to whoever drags them."""
+        """Show the settings of other viewers. A widget that this viewer is dragging stays as it is."""
         channel = self._monitor.channel
         if channel is not None and channel != self._shown:
             self._shown = channel
@@ -245,7 +246,7 @@ class LivePage:
         series: tuple[tuple[str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", {"y_range": Range1d(0, 1.1)}),
             ("goodput", "goodput", {}),
-            ("age", "age", {"y_axis_type": "log"}),  # a map sent once is older than all else by magnitudes
+            ("age", "age", {"y_axis_type": "log"}),  # a map that is sent once is much older than all else
             ("queue", "queued", {}),
         )
         for name, values, options in series:
@@ -263,7 +264,7 @@ class LivePage:
         document = self.document
         document.title = "gr-ros2 · live"
         texts = [self._html[name] for name in ("tiles", "topics", "paths", "packets")]
-        with document.models.freeze():  # otherwise every root makes it walk through all models again
+        with document.models.freeze():  # otherwise the document walks through all models for every root
             for root in (*plots, channel, *texts):
                 document.add_root(root)
         document.template = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=False).get_template(
@@ -274,8 +275,8 @@ class LivePage:
 
 
 def _small(values: Any) -> Any:
-    """As single-precision floats, which is more than a screen shows. Nothing is a NaN, which draws nothing: Bokeh
-    compares what is new with what was, and numpy has no truth for an empty array."""
+    """The values as single-precision floats, which is more precise than a screen. No values become one NaN, which draws
+    nothing: Bokeh compares new data with old data, and the truth value of an empty numpy array is not defined."""
     return np.asarray(values if len(values) else [np.nan], dtype=np.float32)
 
 

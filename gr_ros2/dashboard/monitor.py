@@ -1,7 +1,7 @@
-"""What all viewers of a dashboard share: the run being watched, its newest snapshot, and the settings of its channel.
+"""What all viewers of a dashboard share: the observed run, its newest snapshot, and the settings of its channel.
 
-Invariants: there is one state per run, whoever looks; what a viewer sets acts on the running flowgraph at once and is
-seen by all; a setting that the link refuses leaves it as it was and says why.
+Invariants: there is one state per run for all viewers. A setting of a viewer acts on the running flowgraph at once, and
+all viewers see it. A setting that the link refuses changes nothing, and the reason is shown.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ TICK_S = 0.5
 class RadioView:
     """The radio side of a link at one moment.
 
-    :param channel: as it was set then, None without a run
-    :param has_samples: whether there is anything between the antennas to set
+    :param channel: settings of the channel at that moment, None without a run
+    :param has_samples: whether the PHY has samples, so that noise and frequency offset can be set
     :param backlog: packets between source and antenna
-    :param snr_db: of the newest packets received, dB over the sampled band; None where the PHY does not tell
-    :param frequencies: Hz, of each power in ``spectrum_db``; None where there is no signal
-    :param symbols: equalised payload symbols, None where the PHY shows none
+    :param snr_db: SNR of the newest packets received, dB over the sampled band; None if the PHY does not measure it
+    :param frequencies: frequency of each power in ``spectrum_db``, Hz; None if there is no signal
+    :param symbols: equalised payload symbols, None if the PHY gives none
     """
 
     channel: ChannelConfig | None = None
@@ -67,7 +67,7 @@ class RunMonitor:
     # -- the run's side -----------------------------------------------------------------------------------------
 
     def run_started(self, run: LiveRun) -> None:
-        sampled = [link.phy for link in run.links if link.phy.has_samples]  # on simulated time there is no link
+        sampled = [link.phy for link in run.links if link.phy.has_samples]  # a run in simulated time has no link
         self._spectrum = Spectrum(sampled[0].sample_rate) if sampled else None
         self._state = DashboardState(
             run.registry,
@@ -87,7 +87,7 @@ class RunMonitor:
             self._state.finish(result, failed=result is None and whole)
             self.tick()
         with self._ticking:
-            self._run = None  # its flowgraph may go
+            self._run = None  # its flowgraph may be freed
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         if self._state is not None:
@@ -100,14 +100,14 @@ class RunMonitor:
     # -- the viewers' side --------------------------------------------------------------------------------------
 
     def look(self) -> None:
-        """Take one look at the received signal."""
+        """Add the newest samples of the received signal to the spectrum."""
         run, spectrum = self._run, self._spectrum
         samples = None if run is None or spectrum is None else run.links[0].samples()
         if spectrum is not None and samples is not None:
             spectrum.add(samples)
 
     def tick(self) -> Snapshot:
-        """Make the next snapshot; without a run the last one stands."""
+        """Make the next snapshot. Without a run, the last snapshot stays."""
         with self._ticking:
             if self._run is not None and self._state is not None:
                 self._tick(self._run, self._state)
@@ -136,20 +136,20 @@ class RunMonitor:
 
     @property
     def channel(self) -> ChannelConfig | None:
-        """The channel as it is set at this very moment; after the run as it was last, None before the first."""
+        """The current settings of the channel. After a run, its last settings; None before the first run."""
         run = self._run
         return self.radio.channel if run is None or not run.links else run.links[0].channel
 
     def set_snr_db(self, snr_db: float | None) -> None:
-        """Noise on every link; dB, None = none."""
+        """Set the SNR of every link, dB; None = no noise."""
         self._change(lambda link: link.set_snr_db(snr_db))
 
     def set_frequency_offset(self, offset: float) -> None:
-        """Carrier frequency offset on every link, fraction of the sample rate."""
+        """Set the carrier frequency offset of every link, as a fraction of the sample rate."""
         self._change(lambda link: link.set_frequency_offset(offset))
 
     def set_packet_loss(self, probability: float) -> None:
-        """Loss of whole packets on every link, 0..1."""
+        """Set the loss probability of whole packets on every link, 0..1."""
         self._change(lambda link: link.set_packet_loss(probability))
 
     def _change(self, change: Callable[[LiveLink], None]) -> None:

@@ -1,6 +1,6 @@
-"""Received packets, field by field, for people.
+"""Views of received packets, field by field.
 
-Invariant: whatever the bytes, there is a view of them; what is no packet says why.
+Invariant: there is a view of any bytes. The view of bytes that are not a packet gives the reason.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from gr_ros2.registry import Registry
 from gr_ros2.wire import QOS_NAMES, Span, format_of
 
 NO_COLOUR = -1
-"""Of a topic that is not ours."""
+"""Place in the palette of an unknown topic."""
 
 
 def packet_views(
@@ -23,11 +23,11 @@ def packet_views(
     colours: Mapping[tuple[int, int], int],
     start: float,
 ) -> tuple[PacketView, ...]:
-    """Packets as they came, each with how many of its source went missing since the one before.
+    """Packets in order of arrival, each with the number of packets of its source that are missing before it.
 
-    :param events: time, s, and the packet
+    :param events: time of arrival, s, and the packet
     :param colours: place in the palette by source id and topic id
-    :param start: s on the same clock, when the run began
+    :param start: start of the run, s on the same clock
     """
     views, last_seq = [], dict[int, int]()
     for t, event in events:

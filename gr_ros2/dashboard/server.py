@@ -1,8 +1,8 @@
-"""The dashboard's web server: one thread of its own beside a run, any number of viewers.
+"""The dashboard's web server: its own thread beside a run, for several viewers.
 
-Invariants: without a viewer it does little more than count, and with as many as are let in (``admission``) it leaves
-the link most of a core; on a loopback address unless told otherwise, and only pages it served itself may talk to it;
-closing it shows every viewer the last picture first and leaves no thread.
+Invariants: without a viewer, the server does little more than count. With the most viewers that ``admission`` allows,
+it leaves most of a core to the link. By default it serves on a loopback address, and only its own pages may connect to
+it. Before it closes, it shows every viewer the last picture. It leaves no thread.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from gr_ros2.record.result import Result
 
 _LOOK_S = 0.1
 _LAST_PICTURE_S = 2.0
-"""s a viewer gets to draw the last picture before the server goes."""
+"""s that a viewer has to draw the last picture before the server ends."""
 _POLL_S = 0.02
 _UNUSED_MS = 5000
-"""ms a page that was closed is kept, in case its viewer comes back."""
+"""ms that a closed page is kept, in case its viewer comes back."""
 _ANY = ("0.0.0.0", "::")
 
 
 class Dashboard(RunMonitor):
     """A monitor with a web page.
 
-    :param address: to serve on; 0.0.0.0 for every interface
+    :param address: address to serve on; 0.0.0.0 for every interface
     :param port: 1..65535, 0 = any free one
     """
 
@@ -60,18 +60,18 @@ class Dashboard(RunMonitor):
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds the page."""
+        """Address of the page for a browser on this machine."""
         return f"http://{_in_url('127.0.0.1' if self.address in _ANY else self.address)}:{self.port}/"
 
     @property
     def viewers(self) -> int:
-        """Pages open now."""
+        """Number of open pages."""
         return len(self._pages)
 
     def start(self) -> None:
-        """Serve.
+        """Start to serve.
 
-        :raises ConfigError: when address and port cannot be had
+        :raises ConfigError: when it cannot serve at this address and port
         """
         if not 0 <= self.port <= 65535:  # a socket would take it modulo 65536
             raise ConfigError(f"dashboard = {self.address}:{self.port}: a port is 0 to 65535")
@@ -80,7 +80,7 @@ class Dashboard(RunMonitor):
         self._thread.start()
         try:
             started.result()
-        except (OSError, ValueError) as error:  # a name that is none is no OSError
+        except (OSError, ValueError) as error:  # an invalid host name raises no OSError
             self._thread.join()
             reason = getattr(error, "strerror", None) or " ".join(str(error).split())
             raise ConfigError(
@@ -143,19 +143,19 @@ class Dashboard(RunMonitor):
         return BaseServer(loop, pages, http)
 
     def _origins(self) -> list[str]:
-        """Hosts by which the page may be opened."""
+        """Host names, with the port, under which the page may be opened."""
         hosts = {self.address, "localhost"} if self.address in ("127.0.0.1", "::1") else {self.address}
         if self.address in _ANY:
             name = socket.gethostname()
             hosts = {"localhost", "127.0.0.1", name, socket.getfqdn()}
-            with suppress(OSError):  # a host that nobody resolves, itself neither
+            with suppress(OSError):  # the host cannot resolve its own name
                 hosts.update(socket.gethostbyname_ex(name)[2])
         return [f"{_in_url(host)}:{self.port}" for host in sorted(hosts)]
 
     def _open(self, document: Document) -> None:
-        """A viewer comes."""
+        """Make the page of a new viewer."""
         if not self._admission.enter(document):
-            return  # a WebSocket came without asking for its page, and there is no room
+            return  # a WebSocket came without a request for its page, and there is no room
         page = LivePage(document, self, self._instance)
         self._pages.add(page)
         document.on_session_destroyed(lambda _context: self._pages.discard(page))

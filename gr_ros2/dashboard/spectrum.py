@@ -1,6 +1,6 @@
-"""The received signal as a spectrum, steady enough to be looked at.
+"""The spectrum of the received signal, averaged so that the picture is steady.
 
-Invariant: powers are relative to the strongest bin seen lately, in dB; nothing is kept but one average.
+Invariant: powers are relative to the strongest bin of the average, in dB. Only one running average is kept.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from gr_ros2.dashboard.windows import Floats
 
 BINS = 256
 _SMOOTHING = 0.25
-"""Weight of a new look in the running average."""
+"""Weight of new samples in the running average."""
 _FLOOR = 1e-12
 
 
@@ -29,7 +29,7 @@ class Spectrum:
         self._power: Floats | None = None
 
     def add(self, samples: npt.NDArray[np.complex64]) -> None:
-        """Take a look: at least ``BINS`` consecutive samples; fewer are passed over, and so is the rest of a bin."""
+        """Add consecutive samples, in blocks of ``BINS``. An incomplete block is ignored."""
         blocks = samples[: len(samples) // BINS * BINS].reshape(-1, BINS)
         if not len(blocks):
             return
@@ -37,7 +37,7 @@ class Spectrum:
         self._power = power if self._power is None else self._power + _SMOOTHING * (power - self._power)
 
     def decibels(self) -> Floats | None:
-        """Power of each bin, dB below the strongest; None before the first look."""
+        """Power of each bin relative to the strongest one, dB; None before the first samples."""
         if self._power is None:
             return None
         decibels: Floats = 10 * np.log10(np.maximum(self._power / max(self._power.max(), _FLOOR), _FLOOR))

@@ -1,8 +1,8 @@
-"""What a dashboard knows of one link: fed by the events of both ends, asked for a snapshot now and then. Sans-IO.
+"""The state of one link for a dashboard. It takes the events of both ends and gives snapshots. Sans-IO.
 
-Invariants: memory is bounded by what the windows hold, however long the link runs; times are arguments, s on the clock
-of the events; it may be fed and asked from any thread, and holds none up for longer than one message takes to read.
-Counts are exact while it runs; once the result is in, every number is the result's.
+Invariants: the size of the windows bounds the memory, however long the link runs. Times are arguments, s on the clock
+of the events. Any thread may call it, and no call delays another thread for longer than it takes to read one message.
+Counts are exact during the run. When the result is known, every number comes from the result.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ Key = tuple[int, int]
 """Source id and topic id."""
 
 HISTORY_S = 180.0
-"""How far back curves and paths go, s."""
+"""Length of the shown curves and paths, s."""
 RATE_S = 5.0
-"""The window of everything called "now", s."""
+"""The window of all numbers called "now", s."""
 LATENCIES = 2000
-"""Deliveries of a topic that its latency is taken from."""
+"""Newest deliveries of a topic from which its latency is computed."""
 UNDER_WAY = 4096
-"""Messages of a source whose delivery is waited for; the oldest is forgotten first and then has no latency."""
+"""Most messages of a source that wait for their delivery. The oldest is forgotten first and then has no latency."""
 PACKETS_SHOWN = 12
 
 _PATH_STEP_S = 0.1
@@ -70,7 +70,7 @@ class _Topic:
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
 
     def rows(self) -> dict[str, int]:
-        """What the events alone say: who sees both ends asks the ledger instead."""
+        """The ledger rows as far as the events alone show them. An observer of both ends uses the ledger instead."""
         whole = {LedgerRow.DELIVERED.value: self.delivered - self.repaired, LedgerRow.REPAIRED.value: self.repaired}
         rows = {row: count for row, count in {**whole, **self.ended}.items() if count}
         rest = self.sent - sum(rows.values())
@@ -83,7 +83,7 @@ class _SourceWindow:
     def __init__(self) -> None:
         self.last_serial = -1
         self.messages: Tracker[Tracked] = Tracker(UNDER_WAY)
-        """On their way, so that a delivery finds its submission."""
+        """Messages on their way, so that a delivery finds its submission."""
 
 
 class DashboardState:
@@ -92,9 +92,9 @@ class DashboardState:
     :param registry: types of the topic ids
     :param topics: names of the topics to show from the start, by source id and topic id
     :param packet_len: bytes of a packet
-    :param name: what the link is called
+    :param name: name of the link
     :param duration_s: s during which messages will be submitted, 0 = unknown
-    :param ledger: where every message stands, from who sees both ends; None shows what the events alone tell
+    :param ledger: gives the messages per ledger row, as an observer of both ends knows them; None uses the events alone
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
     """
 
@@ -131,7 +131,7 @@ class DashboardState:
     # -- feeding ------------------------------------------------------------------------------------------------
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """What the sender with this source id reports."""
+        """Take an event of the sender with this source id."""
         with self._lock:
             source = self._sources.setdefault(src_id, _SourceWindow())
             if isinstance(event, SentPacket):
@@ -149,7 +149,7 @@ class DashboardState:
                 self._refused(source, src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """What the receiver reports."""
+        """Take an event of the receiver."""
         with self._lock:
             if isinstance(event, Delivered):
                 self._delivered(event, now)
@@ -167,7 +167,7 @@ class DashboardState:
                     self._packets["rejected"] += 1
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
-        """It is over; without a result where a run failed, and where there was one end of a link only."""
+        """End the run. There is no result if the run failed, or if only one end of the link was observed."""
         with self._lock:
             self._result = result
             self._phase = "failed" if failed else "ended"
@@ -175,7 +175,7 @@ class DashboardState:
     # -- asking -------------------------------------------------------------------------------------------------
 
     def tick(self, now: float, queued: Mapping[Key, int] | None = None) -> Snapshot:
-        """The link at this moment, which also becomes the newest point of its history until the run is over.
+        """A snapshot of the link now. Until the run is over, it also becomes the newest point of the history.
 
         :param queued: messages waiting at the source, by source and topic id
         """
@@ -242,7 +242,7 @@ class DashboardState:
         final = self._final(key)
         if final is not None:
             return _final_view(place, key, final)
-        # What the ledger knows wins: it has heard every event, also those from before there was a state.
+        # The ledger has priority: it has taken every event, also those from before this state was made.
         rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
         sent, delivered = (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), arrived(rows))
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed

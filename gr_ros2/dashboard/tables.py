@@ -1,7 +1,7 @@
 """Numbers and packets as HTML.
 
-Invariants: every text that comes from outside is escaped; a number that does not apply is a dash; the exact value
-stands beside the rounded one in ``data-value``.
+Invariants: every text that comes from outside is escaped. A number that does not apply is a dash. The attribute
+``data-value`` holds the exact value beside the rounded one.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def colour(place: int) -> str:
 
 
 def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) -> str:
-    """The line on top: where the run is, and the few numbers that sum it up.
+    """The top line: the state of the run and its most important numbers.
 
     :param backlog: packets between source and antenna
-    :param snr_db: of what is received
+    :param snr_db: SNR of the received packets, dB
     """
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
     sent_now, received_now = snapshot.packets_now
@@ -155,7 +155,7 @@ def _topic_row(topic: TopicView, rows: list[str]) -> str:
 
 
 def paths_html(snapshot: Snapshot) -> str:
-    """What the map cannot say: the error as a number, per topic with positions."""
+    """The path error as a number, for each topic with positions. The map cannot show it."""
     final = {topic.name: topic for topic in snapshot.topics}
     lines = []
     for path in snapshot.paths:
@@ -175,7 +175,7 @@ def _metres(value: Number) -> str:
 
 
 def packets_html(snapshot: Snapshot) -> str:
-    """The last packets, newest first, each with its bytes to scale."""
+    """The last packets, newest first, each with its bytes drawn to scale."""
     lines = []
     for packet in reversed(snapshot.last_packets):
         lines.append(_packet(packet))

@@ -1,6 +1,6 @@
-"""What the page draws: values only.
+"""The values that the page draws.
 
-Invariant: a number that does not apply is None, as in ``result.json``; nothing here grows with the length of a run.
+Invariant: a number that does not apply is None, as in ``result.json``. No value here grows with the length of a run.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class TopicView:
     :param pdr: delivered / sent of the whole run
     :param pdr_now: deliveries per submission in the last seconds; above 1 while a backlog arrives
     :param goodput_Bps: delivered bytes / duration of the whole run, B/s
-    :param goodput_now_Bps: of the last seconds
-    :param latency_s: of the last deliveries, of all of them once the run is over
-    :param latency_cdf_s: likewise, at 0 %, 1 %, … 100 %
+    :param goodput_now_Bps: the same for the last seconds, B/s
+    :param latency_s: latency of the last deliveries; of all deliveries when the run is over
+    :param latency_cdf_s: quantiles of the same latencies, at 0 %, 1 %, … 100 %
     :param age_now_s: s since the newest delivered message was submitted
     :param queued: messages waiting at the source
     :param ledger: row -> messages; the rows add up to ``sent``
@@ -82,11 +82,11 @@ class SeriesView:
 
 @dataclass(frozen=True)
 class SpanView:
-    """A stretch of a packet's bytes.
+    """A part of a packet's bytes.
 
     :param kind: head, ids, entry, pad or crc
     :param size: bytes
-    :param text: what stands there; '' where that says nothing
+    :param text: description of the bytes; '' if there is none
     :param colour: place of an entry's topic in the palette
     """
 
@@ -101,10 +101,10 @@ class PacketView:
     """One packet as the sink got it.
 
     :param t: s since the start
-    :param refused: why it is no packet of ours, '' where it is
-    :param entries: how many
-    :param spans: in the order of its bytes
-    :param missing: packets of this source that should have come between the one shown before and this one
+    :param refused: why it is not a valid packet, '' if it is valid
+    :param entries: number of entries
+    :param spans: the parts of the packet, in the order of its bytes
+    :param missing: packets of this source that are missing between the one shown before and this one
     """
 
     t: float

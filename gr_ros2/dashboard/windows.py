@@ -1,7 +1,7 @@
-"""Bounded memories of what goes on: rates, ages, paths.
+"""Rates, ages and paths in bounded memory.
 
-Invariants: each holds a fixed number of items however long it is fed; times are seconds on one clock, given by the
-caller, and never run backwards within one object.
+Invariants: each object holds a bounded number of items, for any length of its input. Times are seconds on one clock,
+given by the caller, and never run backwards within one object.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ Point = tuple[float, float]
 
 
 class Rate:
-    """Count and bytes of what happened in the last ``window_s`` seconds.
+    """Number and bytes of the events in the last ``window_s`` seconds.
 
-    :param window_s: s
-    :param slots: how finely the window moves; memory is one item per slot
+    :param window_s: length of the window, s
+    :param slots: number of slots in a window; the window moves by one slot at a time; memory is one item per slot
     """
 
     def __init__(self, window_s: float, slots: int = 20) -> None:
@@ -28,7 +28,7 @@ class Rate:
         self._slots: deque[tuple[int, int, int]] = deque(maxlen=slots + 1)
 
     def add(self, now: float, size: int = 0) -> None:
-        """One thing of this many bytes happened."""
+        """Add one event of ``size`` bytes."""
         slot = int(now / self._slot_s)
         if self._slots and self._slots[-1][0] >= slot:
             last, count, total = self._slots.pop()
@@ -44,7 +44,7 @@ class Rate:
 
 
 class AgeMeter:
-    """Age of information of one topic, exactly as :func:`gr_ros2.record.metrics.age` has it, kept as a sum."""
+    """Age of information of one topic, exactly as :func:`gr_ros2.record.metrics.age` computes it, kept as a sum."""
 
     def __init__(self) -> None:
         self._start: float | None = None
@@ -74,10 +74,10 @@ class AgeMeter:
 
 
 class PathWindow:
-    """The last stretch of a path, thinned in time, and where it ends exactly.
+    """The newest part of a path: points at a limited rate, and the exact end.
 
     :param points: most points kept
-    :param apart_s: s between two kept points, at least
+    :param apart_s: shortest time between two kept points, s
     """
 
     def __init__(self, points: int, apart_s: float) -> None:
@@ -86,25 +86,25 @@ class PathWindow:
         self.latest: Point | None = None
 
     def add(self, now: float, point: Point) -> None:
-        """The path goes on to this point."""
+        """Add a point to the path."""
         self.latest = point
         if not self._points or now - self._points[-1][0] >= self._apart_s:
             self._points.append((now, *point))
 
     def xy(self) -> tuple[Floats, Floats]:
-        """x and y, up to the very end."""
+        """x and y of the kept points and of the exact end."""
         ends = [] if self.latest is None else [self.latest]
         points = np.array([*((x, y) for _, x, y in self._points), *ends], dtype=float).reshape(-1, 2)
         return points[:, 0], points[:, 1]
 
 
 class PathComparison:
-    """One robot's true path beside the path another one knows of, and how far apart they are at each moment.
+    """The path that one robot sent, the path that another robot received, and the error between them over time.
 
-    The error at an instant is the distance from where the robot last said it was to where the other believes it is.
+    The error at an instant is the distance between the position sent last and the position received last.
 
-    :param points: most points of each memory
-    :param apart_s: s between two points, at least
+    :param points: most points of each path, and of the errors
+    :param apart_s: shortest time between two points, s
     """
 
     def __init__(self, points: int, apart_s: float) -> None:
@@ -114,16 +114,16 @@ class PathComparison:
         self._apart_s = apart_s
 
     def moved(self, now: float, point: Point) -> None:
-        """The robot said where it is."""
+        """The robot sent its position."""
         self.sent.add(now, point)
         self._compare(now)
 
     def heard(self, now: float, point: Point) -> None:
-        """The other robot was told."""
+        """The other robot received a position."""
         self.received.add(now, point)
 
     def error(self) -> float | None:
-        """m, now; None before both are known."""
+        """The error now, m; None before both positions are known."""
         one, other = self.sent.latest, self.received.latest
         return None if one is None or other is None else hypot(one[0] - other[0], one[1] - other[1])
 

@@ -1,1 +1,1 @@
-"""What a machine has and lacks for a link: one small function per question, asked in the order of a table."""
+"""Checks what a machine has and lacks for a link. Each check is one small function; a table gives their order."""

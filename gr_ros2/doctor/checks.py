@@ -1,4 +1,4 @@
-"""The table of checks, in the order in which they are told."""
+"""The table of checks, in the order in which they are reported."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CHECKS: tuple[Check, ...] = (
 
 
 def examine() -> Iterator[tuple[str, Finding]]:
-    """Heading and finding, one after another, as they are made."""
+    """Run the checks. Yield each finding with its heading as soon as it is made."""
     for check in CHECKS:
         for finding in check.findings():
             yield check.group, finding

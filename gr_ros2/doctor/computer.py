@@ -1,6 +1,6 @@
-"""The computer: its clock, and the limits that a link in real time meets.
+"""Checks of the computer: its clock, and the limits that matter for a link in real time.
 
-Invariant: read only; every limit is named with the value found and the value that is enough.
+Invariant: nothing is changed. Every limit is reported with the value found and the value that is enough.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from pathlib import Path
 from gr_ros2.doctor.finding import Finding
 
 _BUILT = datetime(2025, 1, 1, tzinfo=timezone.utc)
-"""This program is newer: a clock that shows an earlier date is wrong."""
+"""This program was made later, so a clock that shows an earlier date is wrong."""
 _FAR = datetime(2100, 1, 1, tzinfo=timezone.utc)
 _TIME_ERROR, _UNSYNCHRONISED = 5, 0x0040
-"""``adjtimex`` (Linux, adjtimex(2)): its result and its status bit where nobody disciplines the clock."""
+"""Result and status bit of ``adjtimex`` (Linux, adjtimex(2)) when the clock is not synchronised."""
 _MEASURED_S = 0.5
 _STEP_S = 0.005
-"""s by which the two clocks may part meanwhile: 1 %, a hundred times what any oscillator does."""
+"""s by which the two clocks may differ after ``_MEASURED_S``: 1 %, a hundred times the error of any oscillator."""
 _ENOUGH_RTPRIO, _ENOUGH_MEMLOCK, _ENOUGH_FILES = 1, 64 << 20, 1024
 _ENOUGH_BUFFER = 2_500_000
-"""Bytes: UHD and DDS vendors ask for about this much."""
+"""Bytes. UHD and DDS vendors ask for about this size."""
 _SEGMENTS_WARN, _SEGMENTS_LEFT = 0.8, 64
 _LIMITS = "/etc/security/limits.d/gr-ros2.conf"
 
 
 class _Timex(ctypes.Structure):
-    """The first fields of ``struct timex``; the kernel writes behind them too."""
+    """The first fields of ``struct timex``. The kernel also writes the bytes after them."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -46,7 +46,7 @@ class _Timex(ctypes.Structure):
 
 
 def date() -> Finding:
-    """Whether the date can be right."""
+    """Whether the date is plausible."""
     now = datetime.now(timezone.utc)
     text = f"{now:%Y-%m-%d %H:%M:%S} UTC"
     if _BUILT <= now <= _FAR:
@@ -57,7 +57,7 @@ def date() -> Finding:
 
 
 def synchronised() -> Finding:
-    """Whether somebody disciplines the clock: latency is told by the clocks of both robots."""
+    """Whether the clock is synchronised. Latency is measured with the clocks of both robots."""
     timex = _Timex()
     state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     if state < 0:
@@ -71,7 +71,7 @@ def synchronised() -> Finding:
 
 
 def drift() -> Finding:
-    """Whether the wall clock goes as the monotonic one does: one that is being set makes latencies jump."""
+    """Whether the wall clock runs as fast as the monotonic clock. An adjusted wall clock makes latencies jump."""
     begin = time.time(), time.monotonic()
     time.sleep(_MEASURED_S)
     apart = (time.time() - begin[0]) - (time.monotonic() - begin[1])
@@ -82,7 +82,7 @@ def drift() -> Finding:
 
 
 def limits() -> Iterator[Finding]:
-    """What this process may have: priority, locked memory, open files."""
+    """The limits of this process: priority, locked memory, open files."""
     yield _limit("rtprio", resource.RLIMIT_RTPRIO, _ENOUGH_RTPRIO, "95", "GNU Radio cannot have a real-time priority")
     yield _limit("memlock", resource.RLIMIT_MEMLOCK, _ENOUGH_MEMLOCK, "unlimited", "drivers cannot lock their buffers")
     yield _limit("nofile", resource.RLIMIT_NOFILE, _ENOUGH_FILES, "65536", "many flowgraphs or topics do not open")
@@ -98,9 +98,9 @@ def _limit(name: str, number: int, enough: int, proposed: str, effect: str) -> F
 
 
 def shared_memory(proc: Path = Path("/proc")) -> Iterator[Finding]:
-    """Segments left for GNU Radio's buffers, one each, and room in /dev/shm.
+    """Shared memory segments that are left for GNU Radio's buffers. Each buffer takes one segment.
 
-    :param proc: where the kernel tells
+    :param proc: the folder /proc
     """
     most = int((proc / "sys/kernel/shmmni").read_text())
     used = len((proc / "sysvipc/shm").read_text().splitlines()) - 1
@@ -115,9 +115,9 @@ def shared_memory(proc: Path = Path("/proc")) -> Iterator[Finding]:
 
 
 def governor(cpus: Path = Path("/sys/devices/system/cpu")) -> Finding:
-    """Whether the processor runs at full speed when a packet comes.
+    """Whether the processor runs at full speed when a packet arrives.
 
-    :param cpus: where the kernel lists them
+    :param cpus: folder in which the kernel lists the processors
     """
     found = Counter(path.read_text().strip() for path in cpus.glob("cpu[0-9]*/cpufreq/scaling_governor"))
     if not found:
@@ -141,7 +141,7 @@ def load() -> Finding:
 def buffers(net: Path = Path("/proc/sys/net/core")) -> Iterator[Finding]:
     """Socket buffers, for network radios and large DDS messages.
 
-    :param net: where the kernel tells
+    :param net: folder with the kernel's network settings
     """
     for name in ("rmem_max", "wmem_max"):
         value = int((net / name).read_text())
@@ -153,7 +153,7 @@ def buffers(net: Path = Path("/proc/sys/net/core")) -> Iterator[Finding]:
 
 
 def message_ports() -> Finding:
-    """GNU Radio's limit on messages that wait at a port; one that is set drops packets."""
+    """GNU Radio's limit on messages that wait at a port. If a limit is set, packets beyond it are dropped."""
     name = "GR_CONF_DEFAULT_MAX_MESSAGES"
     value = os.environ.get(name, "")
     if value and value != "-1":

@@ -1,6 +1,6 @@
-"""What a check says: how it stands, in a line, and the command that mends it.
+"""The result of a check: a state, a line of text, and the command that repairs the fault.
 
-Invariant: a check that cannot be made is a finding too, and never ends the others.
+Invariant: a check that fails with an error is also a finding, and the other checks continue.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 State = Literal["ok", "note", "warning", "failed"]
-"""``note``: an optional part that is not there, or what nobody needs to mend; ``warning``: a link runs, and worse than
-it could; ``failed``: it does not run, or not rightly."""
+"""``note``: an optional part is missing, or nothing needs a repair; ``warning``: a link runs, but worse than it could;
+``failed``: a link does not run, or not correctly."""
 
 
 @dataclass(frozen=True)
 class Finding:
     """The answer to one question.
 
-    :param what: was looked at, in a word or two
-    :param state: how it stands
+    :param what: what was checked, in one or two words
+    :param state: result of the check
     :param text: one line
-    :param remedy: the command or setting that mends it, '' = nothing to mend
+    :param remedy: the command or setting that repairs the fault, '' = nothing to repair
     """
 
     what: str
@@ -34,9 +34,9 @@ class Finding:
 class Check:
     """One row of the table.
 
-    :param group: heading under which its findings stand
-    :param name: what it looks at; a check that fails by itself is called so
-    :param look: gives its findings
+    :param group: heading of its findings
+    :param name: what it checks; also the name of the finding when the check itself fails
+    :param look: makes the check and returns its findings
     """
 
     group: str
@@ -44,7 +44,7 @@ class Check:
     look: Callable[[], Finding | Iterable[Finding]]
 
     def findings(self) -> list[Finding]:
-        """What it finds."""
+        """Make the check and return its findings."""
         try:
             found = self.look()
             return [found] if isinstance(found, Finding) else list(found)

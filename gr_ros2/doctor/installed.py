@@ -1,6 +1,6 @@
-"""What is installed: the parts every link needs, and those that only some do.
+"""Checks of what is installed: the parts that every link needs, and those that only some links need.
 
-Invariant: GNU Radio is asked in a process of its own, since one that was built for another numpy may end it.
+Invariant: GNU Radio is imported in a separate process, because one that was built for another numpy may end it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gr_ros2.phy.kernels.library import loaded
 from gr_ros2.radio import FRONT_ENDS
 
 OLDEST, NEWEST = (3, 10), (3, 14)
-"""Python versions this was run on."""
+"""Oldest and newest Python version on which this program was run."""
 GNU_RADIO = "3.10."
 _SYSTEM = "/usr/bin/python3 -m venv --system-site-packages .venv"
 _ASK = "from gnuradio import gr; import pmt; print('version', gr.version())"
@@ -32,11 +32,11 @@ _PARTS = {
     "bokeh": ("the live dashboard", "pip install 'gr-ros2[dashboard]'"),
     "distributed": ("sweeps on a cluster", "pip install 'gr-ros2[sweep]'"),
 }
-"""Optional packages by what they are imported as: what for, and how to get them."""
+"""Optional packages by import name: their purpose, and the command that installs them."""
 
 
 def python() -> Finding:
-    """Whether this Python is one that the program was run on."""
+    """Whether the program was run on this version of Python."""
     text = f"{'.'.join(map(str, sys.version_info[:3]))}, {sys.executable}; gr-ros2 {__version__}"
     if OLDEST <= sys.version_info[:2] <= NEWEST:
         return Finding("Python", "ok", text)
@@ -45,7 +45,7 @@ def python() -> Finding:
 
 
 def gnu_radio() -> Finding:
-    """Whether GNU Radio can be imported here, and is 3.10."""
+    """Whether GNU Radio can be imported here, and its version is 3.10."""
     said = output_of([sys.executable, "-c", _ASK]) or ""
     version = next((line.split()[1] for line in said.splitlines() if line.startswith("version ")), None)
     if version is None:
@@ -59,7 +59,7 @@ def gnu_radio() -> Finding:
 
 
 def kernels() -> Finding:
-    """Whether the modems run compiled."""
+    """Whether the modems use compiled code."""
     found = loaded()
     if found.functions is None:
         text = f"none, numpy does their work, slower: {found.about}"
@@ -78,12 +78,12 @@ def phys() -> Iterator[Finding]:
 
 
 def front_ends() -> Iterator[Finding]:
-    """The radios that there is software for."""
+    """The radio front ends whose software is installed."""
     return _rows(FRONT_ENDS)
 
 
 def companion() -> Finding:
-    """Whether flowgraphs in the Python of GNU Radio Companion find the blocks."""
+    """Whether flowgraphs that run in the Python of GNU Radio Companion find the blocks."""
     program = grc_program()
     if finds_us(program):
         return Finding("GRC", "ok", f"{program} finds gr-ros2")

@@ -1,6 +1,6 @@
-"""Programs that a check asks: found on PATH, with a limit on their time.
+"""Runs the programs that a check needs. They are found on PATH and have a time limit.
 
-Invariant: nothing here waits for longer than the limit, and a program that hangs is ended.
+Invariant: no call waits for longer than the limit. A program that hangs is ended.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import subprocess
 from collections.abc import Sequence
 
 PATIENCE_S = 20.0
-"""s for a program that looks for devices on every bus."""
+"""Time limit of a program, s. Such a program searches every bus for devices."""
 
 
 def output_of(command: Sequence[str]) -> str | None:
-    """What a program prints, both streams; None where there is no such program.
+    """What a program prints on both streams; None if the program is not installed.
 
-    :raises TimeoutError: it has not ended in time
+    :raises TimeoutError: when the program has not ended in time
     """
     program = shutil.which(command[0])
     if program is None:

@@ -1,6 +1,6 @@
-"""Which radios are plugged in or answer.
+"""Finds the radios that are plugged in or answer.
 
-Invariant: nothing is opened or set up: buses are listed, and the vendors' own programs asked.
+Invariant: no radio is opened or configured. The buses are listed, and the vendors' own programs are run.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ KNOWN = {
     "0bda:2832": "RTL-SDR (receives only)",
     "0bda:2838": "RTL-SDR (receives only)",
 }
-"""USB vendor and product of radios, as their makers and the Linux USB list give them."""
+"""USB vendor and product ids of radios, from their makers and the Linux USB list."""
 PACKAGES = {"SoapySDRUtil": "soapysdr-tools", "uhd_find_devices": "uhd-host", "iio_info": "libiio-utils"}
-"""Programs that find devices -> the package of Debian and Ubuntu they are in."""
+"""Programs that find devices, and the Debian and Ubuntu package of each."""
 _NOTHING = ("no devices found", "no uhd devices found", "no contexts found", "no iio context", "unable to")
 
 
 def usb(devices: Path = USB, nodes: Path = Path("/dev/bus/usb")) -> Iterator[Finding]:
     """Radios on USB, and whether this user may open them.
 
-    :param devices: where the kernel lists what is plugged in
-    :param nodes: where its device files are
+    :param devices: folder in which the kernel lists the devices that are plugged in
+    :param nodes: folder of their device files
     """
     found = False
     for device in sorted(devices.glob("*")):
@@ -68,7 +68,7 @@ def programs() -> Iterator[Finding]:
         try:
             front_end = FRONT_ENDS.load(name)
         except BackendMissingError:
-            continue  # told among what is installed
+            continue  # reported by the checks of what is installed
         if front_end.has_radio:
             yield _asked(name, front_end.find_with)
 

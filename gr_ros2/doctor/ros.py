@@ -1,4 +1,4 @@
-"""Which ROS 2 is there: the sourced distribution, what its environment says, and who is on the graph."""
+"""Checks of ROS 2: the sourced distribution, its environment variables, and the nodes and topics on the graph."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from gr_ros2.setting import AUTO
 
 ROS_ROOT = Path("/opt/ros")
 _LOOK_S = 3.0
-"""s to look around: discovery has no way to say that it is complete."""
+"""s of discovery. Discovery does not report when it is complete."""
 _SHOWN = 12
 _KNOWN_RMW = ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_zenoh_cpp")
 
 
 def distribution(root: Path = ROS_ROOT) -> Finding:
-    """The ROS 2 that is sourced."""
+    """The ROS 2 distribution that is sourced."""
     name = os.environ.get("ROS_DISTRO", "")
     there = sorted(path.parent.name for path in root.glob("*/setup.bash"))
     source = f"source {root}/{there[-1]}/setup.bash" if there else ""
@@ -52,7 +52,7 @@ def rmw() -> Finding:
 
 
 def domain() -> Finding:
-    """The domain and how far discovery goes."""
+    """The domain and the range of discovery."""
     try:
         number, options = resolve_domain_id(AUTO), discovery_options()
     except ConfigError as error:

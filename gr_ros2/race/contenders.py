@@ -1,7 +1,7 @@
-"""Who races, and with which settings.
+"""The contenders of the race and their settings.
 
-Invariant: the peers have what their manuals offer for slow links and what measured best here; docs/explanation/race.md
-says why each.
+Invariant: the peers have the settings that their manuals offer for slow links and that measured best here.
+docs/explanation/race.md gives the reason for each setting.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from gr_ros2.errors import ConfigError
 Stack = Literal["gr-ros2", "dds", "zenoh"]
 
 ADDRESSES = ("10.77.0.1", "10.77.0.2")
-"""Of the sending and the receiving end, on the radio."""
+"""IP addresses of the sending and the receiving end, on the radio."""
 MTU = 1500
-"""Bytes of the largest IP packet: one message of the race fits into one."""
+"""Bytes of the largest IP packet. Each message of the race fits into one IP packet."""
 
 _IP_UDP_HEADERS = 28
 _ZENOH_PORT = 7447
 _ZENOH_SEND_BUFFER = 8192
-"""Bytes; what waits in TCP's own buffer is old when it arrives."""
+"""Bytes. The buffer of TCP is small, because a message that waits in it is old when it arrives."""
 _ZENOH_WAIT_US = 20_000
-"""For room in its queue; after Zenoh's own 1 ms it dropped whole stretches when the computer was busy."""
+"""us that Zenoh waits for room in its queue. With Zenoh's default of 1 ms, it dropped many messages in a row when the
+computer was busy."""
 _ZENOH_OPEN_MS = 2000
-"""Over UDP a lost packet of the handshake costs this; Zenoh's own is 10 s."""
+"""ms. Over UDP, a lost packet of the handshake costs this time. Zenoh's default is 10 s."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Contender:
     """One row of the race.
 
     :param stack: what carries the messages
-    :param reliable: whether what is lost on the air is sent again
-    :param summary: one line
+    :param reliable: whether data that is lost on the air is sent again
+    :param summary: description in one line
     :param settings: ``compression`` and ``queue`` of ROS Source (`gr-ros2`), or ``transport`` and ``congestion``
         control of Zenoh
     """
@@ -68,7 +69,7 @@ CONTENDERS = {
 
 
 def chosen(names: Iterable[str]) -> dict[str, Contender]:
-    """The contenders of these names, in the order of the table; all of none.
+    """The contenders with these names, in the order of the table. Without names: all contenders.
 
     :raises ConfigError: for a name that is not in the table
     """
@@ -80,7 +81,7 @@ def chosen(names: Iterable[str]) -> dict[str, Contender]:
 
 
 def cyclone_uri(peer: str, interface: str) -> str:
-    """Value of ``CYCLONEDDS_URI``: this interface, one peer, no multicast, nothing larger than an IP packet."""
+    """Value of ``CYCLONEDDS_URI``: this interface, one peer, no multicast, no message larger than an IP packet."""
     largest = MTU - _IP_UDP_HEADERS
     return (
         '<CycloneDDS><Domain Id="any"><General>'
@@ -89,7 +90,7 @@ def cyclone_uri(peer: str, interface: str) -> str:
         f"<MaxMessageSize>{largest}B</MaxMessageSize><MaxRexmitMessageSize>{largest}B</MaxRexmitMessageSize>"
         f"<FragmentSize>{largest - 128}B</FragmentSize></General>"
         "<Discovery><ParticipantIndex>0</ParticipantIndex><MaxAutoParticipantIndex>0</MaxAutoParticipantIndex>"
-        # By itself it asks a peer that is not there yet, or whose packet is lost, in the first moment only.
+        # By default, Cyclone asks a peer only at the start, even if the peer is absent or its packet is lost.
         f'<SPDPInterval>8s</SPDPInterval><Peers AddLocalhost="false"><Peer Address="{peer}" PruneDelay="inf"/></Peers>'
         "</Discovery>"
         "</Domain></CycloneDDS>"
@@ -97,10 +98,10 @@ def cyclone_uri(peer: str, interface: str) -> str:
 
 
 def zenoh_config(transport: str, listens: bool) -> dict[str, Any]:
-    """A session with one neighbour, found without searching, that sends as few and as small packets as it can.
+    """Configuration of a session with one peer at a known address. It sends as few and as small packets as possible.
 
     :param transport: udp or tcp
-    :param listens: whether this end waits for the other
+    :param listens: whether this end waits for the connection of the other end
     """
     endpoint = f"{transport}/{ADDRESSES[1]}:{_ZENOH_PORT}"
     retry = {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 1.5}

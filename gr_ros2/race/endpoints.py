@@ -1,8 +1,8 @@
-"""The two programs that talk over the radio: one plays a recording, the other notes what arrives.
+"""The two programs at the ends of the radio link: one plays a recording, the other records what arrives.
 
-Invariants: they differ between contenders in the network they join, and in nothing else; a message counts as sent when
-it was due by the recording, so that a network that holds the talker up gains nothing by it; times are s of the
-machine's monotonic clock.
+Invariants: between contenders, the programs differ only in the network that they join. A message counts as sent at its
+due time in the recording, so a network that delays the sending program gains nothing. Times are s of the machine's
+monotonic clock.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from gr_ros2.race.links import DEPTH, SINK_DOMAIN, SOURCE_DOMAIN
 from gr_ros2.race.tun import INTERFACE
 
 _ROS_DEPTH = 10
-"""What ROS 2 nodes keep unless told otherwise."""
+"""Messages that ROS 2 nodes keep by default."""
 _DOMAIN = 0
 _POLL_S = 0.02
 
 
 @dataclass(frozen=True)
 class RaceTopic:
-    """What is sent, and what it is called where it comes out."""
+    """The topic that is sent, and its name at the receiving end."""
 
     name: str
     type_name: str
@@ -40,15 +40,15 @@ class RaceTopic:
 
 
 class Network(ABC):
-    """One end's connection to whatever carries the messages."""
+    """The connection of one end to the network that carries the messages."""
 
     @abstractmethod
     def advertise(self, topic: str, type_name: str) -> Publisher:
-        """A publisher."""
+        """Create a publisher."""
 
     @abstractmethod
     def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:
-        """A subscription."""
+        """Create a subscription."""
 
     @abstractmethod
     def close(self) -> None: ...
@@ -57,7 +57,7 @@ class Network(ABC):
 class DdsNetwork(Network):
     """A ROS 2 node on Cyclone DDS.
 
-    :param qos: of the publisher; a subscription keeps more, so that a busy computer does not cost it messages
+    :param qos: QoS of the publisher; a subscription has a larger depth, so that it loses no message on a busy computer
     """
 
     def __init__(self, domain_id: int, localhost_only: bool, qos: Qos) -> None:
@@ -77,12 +77,12 @@ class DdsNetwork(Network):
 class ZenohNetwork(Network):
     """A Zenoh session.
 
-    :param config: as in Zenoh's configuration file
-    :param congestion: what a publisher does where there is no room, a name of Zenoh's
+    :param config: settings as in Zenoh's configuration file
+    :param congestion: what a publisher does when its queue is full: a name in Zenoh's ``CongestionControl``
     """
 
     def __init__(self, config: dict[str, Any], reliable: bool, congestion: str) -> None:
-        import zenoh  # only here: the other contenders race without it
+        import zenoh  # imported here, because the other contenders do not need it
 
         self._reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         self._congestion = getattr(zenoh.CongestionControl, congestion)
@@ -141,7 +141,7 @@ def join(contender: Contender, receiving: bool) -> Network:
     if contender.stack == "zenoh":
         config = zenoh_config(contender.settings["transport"], receiving)
         return ZenohNetwork(config, contender.reliable, contender.settings["congestion"])
-    if contender.stack == "gr-ros2":  # the local graph loses nothing; the radio is between the two
+    if contender.stack == "gr-ros2":  # the local graphs lose nothing; the radio is between them
         return DdsNetwork(SINK_DOMAIN if receiving else SOURCE_DOMAIN, True, Qos("reliable", "volatile", DEPTH))
     os.environ["CYCLONEDDS_URI"] = cyclone_uri(ADDRESSES[not receiving], INTERFACE)
     reliability: Reliability = "reliable" if contender.reliable else "best_effort"
@@ -151,8 +151,8 @@ def join(contender: Contender, receiving: bool) -> Network:
 class RacePublisher:
     """Plays one topic of a bag.
 
-    :param messages: how many of them
-    :param duration_s: s at most; what is not published by then because the network held it up never is
+    :param messages: number of messages to publish
+    :param duration_s: longest time to play, s; a message that the network delays beyond this time is never published
     """
 
     def __init__(self, contender: Contender, topic: RaceTopic, bag: Path, messages: int, duration_s: float) -> None:
@@ -164,18 +164,18 @@ class RacePublisher:
         self._t_first = float("nan")
 
     def connect(self) -> float:
-        """Join the network; returns when that began, s monotonic."""
+        """Join the network. Return the time at which joining began, s monotonic."""
         began = time.monotonic()
         self._network = join(self._contender, receiving=False)
         self._publisher = self._network.advertise(self._topic.name, self._topic.type_name)
         return began
 
     def matched(self) -> bool:
-        """Whether there is somebody to talk to."""
+        """Whether the publisher has found the receiving end."""
         return self._publisher.matched() > 0
 
     def play(self) -> float:
-        """Publish as recorded; returns when the first message was, s monotonic."""
+        """Publish the messages at their recorded times. Return the time of the first one, s monotonic."""
         self._bag.subscribe(self._topic.name, self._topic.type_name, Qos(), self._publish)
         self._bag.start()
         end = time.monotonic() + self._duration_s
@@ -203,7 +203,7 @@ class RacePublisher:
 
 
 class RaceSubscriber:
-    """Notes what arrives on one topic."""
+    """Records the messages that arrive on one topic."""
 
     def __init__(self, contender: Contender, topic: RaceTopic) -> None:
         self._contender, self._topic = contender, topic
@@ -212,22 +212,22 @@ class RaceSubscriber:
         self._lock = threading.Lock()
 
     def connect(self) -> float:
-        """Join the network; returns when that began, s monotonic."""
+        """Join the network. Return the time at which joining began, s monotonic."""
         began = time.monotonic()
         self._network = join(self._contender, receiving=True)
         self._subscription = self._network.subscribe(self._topic.output, self._topic.type_name, self._take)
         return began
 
     def matched(self) -> bool:
-        """Whether there is somebody to listen to."""
+        """Whether the subscription has found the sending end."""
         return self._subscription.matched() > 0
 
     def count(self) -> int:
-        """Messages that have arrived."""
+        """Number of messages that have arrived."""
         return len(self._heard)
 
     def heard(self) -> list[tuple[float, bytes]]:
-        """All that arrived: when, s monotonic, and the message."""
+        """All messages that have arrived, each with its time of arrival, s monotonic."""
         with self._lock:
             return list(self._heard)
 

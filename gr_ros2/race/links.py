@@ -1,8 +1,8 @@
-"""The radio between two network namespaces: ROS topics over it, or IP packets over it, through the same flowgraph.
+"""The radio between two network namespaces. It carries ROS topics or IP packets through the same flowgraph.
 
-Invariants: every frame has the air for the airtime of its length, one after the other, whoever sends it; it is noted
-when it leaves; nothing waits here, so that a sender feels the link being full; both directions have an air of their
-own.
+Invariants: every frame occupies the air for the airtime of its length, one frame after another, for every sender. A
+frame is logged when it leaves. No frame waits here, so a sender notices when the link is full. Each direction has its
+own air.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from gr_ros2.race.tun import Tun, loopback_up
 from gr_ros2.registry import Registry
 
 SOURCE_DOMAIN, SINK_DOMAIN = 1, 2
-"""DDS domains at the two ends of gr-ros2. One process cannot have a domain in two namespaces."""
+"""DDS domains at the two ends of gr-ros2. One process cannot use the same domain in two namespaces."""
 SOURCE_ID = 1
 DEPTH = 1000
-"""Messages the local graphs keep: nothing is to be lost there."""
+"""Messages that the local graphs keep. The number is large, because no message may be lost there."""
 QUEUE_DEPTH = 8
-"""Messages at ROS Source, for moments in which the computer is busy."""
+"""Most messages that wait at ROS Source while the computer is busy."""
 
 _POLL_S = 0.05
 _JOIN_S = 1.0
@@ -47,9 +47,9 @@ _SHORT_FRAME = 100
 
 @dataclass(frozen=True)
 class RaceRadio:
-    """What all contenders share: a PHY at a sample rate, and the share of its frames that are lost.
+    """The radio of all contenders: a PHY at a sample rate, and the share of its frames that are lost.
 
-    :param seed: of the losses; the way back draws its own
+    :param seed: seed of the losses; each direction has its own losses
     """
 
     phy: str
@@ -59,12 +59,12 @@ class RaceRadio:
     seed: int
 
     def with_frames_of(self, length: int) -> Phy:
-        """The PHY for frames of this length, bytes, or of up to this length."""
+        """The PHY for frames of ``length`` bytes, or of at most ``length`` bytes."""
         phy: Phy = PHY.load(self.phy)(length, self.sample_rate, **self.options)
         return phy
 
     def airtime_s(self, length: int) -> float:
-        """s that a frame of this length, bytes, has the air."""
+        """Airtime of a frame of ``length`` bytes, s."""
         return self.with_frames_of(length).airtime()
 
     def channel(self, direction: int) -> ChannelConfig:
@@ -74,14 +74,14 @@ class RaceRadio:
 
 @dataclass
 class LinkLog:
-    """The frames of one direction: when they went (s, monotonic), their bytes, the s they had the air."""
+    """The frames of one direction: the time at which each left (s, monotonic), its size in bytes, its airtime in s."""
 
     t: array[float] = field(default_factory=lambda: array("d"))
     size: array[float] = field(default_factory=lambda: array("d"))
     airtime: array[float] = field(default_factory=lambda: array("d"))
 
     def note(self, t: float, size: int, airtime: float) -> None:
-        """One frame more."""
+        """Add one frame."""
         self.t.append(t)
         self.size.append(size)
         self.airtime.append(airtime)
@@ -89,7 +89,7 @@ class LinkLog:
 
 @dataclass(frozen=True)
 class LinkReport:
-    """What went over the air: the frames there and back, and by name what was lost on the way."""
+    """The traffic on the air: the frames in both directions, and the number of losses by reason."""
 
     there: LinkLog
     back: LinkLog
@@ -97,12 +97,12 @@ class LinkReport:
 
 
 class RaceRosLink:
-    """gr-ros2 between two namespaces: a ROS graph at each end, the radio between them, one way.
+    """gr-ros2 between two namespaces: a ROS graph at each end, the radio between them, in one direction.
 
-    :param namespaces: paths, of the sending and the receiving end
+    :param namespaces: paths of the namespaces of the sending and the receiving end
     :param topic: its absolute name and its type
-    :param packet_len: bytes
-    :param contender: its settings
+    :param packet_len: bytes of a packet
+    :param contender: the contender whose settings are used
     :raises GrRos2Error: when a part does not start
     """
 
@@ -147,11 +147,11 @@ class RaceRosLink:
 
     @property
     def output_topic(self) -> str:
-        """Where the messages come out."""
+        """The topic on which the receiving end publishes the messages."""
         return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
 
     def report(self) -> LinkReport:
-        """What went over the air so far."""
+        """The traffic on the air so far."""
         topics = self._source.stats()["topics"].values()
         drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
         return LinkReport(self._log, LinkLog(), {**drops, "on_air": self._link.counts().dropped})
@@ -169,18 +169,18 @@ class RaceRosLink:
         self.close()
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
-        """Note a packet that leaves."""
+        """Log a packet that leaves."""
         if isinstance(event, SentPacket):
             self._log.note(event.now, self._size, self._airtime)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """The sink is not observed."""
+        """Do nothing: the sink is not observed."""
 
 
 class RaceIpLink:
-    """IP between two namespaces: a TUN device at each end, each IP packet one frame of its own length, both ways.
+    """IP between two namespaces, in both directions: a TUN device at each end, one frame of the same length per packet.
 
-    :param namespaces: paths, of the sending and the receiving end
+    :param namespaces: paths of the namespaces of the sending and the receiving end
     :raises GrRos2Error: when a part does not start
     """
 
@@ -201,7 +201,7 @@ class RaceIpLink:
                 sink = TunSink(self._tuns[1 - direction])
                 link = LoopbackLink(
                     phy, source, sink, channel=radio.channel(direction), throttled=False, paced=False
-                )  # the source holds each frame for its own airtime
+                )  # TunSource delays each frame by its airtime
                 stack.callback(link.stop)
                 link.start()
                 phy.prefer_latency()
@@ -209,7 +209,7 @@ class RaceIpLink:
             self._stack = stack.pop_all()
 
     def report(self) -> LinkReport:
-        """What went over the air so far."""
+        """The traffic on the air so far."""
         drops = {
             "queue_full": sum(tun.dropped() for tun in self._tuns),
             "on_air": sum(link.counts().dropped for link in self._links),
@@ -231,9 +231,9 @@ class RaceIpLink:
 
 
 class TunSource(gr.basic_block):  # type: ignore[misc]
-    """IP packets of a TUN device on message port `pdus`, each when its airtime is over.
+    """Sends the IP packets of a TUN device to message port `pdus`, each at the end of its airtime.
 
-    :param log: of the frames that left
+    :param log: takes the frames that have left
     """
 
     def __init__(self, tun: Tun, radio: RaceRadio, log: LinkLog) -> None:
@@ -262,7 +262,7 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
     def _run(self) -> None:
         free = time.monotonic()
         while not self._stop.is_set():
-            packet = self._tun.read(0)  # one that is here already has waited for the air to be free
+            packet = self._tun.read(0)  # a packet that is already here has waited until the air is free
             if packet is None:
                 packet = self._tun.read(_POLL_S)
                 free = max(free, time.monotonic())
@@ -278,15 +278,15 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
 
 
 class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
-    """Message port `pdus` to a TUN device."""
+    """Writes the PDUs of message port `pdus` to a TUN device."""
 
     def __init__(self, tun: Tun) -> None:
         super().__init__("gr_ros2_tun_sink", None, None)
         self._tun = tun
         self.handled = 0
-        """PDUs this block is done with."""
+        """PDUs that this block has handled."""
         self.refused = 0
-        """Those of them that were no IP packet, or that the kernel did not take."""
+        """Handled PDUs that were not an IP packet, or that the kernel refused."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._write)
 

@@ -1,8 +1,8 @@
-"""What one contender did under one condition, in numbers, and who did best.
+"""The results of one contender under one condition, as numbers, and the best contenders of a condition.
 
-Invariants: a message is delivered when its bytes come out as they went in (alignment gaps and the padding of DDS
-aside), once; a number that does not apply is None; winners are computed from the numbers as they are shown, and all who
-show the same win together.
+Invariants: a message is delivered when its bytes arrive unchanged, and it counts once. Bytes in alignment gaps and the
+padding of DDS may change. A number that does not apply is None. Winners are computed from the numbers as the tables
+show them, so contenders with the same shown number win together.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RaceCell:
-    """One contender under one condition. Times in s, sizes in bytes; both directions of the air count.
+    """Results of one contender under one condition. Times are in s, sizes in bytes. Both directions of the air count.
 
-    :param load: share of the air that the recording needs as it is, one frame per message
+    :param load: share of the airtime that the recording needs without compression, one frame per message
     :param loss: probability that a frame is lost
     :param matched: both ends found each other before the first message
-    :param delivered: of ``sent``, as they went in; ``altered`` and ``duplicates`` come beside them
-    :param airtime_per_message: of all frames from the first message on, per message delivered
-    :param air_bytes_per_message: likewise, bytes of frames
-    :param air_bytes_back: share of those bytes that went back
-    :param discovery_bytes: of all frames before the first message
-    :param first_message: from joining the network to the first delivery
+    :param delivered: messages of ``sent`` that arrived unchanged; ``altered`` and ``duplicates`` are counted apart
+    :param airtime_per_message: airtime of all frames since the first message, per message delivered
+    :param air_bytes_per_message: bytes of all frames since the first message, per message delivered
+    :param air_bytes_back: share of these bytes that the receiving end sent
+    :param discovery_bytes: bytes of all frames before the first message
+    :param first_message: time from joining the network to the first delivery
     :param drops: frames and messages that were dropped on the way, by name
-    :param busy: programs that wanted a processor, per processor; above 1 times are the computer's, not the radio's
+    :param busy: load average per processor; above 1, the times come from the computer and not from the radio
     """
 
     contender: str
@@ -65,9 +65,9 @@ class RaceCell:
 
 @dataclass(frozen=True)
 class Column:
-    """A number by which contenders are compared.
+    """A number that is compared between contenders.
 
-    :param better: which end of its scale wins
+    :param better: whether the largest or the smallest number wins
     """
 
     heading: str
@@ -93,13 +93,13 @@ COLUMNS = {
     "discovery_bytes": Column("discovery bytes", "least", _whole),
     "first_message": Column("first message [s]", "least", "{:.2f}".format),
 }
-"""By the field of :class:`RaceCell`."""
+"""The compared numbers, by field of :class:`RaceCell`."""
 
 
 class Identity:
-    """Tells which message of a recording some bytes are.
+    """Finds the message of a recording that has the given bytes.
 
-    :raises ConfigError: where two of its messages are the same
+    :raises ConfigError: when two messages of the recording are the same
     """
 
     def __init__(self, recording: RaceRecording) -> None:
@@ -112,21 +112,21 @@ class Identity:
             )
 
     def number(self, payload: bytes) -> int | None:
-        """Place in the recording, from 0; None of other bytes."""
+        """Position of the message in the recording, from 0; None if the recording has no such message."""
         return self._numbers.get(self._plain(payload))
 
     def _plain(self, payload: bytes) -> bytes:
-        """Without what DDS and the codec may change: bytes in alignment gaps, and zeros behind the message."""
+        """The payload without the bytes that DDS and the codec may change: alignment gaps, zeros after the message."""
         return self._codec.decode(0, self._codec.encode(0, payload)).rstrip(b"\0")
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What was seen of one contender. All times s, monotonic.
+    """What was observed of one contender. All times are s, monotonic.
 
     :param began: when the first end began to join
-    :param t_sent: when each message was due, in the recording's order
-    :param heard: when something arrived, and what
+    :param t_sent: due time of each message, in the order of the recording
+    :param heard: time of each arrival, and the bytes that arrived
     :param busy: see :class:`RaceCell`
     """
 
@@ -141,7 +141,7 @@ class Observed:
 def measure(
     seen: Observed, identity: Identity, *, contender: str, load: float, loss: float, sample_rate: float
 ) -> RaceCell:
-    """All numbers of a cell."""
+    """Compute all numbers of a cell."""
     t_sent = np.array(seen.t_sent)
     t_delivered = np.full(len(t_sent), np.nan)
     altered = duplicates = 0
@@ -187,13 +187,13 @@ def measure(
 
 
 def shown(cell: RaceCell, column: str) -> str:
-    """A number as the tables have it; a dash where there is none."""
+    """A number as the tables show it; a dash if it is None."""
     value = getattr(cell, column)
     return "–" if value is None else COLUMNS[column].shown(value)
 
 
 def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
-    """Column -> the contenders that did best in it; of cells under the same condition."""
+    """The best contenders in each column. All cells must have the same condition."""
     best: dict[str, list[str]] = {}
     for name, column in COLUMNS.items():
         values = {cell.contender: getattr(cell, name) for cell in cells if getattr(cell, name) is not None}
@@ -206,7 +206,7 @@ def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
 
 
 def by_condition(cells: Sequence[RaceCell]) -> Mapping[tuple[float, float], list[RaceCell]]:
-    """The cells by (load, loss)."""
+    """The cells, grouped by (load, loss)."""
     groups: dict[tuple[float, float], list[RaceCell]] = {}
     for cell in cells:
         groups.setdefault((cell.load, cell.loss), []).append(cell)
@@ -214,7 +214,7 @@ def by_condition(cells: Sequence[RaceCell]) -> Mapping[tuple[float, float], list
 
 
 def _traffic(logs: Sequence[LinkLog], begin: float, end: float) -> tuple[float, float]:
-    """Bytes and s of the air between two times."""
+    """Bytes, and airtime in s, of the frames between two times."""
     size = airtime = 0.0
     for log in logs:
         t = np.array(log.t)

@@ -1,8 +1,8 @@
-"""Network namespaces without names: each exists as long as somebody holds it, so nothing can be left behind.
+"""Network namespaces without names. A namespace exists only while a process holds it, so none can be left behind.
 
-Invariants: only a thread that enters a namespace is in it, and the threads and processes it starts then; the rest of
-the process stays where it was; the kernel removes a namespace with all its interfaces when its last holder is gone,
-however that came about.
+Invariants: a namespace contains the threads that enter it, and the threads and processes that these threads then
+start. The rest of the process stays in its own namespace. The kernel removes a namespace with all its interfaces when
+its last holder has ended, for any reason.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Namespace:
-    """A new, empty network namespace, with nothing in it but a loopback interface that is down.
+    """A new network namespace. It contains only a loopback interface, which is down.
 
-    :raises RunError: without the right to make one
+    :raises RunError: when this process has no permission to create one
     """
 
     def __init__(self) -> None:
@@ -38,11 +38,11 @@ class Namespace:
 
     @property
     def path(self) -> str:
-        """Where this process and its children find it while it is open."""
+        """Path of the namespace for this process and its children, valid while it is open."""
         return f"/proc/{os.getpid()}/fd/{self._file}"
 
     def close(self) -> None:
-        """Let go of it. Idempotent."""
+        """Release the namespace. Idempotent."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -71,7 +71,7 @@ def enter(path: str) -> None:
 
 
 def inside(path: str, work: Callable[[], T]) -> T:
-    """What ``work`` returns or raises in a thread of its own inside a namespace."""
+    """Run ``work`` in a new thread inside a namespace. Return or raise what ``work`` returns or raises."""
 
     def entered() -> T:
         enter(path)
@@ -81,9 +81,9 @@ def inside(path: str, work: Callable[[], T]) -> T:
 
 
 def check_means() -> None:
-    """Find out whether two namespaces and a TUN device can be had here.
+    """Check whether this computer can create namespaces and a TUN device.
 
-    :raises RunError: naming what is missing and the remedy
+    :raises RunError: when something is missing; the message names it and the remedy
     """
     missing = [tool for tool in _TOOLS if shutil.which(tool) is None]
     if missing:

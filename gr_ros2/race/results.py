@@ -1,6 +1,6 @@
-"""The race in writing: a table, `race.json`, the cells as CSV and Parquet, one figure.
+"""The results of the race: a table, `race.json`, the cells as CSV and Parquet, one figure.
 
-Invariants: files appear whole or not at all; the mark of a winner comes from the numbers, whoever that is.
+Invariants: a file is written completely or not at all. Only the numbers decide which contender is marked as a winner.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LINEAR = {"pdr"}
 
 
 def race_grid(race: Race) -> Grid:
-    """A section per condition, a line per contender; a star marks who did best in a column."""
+    """One section per condition, one line per contender. A star marks the best contenders of a column."""
     sections = []
     for (load, loss), cells in by_condition(race.cells).items():
         best = winners(cells)
@@ -54,7 +54,7 @@ def race_grid(race: Race) -> Grid:
 
 
 def notes(race: Race) -> list[str]:
-    """What a reader of the table must not miss, one line each."""
+    """Facts that a reader of the table must know, one line each."""
     recording = race.recording
     size = sum(map(len, recording.payloads)) / len(recording.payloads)
     rates = dict.fromkeys((cell.load, cell.sample_rate) for cell in race.cells)
@@ -78,7 +78,7 @@ def notes(race: Race) -> list[str]:
 
 
 def write_race(race: Race, out: Path) -> list[Path]:
-    """Write everything into a folder, made if missing. Needs a cell at least.
+    """Write all files into a folder, which is created if missing. The race must have at least one cell.
 
     :return: the files, `race.json` first
     :raises ConfigError: when they cannot be written
@@ -94,7 +94,7 @@ def write_race(race: Race, out: Path) -> list[Path]:
 
 
 def race_figure(cells: Sequence[RaceCell]) -> Figure:
-    """A row per number, a column per load; bars by loss, a colour per contender."""
+    """One row per number, one column per load. Bars are grouped by loss; each contender has its own colour."""
     loads, losses = sorted({cell.load for cell in cells}), sorted({cell.loss for cell in cells})
     names = [name for name in CONTENDERS if any(cell.contender == name for cell in cells)]
     found = {(cell.contender, cell.load, cell.loss): cell for cell in cells}

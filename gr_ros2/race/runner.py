@@ -1,7 +1,7 @@
-"""Runs the race: one contender under one condition after the other, each from nothing.
+"""Runs the race, one cell after another. A cell is one contender under one condition, in new processes.
 
-Invariants: nothing of a cell outlives it, whatever happens: its processes end, and its namespaces and interfaces with
-them; what was measured before Ctrl-C or a failure is kept.
+Invariants: nothing of a cell remains after it, even after an error: its processes end, and its namespaces and
+interfaces are removed. The cells measured before Ctrl-C or a failure are kept.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from gr_ros2.race.workers import Worker
 
 _POLL_S = 0.05
 _QUIET_S = 3.0
-"""s without a message after which nothing more is expected."""
+"""s. When no message has arrived for this time, no more are expected."""
 _PLAY_SLACK_S = 30.0
 
 
 @dataclass
 class Race:
-    """What was raced, and what came of it.
+    """A race and its results.
 
     :param interrupted: Ctrl-C ended it before all cells were run
-    :param error: what else ended it
+    :param error: the error that ended it, None without one
     """
 
     settings: RaceSettings
@@ -54,10 +54,10 @@ class Race:
 
 
 def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | None = None) -> Race:
-    """Run every cell, or until KeyboardInterrupt.
+    """Run all cells, or until KeyboardInterrupt.
 
-    :param on_cell: called before each cell with its number from 0, how many there are, and what it is
-    :raises ConfigError: when it cannot be set up
+    :param on_cell: called before each cell with its number from 0, the number of cells, and a description of the cell
+    :raises ConfigError: when the race cannot be set up
     :raises RunError: without root
     """
     check(settings)
@@ -119,7 +119,7 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
                 settings.duration_s,
             )
         )
-        # The listener joins first, so that a talker that calls it finds it.
+        # The listener joins first, so that the talker can connect to it.
         timeout_s = settings.match_s + _PLAY_SLACK_S
         began = listener.call("connect", timeout_s=timeout_s)
         talker.call("connect", timeout_s=timeout_s)
@@ -140,7 +140,7 @@ def _wait_matched(limit_s: float, *ends: Worker) -> bool:
 
 
 def _drain(limit_s: float, listener: Worker, expected: int) -> None:
-    """Wait for what is on its way, until all is here or nothing has come for a while."""
+    """Wait until all messages on their way have arrived, or none has arrived for ``_QUIET_S``; ``limit_s`` at most."""
     limit = time.monotonic() + limit_s
     count, quiet = -1, 0.0
     while (found := listener.call("count")) < expected and time.monotonic() < limit:

@@ -1,7 +1,7 @@
-"""What is raced over: the recording, the radio, and how the sample rate follows from the load.
+"""The settings of the race: the recording, the radio, and the sample rate that follows from the load.
 
-Invariants: a load is the share of the air that the recording would need if each message were one frame, as it is, with
-the overhead of a version 0 packet; every contender has the same recording at the same sample rate.
+Invariants: a load is the share of the airtime that the recording would need if each message were one uncompressed
+frame with the overhead of a version 0 packet. Every contender has the same recording at the same sample rate.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"
 PHY_OPTIONS = {"gap": 112, "detection_threshold": "stock"}
-"""GNU Radio's own blocks, which take frames of any length."""
+"""The PHY consists of GNU Radio's own blocks, which take frames of any length."""
 SIM_TOPIC = "/robot_1/odom"
 _SIM_ROBOT = 1
 _SIM_START_NS = 1_700_000_000_000_000_000
-"""ns since 1970, of a recording of the simulator; the same always, so that the messages are."""
+"""Start of a recording of the simulator, ns since 1970. It is constant, so the messages are always the same."""
 _SIM_HZ = 35.0
 _LARGEST_IN_IP = MTU - 200
-"""Bytes of a message that fits an IP packet with any contender's headers."""
+"""Bytes of the largest message that fits into an IP packet with the headers of any contender."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Load = Annotated[float, Field(gt=0, le=100)]
@@ -73,9 +73,9 @@ class RaceSettings(Sampled, Packets, Traffic):
 class RaceRecording:
     """What every contender carries: one topic of a bag.
 
-    :param path: of the bag
+    :param path: path of the bag
     :param payloads: the messages, in order
-    :param due: s after the first of them, of each
+    :param due: due time of each message, s after the first one
     """
 
     path: Path
@@ -86,7 +86,7 @@ class RaceRecording:
 
     @property
     def hz(self) -> float:
-        """Messages/s, mean."""
+        """Mean rate, messages/s."""
         return (len(self.due) - 1) / self.due[-1]
 
     @property
@@ -96,13 +96,13 @@ class RaceRecording:
 
     @property
     def single_packet_len(self) -> int:
-        """Bytes of a version 0 packet that holds any of its messages, as it is."""
+        """Bytes of a version 0 packet that holds any one of the messages without compression."""
         return min(V0.packed_len([self.largest]), V0.max_packet_len)
 
 
 @plain_dataclass(frozen=True)
 class Condition:
-    """What all contenders meet alike."""
+    """A condition, which is the same for all contenders."""
 
     load: float
     sample_rate: float
@@ -110,9 +110,9 @@ class Condition:
 
 
 def check(settings: RaceSettings) -> None:
-    """Find what is wrong with settings before anything is started.
+    """Check the settings before anything is started.
 
-    :raises ConfigError: naming it
+    :raises ConfigError: when a setting is wrong; the message names it
     :raises BackendMissingError: when a contender is not installed
     """
     racing = chosen(settings.peers).values()
@@ -122,7 +122,7 @@ def check(settings: RaceSettings) -> None:
 
 
 def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Condition]:
-    """Every load with every loss, the lightest first."""
+    """Every combination of load and loss, the smallest first."""
     phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0, **PHY_OPTIONS)
     needed = recording.hz * phy.airtime_samples()
     if settings.sample_rate != AUTO:
@@ -148,11 +148,11 @@ def record_sim(folder: Path, settings: RaceSettings) -> Path:
 
 
 def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
-    """The recording of the race; that of the simulator is made first.
+    """Read the recording of the race. A recording of the simulator is made first.
 
-    :param folder: for the bag of the simulator
-    :raises ConfigError: where it has no such topic, too little on it, or messages that do not fit
-    :raises BagError: where it cannot be read
+    :param folder: folder for the bag of the simulator
+    :raises ConfigError: when the bag has no such topic, too few messages of it, or messages that are too large
+    :raises BagError: when the bag cannot be read
     """
     path = settings.bag_path or record_sim(folder, settings)
     contents = bag_contents(path)
@@ -182,5 +182,5 @@ def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
 
 
 def dump(settings: RaceSettings) -> dict[str, Any]:
-    """As JSON values."""
+    """The settings as JSON values."""
     return asdict(settings)

@@ -1,8 +1,8 @@
-"""An IP interface of a network namespace whose packets this process carries: a TUN device.
+"""A TUN device: an IP interface of a network namespace. This process carries the packets of the interface.
 
-Invariants: what the radio cannot take yet waits in the kernel, in a queue bounded in bytes in front of the device, as
-with a real interface, so that senders feel the link being full; what that queue drops is counted; the device is gone
-when it is closed.
+Invariants: packets that the radio cannot take yet wait in a kernel queue in front of the device. The queue is bounded
+in bytes, as with a real interface, so senders notice when the link is full. Packets that the queue drops are counted.
+The device is removed when it is closed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from gr_ros2.race.namespaces import inside
 
 INTERFACE = "air0"
 QUEUE_BYTES = 4000
-"""Bytes that wait in front of the device at most, as a short ``txqueuelen``: longer ones only make messages older."""
+"""Most bytes that wait in front of the device. The queue is short, like a short ``txqueuelen``, because a longer queue
+only makes messages older."""
 
 _RING_PACKETS = 8
 _TUNSETIFF = 0x400454CA
@@ -31,12 +32,12 @@ _FRAGMENTS_KEPT_S = 3
 class Tun:
     """A point-to-point interface.
 
-    :param namespace: path of the network namespace it stands in
+    :param namespace: path of the network namespace that contains the interface
     :param address, peer: IPv4 addresses of this end and the other
     :param mtu: bytes of the largest IP packet
-    :param byte_rate: bytes/s the link carries
-    :param overhead: bytes that each packet costs beyond its own
-    :raises RunError: when it cannot be made
+    :param byte_rate: bytes/s that the link carries
+    :param overhead: airtime that the radio adds to each packet, as a number of bytes
+    :raises RunError: when the interface cannot be created
     """
 
     def __init__(self, namespace: str, address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float) -> None:
@@ -57,20 +58,20 @@ class Tun:
             raise
 
     def read(self, timeout_s: float) -> bytes | None:
-        """The next IP packet to be sent, None when there is none for so long."""
+        """The next IP packet to send; None if there is none within ``timeout_s``."""
         if not select.select([self._file], [], [], timeout_s)[0]:
             return None
         return os.read(self._file, 1 << 16)
 
     def write(self, packet: bytes) -> None:
-        """An IP packet has arrived.
+        """Give the kernel an IP packet that has arrived.
 
         :raises OSError: when the kernel refuses it
         """
         os.write(self._file, packet)
 
     def dropped(self) -> int:
-        """Packets the queue in front of the device had no room for."""
+        """Number of packets that the queue in front of the device has dropped because it was full."""
         text = inside(self._namespace, lambda: _run(f"tc -s -j qdisc show dev {INTERFACE}"))
         return int(json.loads(text)[0]["drops"])
 
@@ -91,7 +92,7 @@ def loopback_up(namespace: str) -> None:
 
 def _open() -> int:
     settings = Path("/proc/sys/net")
-    if (settings / "ipv6").exists():  # neighbours and routers are not to be asked for over the radio
+    if (settings / "ipv6").exists():  # IPv6 would search for neighbours and routers over the radio
         (settings / "ipv6/conf/all/disable_ipv6").write_text("1")
     (settings / "ipv4/ipfrag_time").write_text(str(_FRAGMENTS_KEPT_S))
     file = os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)

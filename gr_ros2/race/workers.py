@@ -1,7 +1,9 @@
-"""Processes of the race: an object in a process of its own, in a network namespace of its own, called from here.
+"""Processes of the race. A worker is an object in its own process, which may enter a network namespace. Its owner, the
+process that started it, calls its methods.
 
-Invariants: a worker lives no longer than the ``with`` of its owner, nor than its owner, whatever ends that; Ctrl-C is
-for the owner only, who then ends the workers at once; what fails in a worker fails in its owner, in the same words.
+Invariants: a worker ends with the ``with`` block of its owner, or with its owner, whatever ends the owner. Only the
+owner reacts to Ctrl-C; it then ends the workers at once. An error in a worker is raised in its owner, with the same
+text.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ class Worker:
 
     :param name: for error messages
     :param namespace: path of the network namespace to enter first, '' to stay
-    :param make: a class or function of a module, which gives a context manager
+    :param make: a class or function of a module that returns a context manager
     :raises RunError: when the object cannot be made
     """
 
@@ -48,9 +50,9 @@ class Worker:
             raise
 
     def call(self, method: str, *, timeout_s: float = _START_S) -> Any:
-        """What a method of the object returns, or the value of an attribute.
+        """Call a method of the object and return its result, or return the value of an attribute.
 
-        :raises RunError: when it fails, takes longer, or the process has ended
+        :raises RunError: when the call fails, takes longer than ``timeout_s``, or the process has ended
         """
         try:
             self._ours.send(method)
@@ -59,9 +61,9 @@ class Worker:
         return self._answer(timeout_s)
 
     def close(self, at_once: bool = False) -> None:
-        """End the process: by closing its line, and if it does not hear that, by force. Idempotent.
+        """Close the connection to the process, so that it ends; if it does not end, kill it. Idempotent.
 
-        :param at_once: by force, without waiting for what it is doing
+        :param at_once: kill the process without waiting for its current work
         """
         self._ours.close()
         self._process.join(0 if at_once else _END_S)
@@ -102,7 +104,7 @@ def _serve(
                 found = getattr(served, line.recv())
                 line.send((False, found() if callable(found) else found))
     except (EOFError, ConnectionError):
-        return  # the owner is done, or gone
-    except Exception as error:  # noqa: BLE001 - told to the owner
+        return  # the owner has closed the connection, or has ended
+    except Exception as error:  # noqa: BLE001 - sent to the owner
         text = str(error) if isinstance(error, GrRos2Error) else f"{type(error).__name__}: {error}"
         line.send((True, text))
