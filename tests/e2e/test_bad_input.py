@@ -69,7 +69,7 @@ def files(folder: Path) -> dict[str, str]:
         ("run paper-direct --set source=bag:", "the path of the bag is missing; write bag:PATH"),
         ("run paper-direct --set source=radio", "source = 'radio': write sim or bag:PATH"),
         ("run paper-direct --set colour=red", "unknown key colour"),
-        ("run paper-direct --set ros_source.colour=red", "unknown key ros_source.colour; known are packet_len, registry"),
+        ("run paper-direct --set ros_source.colour=red", "unknown key ros_source.colour; known are packet_len"),
         ("run paper-direct --set packet_len=13", "packet_len = 13"),
         ("run paper-direct --set ros_source.min_fragment=60", "min_fragment = 60 does not fit packet_len = 64"),
         ("run paper-direct --set phy.name=smoke", "phy.name = 'smoke': no such phy; known are direct, "),
