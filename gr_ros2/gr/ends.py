@@ -1,7 +1,7 @@
-"""What the two blocks share: their settings, their registry, their place on a ROS graph, and the loop guard.
+"""Shared parts of the two blocks: settings, registry, participant on a ROS graph, and loop guard.
 
-Invariant: a sink must not publish what a source on the same graph subscribes, or a message would circulate without end;
-every block of this process is checked against every other when it is made.
+Invariant: a sink must not publish a topic that a source on the same graph subscribes to. Otherwise a message would
+circulate without end. Each new block is checked against all other blocks of this process.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def settings(
 ) -> _T:
     """The configuration of a block from its keyword arguments.
 
-    :raises ConfigError: naming key, value and what is allowed
+    :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
     named = dict(values)
     if isinstance(registry, str):
@@ -51,16 +51,16 @@ def settings(
 
 
 def own_settings(config: SourceConfig | SinkConfig) -> dict[str, Any]:
-    """A block's settings as its keyword arguments, without what is handed over as an object."""
+    """The settings of a block as its keyword arguments, without ``registry`` and ``middleware``."""
     names = {item.name for item in fields(config)} - {"registry", "middleware"}
     return {name: getattr(config, name) for name in names}
 
 
 def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
-    """The registry itself, or the one in a CSV file.
+    """Return a Registry as it is, or read it from a CSV file.
 
-    :param needed: whether there has to be one; where topics are announced a receiver can do without
-    :raises ConfigError: when there is none, or the file is wrong
+    :param needed: whether a registry is required. A receiver needs none if the senders announce their topics
+    :raises ConfigError: when a required registry is missing, or the file is wrong
     """
     if isinstance(registry, Registry):
         return registry
@@ -72,26 +72,27 @@ def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
 
 
 def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> MessageCodec | None:
-    """The codec of a link that compresses, None of one that does not.
+    """The codec of a link with compression; None for a link without.
 
     :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
     """
     if not config.compression:
         return None
-    from gr_ros2.compression import LinkCodec  # only here: links that do not compress need none of it
+    from gr_ros2.compression import LinkCodec  # imported here: links without compression do not need it
 
     return LinkCodec(registry.with_options(config.topic_options), config.dictionaries)
 
 
 @dataclass(frozen=True)
 class Start:
-    """What an end of version 1 is to know of this start of its robot.
+    """What a version 1 endpoint must know about the current start of its robot.
 
-    :param boot: number of the start, greater than all before
-    :param heard: how far other robots had been heard before, by robot id: boot number and packet number
-    :param save: stores that, see :class:`gr_ros2.boots.BootFile`
-    :param reports: whether the robots that it receives from can receive from it
-    :param half_duplex: whether what it says takes air from what it hears
+    :param boot: number of this start, greater than all earlier numbers
+    :param heard: the last packet heard from each other robot before this start, by robot id: boot number and packet
+        number
+    :param save: stores ``heard``, see :class:`gr_ros2.boots.BootFile`
+    :param reports: whether the robots from which it receives can also receive from it
+    :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     """
 
@@ -114,13 +115,13 @@ def make_endpoint(
     rng: random.Random | None = None,
     observer: Callable[[SenderEvent], None] | None = None,
 ) -> Endpoint:
-    """One robot's end of a link, of the version that its settings name.
+    """Make one robot's end of a link, of the version in its settings.
 
-    :param source: what it sends; None: nothing
-    :param sink: what it receives; None: nothing
-    :param start: for version 1
-    :param codec: of all messages; None makes it where ``compression`` is on
-    :raises ConfigError: for settings that do not go together
+    :param source: settings of the sending half; None: it sends nothing
+    :param sink: settings of the receiving half; None: it receives nothing
+    :param start: for version 1 only
+    :param codec: codec of all messages; None: made here if ``compression`` is on
+    :raises ConfigError: for settings that contradict each other
     """
     to_air = from_air = codec
     if codec is None:
@@ -145,17 +146,17 @@ def make_endpoint(
 
 
 def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> MessageCodec:
-    """What decodes the messages of a robot that announced these topics."""
+    """The codec that decodes the messages of a robot that announced these topics."""
     from gr_ros2.compression import LinkCodec
 
     return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
 
 
 def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, half_duplex: bool = False) -> Start:
-    """This start of a robot, counted in its state file; its keys.
+    """Count this start of a robot in its state file, and read the robot's keys.
 
-    :param src_id: of the robot, -1 for one that says nothing
-    :raises ConfigError: a key file or a state file that cannot be read or understood
+    :param src_id: id of the robot, -1 for a robot that sends nothing
+    :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
     if not config.version:
@@ -168,23 +169,23 @@ def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, h
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
     file = BootFile(path, time.time())
-    # Nobody can tell a replay from the original where packets are not sealed, so there is nothing to be remembered.
+    # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
     heard, save = (file.heard, file.save) if config.key else ({}, None)
     return Start(file.boot, keys, heard, save, reports, half_duplex)
 
 
 def state_folder() -> Path:
-    """Where what a robot must not forget is kept: the folder of XDG for state."""
+    """The folder for the state files of robots, inside the XDG folder for state."""
     base = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
     return Path(base).expanduser() / "gr_ros2"
 
 
 class LiveEnd:
-    """An end that blocks of one flowgraph share, and the one lock that guards it.
+    """An endpoint that the blocks of one flowgraph share, and the one lock that protects it.
 
     :param make: makes the endpoint, given its observer
     :ivar work: notified when a packet may leave
-    :ivar observer: hears what the sending half does, with the lock held
+    :ivar observer: called with each event of the sending half, while the lock is held
     """
 
     def __init__(self, make: Callable[[Callable[[SenderEvent], None]], Endpoint]) -> None:
@@ -199,9 +200,9 @@ class LiveEnd:
 
 
 class Graph:
-    """A block's participant on a ROS graph: handed over open, or opened by name and then closed by us.
+    """A block's participant on a ROS graph. The caller passes it in open, or this class opens it by name and closes it.
 
-    :param middleware: an open one, or None to open ``name``
+    :param middleware: an open Middleware; for anything else, ``name`` is opened
     :raises GrRos2Error: see :func:`gr_ros2.middleware.join_graph`
     """
 
@@ -214,21 +215,21 @@ class Graph:
             self.owned = True
 
     def same_as(self, other: Graph) -> bool:
-        """Whether what one publishes the other can hear."""
+        """Whether messages published on one of the two graphs reach the other."""
         return meet(self.middleware, other.middleware)
 
     def close(self) -> None:
-        """Leave the graph, if we joined it."""
+        """Leave the graph, if this object has joined it."""
         if self.owned:
             self.middleware.close()
 
 
 def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry) -> None:
-    """Refuse a sink that publishes a topic which a source of the same graph subscribes.
+    """Refuse a sink that publishes a topic to which a source on the same graph subscribes.
 
-    :param subscribed: absolute topic names the source listens to
-    :param registry: the sink's, topic options applied
-    :raises ConfigError: naming the topic
+    :param subscribed: absolute names of the topics to which the source subscribes
+    :param registry: registry of the sink, with topic options applied
+    :raises ConfigError: for a loop; the message names the topic
     """
     names = set(subscribed)
     for merged in config.merged_topics:
@@ -248,7 +249,7 @@ def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry
 
 
 class LoopGuard:
-    """The blocks of this process, as far as loops go."""
+    """Keeps a list of all blocks of this process, to detect loops between them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -256,7 +257,7 @@ class LoopGuard:
         self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
 
     def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
-        """:raises ConfigError: for a loop with a sink that is there"""
+        """:raises ConfigError: for a loop with an existing sink"""
         names = frozenset(subscribed)
         with self._lock:
             for other, config, registry in self._sinks.values():
@@ -265,7 +266,7 @@ class LoopGuard:
             self._sources[block] = (graph, names)
 
     def add_sink(self, block: Any, graph: Graph, config: SinkConfig, registry: Registry) -> None:
-        """:raises ConfigError: for a loop with a source that is there"""
+        """:raises ConfigError: for a loop with an existing source"""
         with self._lock:
             for other, names in self._sources.values():
                 if graph.same_as(other):
@@ -273,7 +274,7 @@ class LoopGuard:
             self._sinks[block] = (graph, config, registry)
 
     def check_output(self, graph: Graph, name: str) -> None:
-        """Refuse a topic that a sink is about to publish, where a source of the same graph subscribes it.
+        """Refuse a topic that a sink is about to publish, if a source on the same graph subscribes to it.
 
         :raises ConfigError: for a loop
         """
@@ -286,7 +287,7 @@ class LoopGuard:
                     )
 
     def remove(self, block: Any) -> None:
-        """A block has left its graph."""
+        """Remove a block that has left its graph."""
         with self._lock:
             self._sources.pop(block, None)
             self._sinks.pop(block, None)

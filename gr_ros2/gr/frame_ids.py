@@ -1,9 +1,10 @@
 """Frame names of several robots on one graph: a prefix per sender, and all their transforms on one topic (REP 105).
 
-Invariants: a message is altered in its frame names only, and re-encoded as its type says (alignment gaps become zero);
-of the definitions that a type has in the distributions of ROS, the one that fits the bytes counts; a frame that has the
-prefix keeps it, an empty one stays empty; what cannot be taken apart passes as it is and is counted by name; of static
-transforms the newest of each child frame is kept, at most ``MAX_STATIC``.
+Invariants: only the frame names of a message change. The message is encoded again as its type defines, and alignment
+gaps become zero. If ROS distributions define a type differently, the definition that fits the bytes is used. A frame
+name that already has the prefix stays as it is; an empty one stays empty. A message that cannot be decoded passes
+unchanged and is counted by name. The newest static transform of each child frame is kept, for at most ``MAX_STATIC``
+frames.
 """
 
 from __future__ import annotations
@@ -20,16 +21,17 @@ from gr_ros2.names import filled
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 MAX_STATIC = 4096
-"""Static transforms kept for late joiners; those of further child frames are published once and counted."""
+"""Number of static transforms kept for late joiners. Those of further child frames are published once and counted."""
 
 _HEADER = "std_msgs/msg/Header"
 _ENDING = "_frame_id"
-"""Of members that name a frame: child_frame_id, body_frame_id, reference_frame_id."""
+"""The ending of members that hold a frame name: child_frame_id, body_frame_id, reference_frame_id."""
 _LITTLE_ENDIAN = 1
 _TF_DEPTH = 100
 
 Plan = tuple[tuple[str, bool, Any], ...]
-"""Members that hold frame names: name, whether it is a sequence or array, and the plan within (None: a frame name)."""
+"""Members that hold frame names: name, whether it is a sequence or array, and the plan of its content (None: a frame
+name)."""
 
 
 def prefixed_frame(prefix: str, frame: str) -> str:
@@ -40,21 +42,21 @@ def prefixed_frame(prefix: str, frame: str) -> str:
 
 
 class FramePrefix:
-    """Puts a prefix before the frame names of messages: ``frame_id`` of every Header, and every ``…_frame_id``.
+    """Adds a prefix to the frame names of messages: ``frame_id`` of every Header, and every ``…_frame_id``.
 
-    :param form: the prefix, ``{src_id}`` is the sender; '' alters nothing
-    :param counters: gets ``frame_unknown_type`` (no definition of the type) and ``frame_damaged`` (the bytes are no
-        message of it): messages that passed as they were
+    :param form: the prefix, in which ``{src_id}`` is the sender; '' changes nothing
+    :param counters: counts messages that passed unchanged: ``frame_unknown_type`` (no definition of the type) and
+        ``frame_damaged`` (the bytes are not a message of the type)
     """
 
     def __init__(self, form: str, counters: Counter[str]) -> None:
         self._form = form
         self._counters = counters
         self._plans: dict[str, list[tuple[Typestore, Plan]]] = {}
-        """Of every definition of a type, the likeliest first."""
+        """Plans by type name, one for each definition of the type; the most likely definition comes first."""
 
     def apply(self, type_name: str, src_id: int, payload: bytes) -> bytes:
-        """The message with prefixed frame names, or as it is."""
+        """The message with prefixed frame names, or the unchanged message."""
         if not self._form:
             return payload
         plans = self._plans.get(type_name)
@@ -75,14 +77,14 @@ class FramePrefix:
 
 
 STATIC_DEPTH = 100
-"""Messages that a subscription of static transforms takes at least, as tf2's listener does: the depth counts over all
-broadcasters, of which each has told something else, and a DDS drops in silence what exceeds it."""
+"""Smallest queue depth of a subscription to static transforms, as in tf2's listener. All broadcasters share this depth,
+and each of them publishes different transforms. A DDS drops further messages without notice."""
 
 
 class StaticTransforms:
-    """All static transforms of several broadcasters, of which each knows only its own.
+    """All static transforms of several broadcasters. Each broadcaster knows only its own.
 
-    :param counters: gets ``tf_damaged`` (messages that are none) and ``tf_static_full`` (transforms not kept)
+    :param counters: counts ``tf_damaged`` (bytes that are not a message) and ``tf_static_full`` (transforms not kept)
     """
 
     def __init__(self, counters: Counter[str]) -> None:
@@ -91,9 +93,9 @@ class StaticTransforms:
         self._store = typestores(TF_TYPE)[0]
 
     def union(self, payload: bytes) -> bytes | None:
-        """A message with all transforms so far, those of this one included; None where it is no message.
+        """A message with all transforms so far, including those in ``payload``; None if ``payload`` is not a message.
 
-        One that has them all already comes back as it is.
+        A ``payload`` that already has all transforms is returned unchanged.
         """
         message = _decode(self._store, TF_TYPE, payload)
         if message is None:
@@ -112,9 +114,9 @@ class StaticTransforms:
 
 
 class MergedTransforms:
-    """One topic of all robots' transforms, and one of all their static ones, latched as a whole.
+    """One topic with the transforms of all robots, and one latched topic with all their static transforms.
 
-    :param topics: absolute names of the two
+    :param topics: absolute names of the two, the moving transforms first
     :param counters: see :class:`StaticTransforms`
     """
 
@@ -125,9 +127,9 @@ class MergedTransforms:
         self._static_publisher = middleware.advertise(static, TF_TYPE, Qos("reliable", "transient_local", 1))
 
     def add(self, payload: bytes, *, static: bool) -> None:
-        """Publish the transforms of one robot's message, its frames prefixed already.
+        """Publish the transforms of one robot's message. Its frame names already have the prefix.
 
-        :raises MiddlewareError: when that fails
+        :raises MiddlewareError: when publishing fails
         """
         if not static:
             self._moving_publisher.publish(payload)
@@ -142,7 +144,7 @@ class MergedTransforms:
 
 
 def _plan(store: Typestore, type_name: str) -> Plan:
-    """Where messages of a type hold frame names; () for nowhere."""
+    """The members of a message type that hold frame names; () if there are none."""
     plan: list[tuple[str, bool, Any]] = []
     for name, described in store.fielddefs[type_name][1]:
         kind, detail = cast("tuple[Nodetype, Any]", described)
@@ -172,7 +174,7 @@ def _rename(message: Any, plan: Plan, prefix: str) -> None:
 
 
 def _decode(store: Typestore, type_name: str, payload: bytes) -> Any:
-    """The message, None where the bytes are none."""
+    """The decoded message; None if the bytes are not a message of the type."""
     if len(payload) < 5 or payload[0] or payload[1] > _LITTLE_ENDIAN:
         return None
     try:
@@ -182,5 +184,5 @@ def _decode(store: Typestore, type_name: str, payload: bytes) -> Any:
 
 
 def _encode(store: Typestore, type_name: str, message: Any, like: bytes) -> bytes:
-    """The bytes of a message, in the byte order of another."""
+    """The bytes of a message, in the byte order of ``like``."""
     return bytes(store.serialize_cdr(message, type_name, little_endian=like[1] == _LITTLE_ENDIAN))

@@ -1,8 +1,8 @@
-"""How a live link is doing: its counters over the last seconds, judged against limits.
+"""The health of a running link: its counters over the last seconds, compared with limits.
 
-Invariants: sans-IO, time is an argument; only counters that both blocks keep anyway are read; what is not known is left
-out, never invented; loss is estimated from gaps in numbers, since a receiver cannot know what was sent. The levels are
-those of diagnostic_msgs/DiagnosticStatus.
+Invariants: no input or output, and time is an argument. Only counters that the blocks keep anyway are read. A value
+that is not known is left out, never invented. Loss is estimated from gaps in numbers, because a receiver cannot know
+what was sent. The levels are those of diagnostic_msgs/DiagnosticStatus.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 Stats = Mapping[str, Any]
 
 _NO_LOSS = {"bursts_in", "bursts_out", "blanked"}
-"""Of what a front end counts: what passed, and what half duplex costs by design."""
+"""Counters of a front end that are not losses: what passed, and samples that half duplex loses by design."""
 _LOCKED = {
     "no_key": "sealed, and no key is configured here",
     "not_sealed": "not sealed, where a key is configured",
@@ -27,11 +27,11 @@ _LOCKED = {
     "replayed": "replays of what was heard before",
     "tag": "damaged, or forged",
 }
-"""Why packets are refused that may be somebody's attack, or somebody's wrong configuration."""
+"""Reasons to refuse a packet that may be caused by an attack or by a wrong configuration."""
 
 
 class Level(IntEnum):
-    """How bad it is."""
+    """Severity of a status."""
 
     OK = 0
     WARN = 1
@@ -42,8 +42,8 @@ class Level(IntEnum):
 class Status:
     """One part of a link.
 
-    :ivar problems: what is past a limit, in words; none where the level is OK
-    :ivar values: figures by name, as text
+    :ivar problems: what is wrong, in words; empty if the level is OK
+    :ivar values: values by name, as text
     """
 
     name: str
@@ -56,7 +56,7 @@ class Status:
         return "; ".join(self.problems) or "OK"
 
     def judge(self, what: str, value: float, unit: str, warn: float, error: float = 0.0) -> None:
-        """Add a figure, and raise the level where it is past a limit (0: no limit)."""
+        """Add a value, and raise the level if the value exceeds a limit (0: no limit)."""
         self.values[f"{what} ({unit})" if unit else what] = f"{value:.3g}"
         level = Level.ERROR if error and value > error else Level.WARN if warn and value > warn else Level.OK
         if level:
@@ -64,7 +64,7 @@ class Status:
             self.problems.append(f"{what} {value:.3g} {unit}".strip())
 
     def warn(self, what: str, count: int, before: int) -> None:
-        """Add a count of what should never happen, and warn of what is new of it."""
+        """Add a count of events that should never happen, and warn if the count has grown."""
         self.values[what] = str(count)
         if count > before:
             self.level = max(self.level, Level.WARN)
@@ -72,7 +72,7 @@ class Status:
 
 
 class _Look(NamedTuple):
-    """The counters that matter at one moment; of a topic, messages delivered and messages lost."""
+    """The relevant counters at one moment. For each topic: messages delivered and messages lost."""
 
     now: float
     sent: int
@@ -89,7 +89,7 @@ class _Look(NamedTuple):
 class LinkHealth:
     """Judges the snapshots of one link, taken at regular times.
 
-    :param name: before the name of every part
+    :param name: prefix of the name of every part
     """
 
     def __init__(self, config: DiagnosticsConfig, name: str) -> None:
@@ -99,9 +99,9 @@ class LinkHealth:
         self._heard_at: float | None = None
 
     def judge(self, stats: Stats, now: float) -> list[Status]:
-        """Receiver, transmitter, front end where it counts anything, and every topic received.
+        """The status of receiver, transmitter, front end (if it counts anything) and every topic received.
 
-        :param stats: of a ``RobotLink``
+        :param stats: statistics of a ``RobotLink``
         :param now: s, monotonic
         """
         look = _look(stats, now)
@@ -150,7 +150,7 @@ class LinkHealth:
         status.values["packets waiting"] = str(stats["packets"]["backlog"])
         topics = stats["source"]["topics"].values()
         status.values["messages waiting"] = str(sum(topic["queued"] for topic in topics))
-        # A queue of the newest message alone is full by design, and one without a bound never is.
+        # A queue that holds only the newest message is full by design. A queue without a bound is never full.
         bounded = [topic for topic in topics if topic["queue_depth"] and topic["queue"] != "latest"]
         if bounded:
             fullest = max(topic["queued"] / topic["queue_depth"] for topic in bounded)
@@ -163,7 +163,7 @@ class LinkHealth:
         return status
 
     def _front_end(self, look: _Look, before: Mapping[str, int]) -> list[Status]:
-        """What the front end counts; a warning of what it lost since the last look. None where it counts nothing."""
+        """The counters of the front end, with a warning of new losses. Empty if it counts nothing."""
         status = Status(f"{self._name}: front end")
         for name, count in look.front_end.items():
             status.warn(name.replace("_", " "), count, count if name in _NO_LOSS else before.get(name, 0))

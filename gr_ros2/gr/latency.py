@@ -1,7 +1,7 @@
-"""The sink's live latency: from a message's own stamp to its publication.
+"""Latency in a running sink: from a message's own stamp to its publication.
 
-Invariants: only types whose first field is a std_msgs/Header have one; a stamp of zero is unset, as ROS has it;
-negative values (clocks that disagree) are kept and counted; memory is bounded by a window of the newest values.
+Invariants: only types whose first field is a std_msgs/Header have a latency. A stamp of zero means unset, as in ROS.
+Negative values, caused by clocks that disagree, are kept and counted. A window of the newest values limits the memory.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import NamedTuple
 from gr_ros2.middleware.type_definitions import typestores
 
 WINDOW = 10_000
-"""Newest values the percentiles are taken over."""
+"""Number of newest values in the percentiles."""
 RECENT = 100
-"""Newest values that say how it is now."""
+"""Number of newest values that show the current latency."""
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 _TIME = (struct.Struct(">iI"), struct.Struct("<iI"))
@@ -25,15 +25,15 @@ _LITTLE_ENDIAN = 1
 
 
 def has_header(type_name: str) -> bool:
-    """Whether messages of a type begin with a std_msgs/Header; False where the type is not known."""
-    for store in typestores(type_name)[:1]:  # no type of ROS ever got or lost its header
+    """Whether messages of a type begin with a std_msgs/Header; False if the type is not known."""
+    for store in typestores(type_name)[:1]:  # no ROS type ever gained or lost its header
         _, members = store.fielddefs[type_name]
         return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
     return False
 
 
 def leading_time(payload: bytes) -> float | None:
-    """The time a serialized message begins with (a Header's stamp, or a Clock), s; None if unset or too short."""
+    """The time at the start of a serialized message (a Header's stamp, or a Clock), s; None if unset or too short."""
     if len(payload) < _CDR_HEAD + 8 or payload[0] != 0:
         return None
     seconds, nanoseconds = _TIME[payload[1] & _LITTLE_ENDIAN].unpack_from(payload, _CDR_HEAD)
@@ -41,7 +41,7 @@ def leading_time(payload: bytes) -> float | None:
 
 
 class LatencySummary(NamedTuple):
-    """Over the window, s; None where nothing was measured. ``measured`` and ``negative`` are since the start."""
+    """Latencies over the window, s; None if there are none. ``measured`` and ``negative`` count since the start."""
 
     p50: float | None
     p95: float | None
@@ -65,7 +65,7 @@ class LatencyWindow:
         self._negative += seconds < 0
 
     def copy(self) -> LatencyWindow:
-        """As it is now."""
+        """A copy of the current state."""
         copied = LatencyWindow()
         copied._values = self._values.copy()
         copied._count, copied._negative = self._count, self._negative
@@ -77,7 +77,10 @@ class LatencyWindow:
         return self._values[-1] if self._values else None
 
     def summary(self, newest: int = WINDOW) -> LatencySummary:
-        """Percentiles by nearest rank, over that many of the newest values."""
+        """Percentiles by nearest rank.
+
+        :param newest: number of newest values to use
+        """
         values = sorted(islice(reversed(self._values), newest))
         if not values:
             return LatencySummary(None, None, None, None, 0, 0)

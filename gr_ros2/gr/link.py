@@ -1,6 +1,7 @@
 """ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
 
-Invariant: source and sink are the blocks of these names around one end, so that what is heard changes what is sent.
+Invariant: the block contains a RosSource and a RosSink that share one endpoint. So received packets can change what is
+sent.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from gr_ros2.registry import Registry
 class RosLink(gr.hier_block2):  # type: ignore[misc]
     """One robot's end of a link.
 
-    Message ports: `pdus` in and out, `credit` in, as of :class:`RosSource` and :class:`RosSink`.
+    Message ports: `pdus` in and out, `credit` in, as in :class:`RosSource` and :class:`RosSink`.
 
     :param registry: CSV path or Registry
-    :param source: settings of what it sends
-    :param sink: settings of what it receives
-    :param middleware: open ones of the source and of the sink; None opens what the settings say
-    :param half_duplex: what this end says takes air from what it hears
-    :param start: what is to be known of this start, for version 1; None takes it from the files of the settings
+    :param source: settings of the sending half
+    :param sink: settings of the receiving half
+    :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
+    :param half_duplex: whether sending and receiving share the airtime
+    :param start: what version 1 must know about this start; None: read from the files in the settings
     :param observer, clock, seed: see :class:`RosSource`
-    :raises ConfigError: for settings that do not go together
+    :raises ConfigError: for settings that contradict each other
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Packets to PDUs and back, the fast way.
+"""Fast conversion of packets to PDUs and back.
 
-Invariants: a PDU is a PMT pair of a dictionary and a u8vector; what comes back from ``packet_of`` is bytes or a named
-reason why it is none, whatever object came in; metadata is for people and other blocks, never trusted here.
+Invariants: a PDU is a PMT pair of a dictionary and a u8vector. For any object, ``packet_of`` returns bytes or a named
+reason why there are none. Metadata is for people and other blocks; it is never trusted here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _CACHED_HEADERS = 4096
 
 
 class PduMaker:
-    """Makes PDUs of packets; remembers the metadata that repeats."""
+    """Makes PDUs from packets, and caches the metadata that repeats."""
 
     def __init__(self) -> None:
         self._metadata: dict[tuple[int, ...], Any] = {}
@@ -26,7 +26,7 @@ class PduMaker:
     def pdu(self, packet: Packet, data: bytes, wall: float) -> Any:
         """One packet as a PDU.
 
-        :param data: its bytes
+        :param data: bytes of the packet
         :param wall: s since 1970, for ``t_src_wall``
         """
         header = (packet.src_id, packet.dst_id, packet.seq, packet.qos)
@@ -40,7 +40,7 @@ class PduMaker:
 
 
 def packet_of(pdu: Any) -> tuple[bytes, str]:
-    """The bytes of a PDU and '', or no bytes and why: ``not_a_pair`` or ``not_u8``."""
+    """The bytes of a PDU and '', or no bytes and the reason: ``not_a_pair`` or ``not_u8``."""
     if not pmt.is_pair(pdu):
         return b"", "not_a_pair"
     vector = pmt.cdr(pdu)

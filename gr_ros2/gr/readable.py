@@ -1,7 +1,7 @@
-"""What `debug` writes: one line per packet, for people.
+"""The output of `debug`: one readable line per packet.
 
-Invariant: only where a user asked for `debug` and no logging is set up does a handler appear, on standard output as the
-paper has it (section 4.3); otherwise logging is the application's.
+Invariant: a log handler is added only if a user asked for `debug` and no logging is set up. It writes to standard
+output, as in the paper (section 4.3). Otherwise the application controls the logging.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gr_ros2.wire import QOS_NAMES
 
 
 def describe(event: SentPacket | Received | Rejected, registry: Registry) -> str:
-    """Header fields, then each entry as topic#entry_id[index/total] and its size; or why it is no packet."""
+    """Header fields, then each entry as topic#entry_id[index/total] and its size; or why the packet was refused."""
     if isinstance(event, Rejected):
         return f"refused ({event.error.kind}): {event.error}"
     packet = event.packet
@@ -30,7 +30,7 @@ def describe(event: SentPacket | Received | Rejected, registry: Registry) -> str
 
 
 def debug_logger(name: str, debug: bool) -> logging.Logger:
-    """The logger of a block, made to show its debug lines where asked."""
+    """The logger of a block. With ``debug``, its debug lines are shown."""
     logger = logging.getLogger(name)
     if debug:
         logger.setLevel(logging.DEBUG)

@@ -1,9 +1,9 @@
 """ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
 
-Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; only the bytes of a PDU are
-trusted; neither the message handler nor the thread of timeouts ever raises, since that would end it while the flowgraph
-seems alive; messages are published in completion order; what counts as delivered was published, and everything else is
-counted by name.
+Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. Only the bytes
+of a PDU are trusted. The message handler and the timeout thread never raise, because an exception would end them while
+the flowgraph seems to run. Messages are published in the order in which they become complete. A message counts as
+delivered only after it was published. Everything else is counted by name.
 """
 
 from __future__ import annotations
@@ -49,18 +49,19 @@ _COUNTED = (
 class RosSink(gr.basic_block):  # type: ignore[misc]
     """Reassembles packets into messages and publishes them on a ROS graph.
 
-    Message port: `pdus` in (PMT pair of anything and a u8vector). A publisher appears with the first message of a
-    sender and topic. ``close`` leaves the graph; the end of the process does it too. A middleware handed over open is
-    closed by who opened it.
+    Message port: `pdus` in (PMT pair of anything and a u8vector). The first message of each sender and topic creates a
+    publisher. ``close`` leaves the graph, and so does the end of the process. A middleware that is passed in open must
+    be closed by the caller.
 
-    :param registry: CSV path or Registry, the same as at the source; '' with version 1, where senders announce theirs
+    :param registry: CSV path or Registry, the same as at the source; '' with version 1, where senders announce their
+        topics
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
-    :param observer: hears every ReceiverEvent, in order, and Delivered after it was published; when it raises, it is
-        told nothing more
+    :param observer: called with every ReceiverEvent, in order; with Delivered after the message was published. An
+        observer that raises is not called again
     :param clock: s, monotonic
-    :param end: of both directions, where a source shares it; None makes one that says nothing
+    :param end: endpoint of both directions, shared with a source; None: an endpoint that only receives is made
     :param values: the fields of :class:`gr_ros2.config.SinkConfig`
-    :raises ConfigError: naming key, value and what is allowed
+    :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
         self._end, self._work = end.endpoint, end.work
         self._announced: dict[tuple[int, int], Topic] = {}
-        """What topic ids mean that senders have announced themselves, by source and topic id."""
+        """Topics that senders have announced, by source id and topic id."""
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
@@ -100,8 +101,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._counters: Counter[str] = Counter()
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
-        # Kept when a robot has gone: its map stays available to those who come later, and one that comes back is not
-        # discovered again. At most as many as there are source ids times topics of the registry.
+        # Publishers are kept when a robot has gone. Late subscribers still get its map, and a robot that comes back
+        # needs no new discovery. There are at most as many as source ids times topics of the registry.
         self._publishers: dict[tuple[int, int], Publisher] = {}
         self._latency: dict[tuple[int, int], LatencyWindow] = {}
         self._published: Counter[tuple[int, int]] = Counter()
@@ -112,7 +113,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
         self.handled = 0
-        """PDUs this block is done with, whatever became of them."""
+        """Number of PDUs that this block has finished with, whatever the result."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._handle)
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, "gr_ros2_sink")
@@ -130,11 +131,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     @property
     def middleware(self) -> Middleware:
-        """Our participant on the ROS graph."""
+        """This block's participant on the ROS graph."""
         return self._graph.middleware
 
     def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
-        """Make the publishers of a sender that is expected, so that subscribers find them before its first message.
+        """Create the publishers of an expected sender now, so that subscribers find them before its first message.
 
         :raises MiddlewareError: when a topic cannot be announced
         """
@@ -196,21 +197,21 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
             }
-        # Thousands of latencies are sorted without the lock, which the next packet waits for.
+        # There may be thousands of latencies. They are sorted without the lock, because the next packet waits for it.
         for key, window in windows.items():
             summaries = {"latency_s": window.summary(), "recent_latency_s": window.summary(RECENT)}
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
         return {**counted, "topics": {self._name(key): topic for key, topic in topics.items()}}
 
     def set_reassembly_timeout_s(self, reassembly_timeout_s: float) -> None:
-        """s an incomplete message is kept (raises ConfigError out of range)."""
+        """Set how long an incomplete message is kept, s (raises ConfigError out of range)."""
         with self._lock:
             self.config = replaced(self.config, reassembly_timeout_s=reassembly_timeout_s)
             self._end.keep_incomplete(reassembly_timeout_s)
             self._timer_due.notify_all()
 
     def set_debug(self, debug: bool) -> None:
-        """Readable log of headers, topic ids and entries."""
+        """Turn the readable log of headers, topic ids and entries on or off."""
         with self._lock:
             self.config = replaced(self.config, debug=debug)
         self._log = debug_logger(self._log.name, self.config.debug)
@@ -219,9 +220,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return self._topic(key).republished(self.config.namespace_format, key[0])
 
     def _topic(self, key: tuple[int, int]) -> Topic:
-        """What a sender's topic id means: as it has announced, or as the registry has it.
+        """The topic that a sender's topic id means, from its announcement or from the registry.
 
-        :raises ConfigError: neither says so
+        :raises ConfigError: when the topic id is in neither of them
         """
         topic = self._announced.get(key)
         if topic is not None:
@@ -231,7 +232,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
 
     def _learn(self, event: Announced) -> None:
-        """Take over what a sender says of its topics; a publisher of what has another name or type now is closed."""
+        """Take over the topics that a sender announces. A publisher whose topic has a new name or type is closed."""
         for row in event.rows:
             key = (event.src_id, row.topic_id)
             try:
@@ -267,12 +268,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _handle(self, pdu: Any) -> None:
         try:
             self._take(pdu)
-        except Exception as error:  # noqa: BLE001 - raised here, it would end the block's thread and all reception
+        except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
         self.handled += 1
 
     def _failed(self, error: Exception) -> None:
-        """Count what should not happen, and tell of the first."""
+        """Count an unexpected error, and log the first one."""
         with self._lock:
             self._counters["handler_failed"] += 1
             first = self._counters["handler_failed"] == 1
@@ -297,7 +298,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._settle(events)
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:
-        """Do what each event asks for, then tell the observer."""
+        """Handle each event, then call the observer."""
         for event in events:
             try:
                 if self.config.debug and isinstance(event, Received | Rejected):
@@ -309,7 +310,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 result = self._publish(event) if isinstance(event, Delivered) else event
                 if self._observer is not None:
                     self._guard(self._observer.receiver_event, result, self._clock())
-            except Exception as error:  # noqa: BLE001 - raised here, it would take the next events and the thread along
+            except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
                 self._failed(error)
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
@@ -319,7 +320,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
             publisher = self._publishers.get(key) or self._advertise(key)
             publisher.publish(payload)
-        except Exception as error:  # noqa: BLE001 - for whatever reason: nobody got the message
+        except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
             named = f"topic id {key[1]} of robot {key[0]}"
             self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
@@ -337,7 +338,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return event
 
     def _warn(self, event: Rejected) -> None:
-        """Say once of each reason that concerns keys why nothing is heard."""
+        """Log each refusal that concerns keys, once for each reason."""
         if isinstance(event.error, SealError) and event.error.kind not in self._said:
             self._said.add(event.error.kind)
             self._log.warning("ros2_sink: a packet was refused (%s): %s", event.error.kind, event.error)
@@ -345,11 +346,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
         try:
             transforms.add(payload, static=static)
-        except Exception as error:  # noqa: BLE001 - the message they came in is published and counts as delivered
+        except Exception as error:  # noqa: BLE001 - the message itself was published and counts as delivered
             self._tell_first("tf_failed", "transforms were not merged", error)
 
     def _tell_first(self, counter: str, what: str, error: Exception) -> None:
-        """Count something that failed, and tell of the first: how it came about where it is no error of ours."""
+        """Count a failure and log the first one, with a traceback if the error is not one of this project."""
         with self._lock:
             self._counters[counter] += 1
             first = self._counters[counter] == 1
@@ -376,7 +377,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._latency[key].add(now - stamp)
 
     def _forget_the_gone(self) -> None:
-        """Free the latencies, 0.3 MB a topic, of senders whose place the receiver has given to others."""
+        """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""
         known = self._end.knows
         self._latency = {key: window for key, window in self._latency.items() if known(key[0])}
 

@@ -1,8 +1,8 @@
-"""ROS Source: ROS topics in, packets out on message port `pdus` (the paper, section 4.1 and 4.3).
+"""ROS Source: ROS topics in, packets out on message port `pdus` (the paper, sections 4.1 and 4.3).
 
-Invariants: a thin shell, all behaviour is in the link's engine, which one lock guards; packets are composed just before
-they go, by one pump thread; a callback of the middleware blocks only under ``backpressure``; nothing is dropped
-unnamed.
+Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. One pump thread
+composes each packet just before it leaves. A callback of the middleware blocks only with ``backpressure``. Every
+dropped message is counted by name.
 """
 
 from __future__ import annotations
@@ -39,29 +39,30 @@ from gr_ros2.setting import AUTO, Auto
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 16
-"""Packets composed before the lock is given up, so that callbacks do not wait."""
+"""Number of packets composed before the lock is released, so that callbacks do not wait long."""
 _JOIN_S = 1.0
 _SHORTEST_WAIT_S = 2e-4
 
 
 class RosSource(gr.basic_block):  # type: ignore[misc]
-    """Subscribes topics of a ROS graph and emits them as packets.
+    """Subscribes to topics of a ROS graph and emits their messages as packets.
 
-    Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit`
-    in, optional: from its first message on, as many packets leave as messages came; an integer counts for as many.
+    Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
+    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave.
 
-    Messages are taken from construction on; packets leave while the flowgraph runs. ``close`` leaves the graph; the
-    end of the process does it too. A middleware handed over open is started and closed by who opened it.
+    The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
+    graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
+    caller.
 
     :param registry: CSV path or Registry
     :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
-    :param observer: called with every SenderEvent, in order, with the block's lock held: it must not call back; when it
-        raises, it is told nothing more
+    :param observer: called with every SenderEvent, in order, while the block's lock is held. It must not call the
+        block. An observer that raises is not called again
     :param clock: s, monotonic
-    :param seed: of sequence number and entry ids; None is random
-    :param end: of both directions, where a sink shares it; None makes one that hears nothing
-    :param settings: the fields of :class:`gr_ros2.config.SourceConfig`
-    :raises ConfigError: naming key, value and what is allowed
+    :param seed: seed of sequence number and entry ids; None: random
+    :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
+    :param values: the fields of :class:`gr_ros2.config.SourceConfig`
+    :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
 
     def __init__(
@@ -104,13 +105,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.emitted = 0
-        """PDUs that have left."""
+        """Number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
         self.message_port_register_out(PDUS)
-        self._publish = self.message_port_pub  # found through two proxies otherwise, for every packet
+        self._publish = self.message_port_pub  # stored: each look-up would pass through two proxies
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
         chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
@@ -128,12 +129,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     @property
     def middleware(self) -> Middleware:
-        """Our participant on the ROS graph."""
+        """This block's participant on the ROS graph."""
         return self._graph.middleware
 
     @property
     def idle(self) -> bool:
-        """Whether no message is waiting or under way."""
+        """Whether no message is waiting or being sent."""
         with self._lock:
             return self._end.idle
 
@@ -144,7 +145,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     @property
     def unmatched(self) -> list[str]:
-        """Topics, by their names on the ROS graph, that nobody publishes yet."""
+        """Names, on the ROS graph, of the topics that nobody publishes yet."""
         subscriptions = dict(self._subscriptions)
         names = {topic.topic_id: name for name, topic in self.subscribed.items()}
         return [names[number] for number, subscription in subscriptions.items() if not subscription.matched()]
@@ -191,7 +192,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._finalizer()
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: packets and messages, per topic and in all."""
+        """A snapshot of the counters of packets and messages, per topic and in total."""
         with self._lock:
             self._take_losses()
             stats = self._end.sent
@@ -226,35 +227,38 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             }
 
     def set_packet_rate(self, packet_rate: float | Auto) -> None:
-        """Packets/s at most, auto as credits come, 0 unpaced (raises ConfigError out of range, like all setters)."""
+        """Set the largest packet rate, packets/s. With auto, the credits set the pace; with 0 there is no limit.
+
+        :raises ConfigError: out of range, as in all setters
+        """
         self._reconfigure(packet_rate=packet_rate)
 
     def set_flush_timeout_s(self, flush_timeout_s: float) -> None:
-        """s a partly filled packet waits for company."""
+        """Set how long a partly filled packet waits for more entries, s."""
         self._reconfigure(flush_timeout_s=flush_timeout_s)
 
     def set_greedy(self, greedy: bool) -> None:
-        """Several entries of one topic in a packet."""
+        """Set whether a packet may hold several entries of one topic."""
         self._reconfigure(greedy=greedy)
 
     def set_dst_id(self, dst_id: int) -> None:
-        """Destination id, 255 broadcast."""
+        """Set the destination id; 255 is broadcast."""
         self._reconfigure(dst_id=dst_id)
 
     def set_hop(self, hop: int) -> None:
-        """Initial hop count."""
+        """Set the initial hop count."""
         self._reconfigure(hop=hop)
 
     def set_queue_depth(self, queue_depth: int) -> None:
-        """Messages waiting per topic, 0 unbounded."""
+        """Set how many messages may wait per topic; 0 is unlimited."""
         self._reconfigure(queue_depth=queue_depth)
 
     def set_repeat_s(self, repeat_s: float) -> None:
-        """s between repeats of a transient-local topic, 0 off."""
+        """Set the time between repeats of a transient-local topic, s; 0 is off."""
         self._reconfigure(repeat_s=repeat_s)
 
     def set_debug(self, debug: bool) -> None:
-        """Readable log of headers, topic ids and entries."""
+        """Turn the readable log of headers, topic ids and entries on or off."""
         with self._lock:
             self.config = replaced(self.config, debug=debug)
         self._log = debug_logger(self._log.name, self.config.debug)
@@ -283,7 +287,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self.middleware.start()
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
-        """What the publishers of a topic offer: its queue follows, where it is not configured."""
+        """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         qos = agreed(offers)
         with self._lock:
             changed = self._end.follow(
@@ -299,7 +303,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
 
     def _take(self, topic_id: int, payload: bytes) -> None:
-        """A message of the ROS graph, in a thread of the middleware."""
+        """Accept a message of the ROS graph, in a thread of the middleware."""
         with self._lock:
             while self.config.backpressure and not self._closed and not self._end.room(topic_id):
                 self._room.wait()
@@ -308,15 +312,15 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 return
             if topic_id in self._subscriptions:
                 self._end.missed(topic_id, self._subscriptions[topic_id].lost)
-            # A robot that comes late gets the newest message of a topic, which then has to hold all static transforms.
+            # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             self._end.submit(topic_id, whole or payload, self._clock())
-            if not self._end.out_of_credit:  # waking the pump for nothing would cost as much as a packet
+            if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
                 self._work.notify()
 
     def _take_losses(self) -> None:
-        """What the ROS graph has lost before it reached us is part of what was sent. Called with the lock held."""
+        """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
         for topic_id, subscription in self._subscriptions.items():
             self._end.missed(topic_id, subscription.lost)
 
@@ -330,7 +334,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         while self._running:
             try:
                 self._emit(self._compose())
-            except Exception as error:  # noqa: BLE001 - raised here, it would end all transmission
+            except Exception as error:  # noqa: BLE001 - an exception would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1
                     first = self._counters["pump_failed"] == 1
@@ -338,7 +342,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                     self._log.exception("ros2_source %d: %s", self.src_id, error)
 
     def _compose(self) -> list[SentPacket]:
-        """The packets that may go now; if there are none, nothing, after waiting for a reason to look again."""
+        """The packets that may leave now. If there are none, wait for a reason to look again and return none."""
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
@@ -368,7 +372,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name
-            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # what `latest` is for
+            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

@@ -11,7 +11,7 @@ from gr_ros2.backends import Backend, BackendTable
 class FrontEndBackend(Backend):
     """One row of the front end table.
 
-    :param sample_rate: samples/s of a link whose user names no rate: one that all its devices can have
+    :param sample_rate: default sample rate of a link, samples/s; all devices of the front end support it
     """
 
     sample_rate: float = 1e6

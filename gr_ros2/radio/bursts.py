@@ -1,8 +1,8 @@
-"""Bursts as transmitting devices want them: padded, at the right level, their length told by a tag; and a deaf receiver
-meanwhile, where the device needs it.
+"""Bursts in the form that transmitting devices need: padded, at the right level, with their length in a tag. For
+devices that need it, samples received during a burst are blanked.
 
-Invariants: every burst has the same length, so where one begins and ends is arithmetic on sample numbers, never a tag
-from upstream; a burst leaves as soon as its last sample is in; what follows the last sample are zeros, never the next
+Invariants: all bursts have the same length. So the begin and end of a burst follow from sample numbers, never from a
+tag from upstream. A burst leaves as soon as its last sample has arrived. Zeros follow the last sample, never the next
 burst.
 """
 
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from gr_ros2.phy.threads import KeepsThreadState
 
 LENGTH_TAG = "burst_len"
-"""On a burst's first sample: how many it has. With ``tx_sob`` and ``tx_eob`` instead ``uhd.usrp_sink`` would begin one
-of its own when it starts, which can damage the first two of ours (gnuradio#1944)."""
+"""Tag on the first sample of a burst: the number of its samples. With ``tx_sob`` and ``tx_eob`` instead,
+``uhd.usrp_sink`` would begin a burst of its own at its start. That burst can damage our first two (gnuradio#1944)."""
 _LENGTH = pmt.intern(LENGTH_TAG)
 _REMEMBERED = 64
-"""Bursts whose times are kept: more than a receiver can be behind."""
+"""Number of bursts whose times are kept. A receiver is never that many bursts behind."""
 
 Samples = NDArray[np.complex64]
 
@@ -36,10 +36,10 @@ Samples = NDArray[np.complex64]
 class BurstLayout:
     """One packet's burst, in samples.
 
-    :param samples: what the transmitter gives, above 0
-    :param lead: zeros before it, while the amplifier settles
-    :param tail: zeros behind it at least, to push the last sample out of filters and buffers
-    :param multiple: the whole is a multiple of this, so that no device waits for the rest of a transfer
+    :param samples: number of samples from the transmitter, above 0
+    :param lead: zeros before the packet, while the amplifier settles
+    :param tail: smallest number of zeros behind the packet, to push the last sample out of filters and buffers
+    :param multiple: the total length is a multiple of this, so that no device waits for the rest of a transfer
     """
 
     samples: int
@@ -54,11 +54,12 @@ class BurstLayout:
 
 
 class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
-    """A transmitter's samples in, whole bursts out, tagged with their length.
+    """Takes the samples of a transmitter and gives whole bursts, tagged with their length.
 
-    A sample beyond full scale, which a converter would turn into its opposite, is brought back to it and counted.
+    A converter would turn a sample beyond full scale into its opposite. Such a sample is reduced to full scale and
+    counted.
 
-    :param layout: of a burst
+    :param layout: layout of a burst
     :param scale: factor on the samples
     :param sample_rate: samples/s
     :param clock: s, monotonic
@@ -77,19 +78,19 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         self._burst_s = layout.total / sample_rate
         self._clock = clock
         self.clipped = 0
-        """Samples that were beyond full scale."""
+        """Number of samples that were beyond full scale."""
         self._sending: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
         self._lock = threading.Lock()
         self.set_tag_propagation_policy(gr.TPP_DONT)
         self.set_output_multiple(layout.total)
 
     def sent(self, begin: float, end: float) -> list[tuple[float, float]]:
-        """From when to when bursts were on the air, s of the clock, as far as they touch an interval."""
+        """Begin and end of the bursts on the air that touch an interval, s of the clock."""
         with self._lock:
             return [times for times in self._sending if times[0] <= end and begin <= times[1]]
 
     def forecast(self, noutput_items: int, ninputs: int) -> list[int]:
-        # Whole bursts only: a device that has begun one must not wait for the rest.
+        # Whole bursts only: a device that has begun a burst must not wait for the rest of it.
         return [noutput_items // self._layout.total * self._layout.samples] * ninputs
 
     def general_work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
@@ -111,7 +112,7 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         return samples
 
     def _note(self, bursts: int) -> None:
-        """Remember when these bursts are on the air: now, or behind those before them."""
+        """Store when these bursts are on the air: now, or directly after the bursts before them."""
         with self._lock:
             for _ in range(bursts):
                 begin = max(self._clock(), self._sending[-1][1] if self._sending else float("-inf"))
@@ -125,12 +126,12 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
 
 
 class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Samples in and out; zeros for those that came while we sent, and for ``after`` s beyond.
+    """Passes samples on. Sets those to zero that arrive while this robot sends, or up to ``after`` s later.
 
-    A sample's time is when it gets here, so ``after`` has to cover what it takes from the antenna to this place.
+    The time of a sample is its arrival at this block. So ``after`` must cover the delay from the antenna to this block.
 
-    :param sent: when we were sending, as :meth:`BurstShaper.sent`
-    :param after: s
+    :param sent: returns the times of sending, like :meth:`BurstShaper.sent`
+    :param after: time to blank after each burst, s
     :param sample_rate: samples/s
     """
 
@@ -147,7 +148,7 @@ class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._sample_rate = sample_rate
         self._clock = clock
         self.blanked = 0
-        """Samples made zero."""
+        """Number of samples set to zero."""
         self.set_tag_propagation_policy(gr.TPP_DONT)
 
     def work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
@@ -155,7 +156,7 @@ class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         out[:] = input_items[0][: len(out)]
         first = self._clock() - len(out) / self._sample_rate
         for begin, end in self._sent(first - self._after, self._clock()):
-            # Rounded outwards: a sample that is half ours is ours.
+            # Rounded outwards: a sample that overlaps a burst only in part is blanked too.
             low = max(0, floor((begin - first) * self._sample_rate))
             high = min(len(out), ceil((end + self._after - first) * self._sample_rate))
             out[low:high] = 0

@@ -1,7 +1,7 @@
-"""What `gr-ros2 link` is told: one robot's end of a link as one YAML file.
+"""The configuration of `gr-ros2 link`: one robot's end of a link as one YAML file.
 
-Invariant: everything the two ends of a link must agree on (`registry`, `packet_len`, `phy`) stands at the top level;
-whatever a front end needs stands under `front_end`, and its sample rate is the PHY's.
+Invariant: the settings on which both ends of a link must agree (`registry`, `packet_len`, `phy`) are at the top level.
+The settings of the front end are under `front_end`. Its sample rate is that of the PHY.
 """
 
 from __future__ import annotations
@@ -67,18 +67,18 @@ class LinkConfig(AnyLink):
 
     @property
     def front_end_name(self) -> str:
-        """The row of the table."""
+        """Name of the front end in ``FRONT_ENDS``."""
         return str(self.front_end["name"])
 
     @property
     def front_end_options(self) -> dict[str, Any]:
-        """The settings of that front end."""
+        """The settings of the front end."""
         return {key: value for key, value in self.front_end.items() if key != "name"}
 
     def load_registry(self) -> Registry:
-        """The registry every robot works with.
+        """Load the registry.
 
-        :raises RegistryError: file, line, what is wrong
+        :raises RegistryError: for a wrong file; the message names file, line and problem
         :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
         """
         if not self.registry:
@@ -92,7 +92,7 @@ def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
     """Make a link's configuration from a mapping.
 
     :param where: what to call the mapping in errors, for instance its file name
-    :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; names it
+    :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; the message names it
     """
     values = {"version": 1, **values}
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
@@ -115,4 +115,4 @@ def load_link(path: str | Path, overrides: Sequence[str] = ()) -> LinkConfig:
 
 
 EXAMPLES_DIR = Path(__file__).resolve().parent.parent / "examples"
-"""Where a configuration for each front end lies, ``link-*.yaml``."""
+"""Folder with an example configuration for each front end, ``link-*.yaml``."""

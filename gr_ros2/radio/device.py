@@ -1,9 +1,9 @@
-"""What all radios have in common: frequencies, gains, antennas, and a transmitter that works in bursts.
+"""Common parts of all radios: frequencies, gains, antennas, and a transmitter that works in bursts.
 
-Invariants: a device gets its samples at the time they go on the air, whole bursts only, none beyond full scale; a
-device that is not at the sample rate, frequency and gain asked for is refused before it sends: packets at another rate
-are noise, and another frequency may be somebody else's; whatever the vendor's library throws, and a device that falls
-silent or deaf, becomes one line that names front end, args and remedy.
+Invariants: a device gets its samples at the time of transmission, in whole bursts, and no sample is beyond full scale.
+A device that does not have the requested sample rate, frequency and gain is refused before it sends. Packets at another
+rate are noise, and another frequency may belong to somebody else. Errors of a vendor's library become one line that
+names front end, args and remedy. The same holds for a device that stops giving or taking samples.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from gr_ros2.radio.stream_events import GapCounter
 from gr_ros2.setting import AUTO, Auto
 
 TOLERANCE = 1e-4
-"""How far from the sample rate and frequency asked for a device may be; the PHYs are made for clocks within 100 ppm."""
+"""Largest relative error of sample rate and frequency. The PHYs are made for clocks within 100 ppm."""
 
 GAIN_TOLERANCE = 0.5
-"""dB a gain may differ from what was asked for, where the device has no coarser step."""
+"""Largest error of a gain, dB, if the device does not have coarser steps."""
 
 SILENT_S = 3.0
-"""s without a sample given or taken after which a device is held for dead; changing direction takes a tenth of it."""
+"""A device without a sample given or taken for this time, s, counts as dead; a change of direction takes a tenth."""
 
 _LEAD_S = 0.002
-"""s before its airtime begins at which a device gets a packet, so that one follows the other without a pause; where
-there is to be a pause, it gets it when that is over."""
+"""How long before its airtime begins a device gets a packet, s, so that packets follow each other without a pause. If
+there must be a pause, the device gets the packet when the pause is over."""
 
 Decibels = Annotated[float, Field(ge=-200, le=200)]
 Direction = Literal["tx", "rx"]
@@ -81,12 +81,12 @@ class DeviceOptions(FrontEndOptions):
 
     @property
     def receive_frequency(self) -> float:
-        """Hz."""
+        """The frequency to receive at, Hz."""
         return self.frequency if self.frequency_rx == AUTO else self.frequency_rx
 
 
 class DeviceFrontEnd(FrontEnd):
-    """A radio. A subclass opens the two halves of its device, both set up completely.
+    """A radio. A subclass opens the transmitter and the receiver of its device, and sets both up completely.
 
     :raises RadioError: when there is no such device, or it refuses a setting
     """
@@ -94,9 +94,9 @@ class DeviceFrontEnd(FrontEnd):
     Options = DeviceOptions
     has_radio = True
     example_args: ClassVar[str]
-    """What ``args`` may look like, for errors."""
+    """Example of ``args``, for error messages."""
     find_with: ClassVar[str]
-    """Command that lists the devices present, for errors."""
+    """Command that lists the devices present, for error messages."""
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
@@ -152,10 +152,10 @@ class DeviceFrontEnd(FrontEnd):
             graph.connect(self._receiving, self._blanker)
 
     def _silence(self) -> float:
-        """s after each burst in which nothing is sent."""
+        """How long nothing is sent after each burst, s."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self, packet_len: int | None = None) -> float:  # noqa: ARG002 - all bursts are as long
+    def airtime(self, packet_len: int | None = None) -> float:  # noqa: ARG002 - all bursts have the same length
         return self.layout.total / self.phy.sample_rate + self._silence()
 
     def early(self) -> float:
@@ -176,21 +176,22 @@ class DeviceFrontEnd(FrontEnd):
         )
 
     def counters(self) -> dict[str, int]:
-        """What was lost, and what the device tells of it.
+        """Losses, and what the device reports about them.
 
-        ``clipped``: samples beyond full scale; ``blanked``: samples not heard because we were sending; ``overflows``:
-        places where samples received were lost before they came here; and :meth:`_told`.
+        ``clipped``: samples beyond full scale. ``blanked``: samples not received because this robot was sending.
+        ``overflows``: places where received samples were lost before they came here. The counters of :meth:`_told` are
+        added.
         """
         blanked = {} if self._blanker is None else {"blanked": self._blanker.blanked}
         overflows = {} if self._gaps.gaps is None else {"overflows": self._gaps.gaps}
         return {"clipped": self._shaper.clipped, **blanked, **overflows, **self._told()}
 
     def _told(self) -> dict[str, int]:
-        """What is known of bursts behind the shaper, by name."""
+        """Counters of the bursts after the shaper, by name."""
         return {}
 
     def close(self) -> None:
-        # The device is let go when nothing holds its blocks.
+        # The device is released when nothing refers to its blocks.
         self._transmitting = self._receiving = None
 
     def check_rate(self, got: float) -> None:
@@ -200,7 +201,7 @@ class DeviceFrontEnd(FrontEnd):
             raise self._unlike(f"runs at {got:,.0f} samples/s, not at {wanted:,.0f}", "phy.sample_rate")
 
     def check_antenna(self, direction: Direction, known: Sequence[str]) -> str:
-        """The antenna asked for, '' for the device's choice.
+        """The requested antenna, '' for the device's choice.
 
         :raises RadioError: when the device has no such antenna
         """
@@ -213,9 +214,9 @@ class DeviceFrontEnd(FrontEnd):
         return antenna
 
     def check_frequency(self, direction: Direction, got: float) -> None:
-        """:raises RadioError: when a device is tuned elsewhere than asked
+        """:raises RadioError: when a device is not tuned to the requested frequency
 
-        :param got: Hz
+        :param got: frequency of the device, Hz
         """
         options = self.options
         wanted = options.frequency if direction == "tx" else options.receive_frequency
@@ -231,9 +232,9 @@ class DeviceFrontEnd(FrontEnd):
         high: float = float("inf"),
         step: float = 0.0,
     ) -> None:
-        """:raises RadioError: when a device has another gain than asked, or cannot have it
+        """:raises RadioError: when a device does not have the requested gain, or cannot have it
 
-        :param got: dB, and so are ``low`` to ``high``, what it can have, in steps of ``step``
+        :param got: gain of the device, dB. Its gains are from ``low`` to ``high`` in steps of ``step``, all in dB
         """
         key = f"gain_{direction}"
         wanted: float = getattr(self.options, key)
@@ -249,7 +250,7 @@ class DeviceFrontEnd(FrontEnd):
 
     @contextmanager
     def one_line(self) -> Iterator[None]:
-        """Turns what a vendor's library throws into one line of ours."""
+        """Turns an exception of a vendor's library into a RadioError of one line."""
         try:
             yield
         except (RuntimeError, ValueError, IndexError) as error:
@@ -263,14 +264,14 @@ class DeviceFrontEnd(FrontEnd):
 
 
 class _Progress:
-    """Whether a count goes on."""
+    """Watches whether a count still changes."""
 
     def __init__(self) -> None:
         self._count: int | None = None
         self._since = 0.0
 
     def still_s(self, count: int | None, now: float) -> float:
-        """s for which it has been the same; 0 for None, which is no count."""
+        """How long the count has been the same, s. It is 0 if there is no count (None)."""
         if count is None or count != self._count:
             self._count, self._since = count, now
         return now - self._since

@@ -1,7 +1,7 @@
-"""Says on the ROS graph how a link is doing: ``/diagnostics`` for people's tools, and all its counters as JSON.
+"""Publishes the state of a link on the ROS graph: ``/diagnostics`` for common tools, and all its counters as JSON.
 
-Invariants: one thread, which lives on whatever fails in it and counts that, and which alone publishes and leaves the
-graph; nothing is published once ``stop`` has returned; all judgement is in ``gr.health``.
+Invariants: one thread publishes, and this thread leaves the graph. It counts every failure and continues. Nothing is
+published after ``stop`` has returned. ``gr.health`` makes all judgements.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ STATISTICS_TYPE = "std_msgs/msg/String"
 
 _QOS = Qos("reliable", "volatile", 10)
 _JOIN_S = 5.0
-"""s ``stop`` waits: a subscriber that does not keep up holds each of two messages for a second."""
+"""How long ``stop`` waits, s. A slow subscriber delays each of the two messages by a second."""
 _log = logging.getLogger(__name__)
 
 
 class Diagnostics:
-    """Publishes both, every ``period_s``.
+    """Publishes diagnostics and counters every ``period_s``.
 
-    :param node_name: of the link on the graph; its counters come out as ``/<node_name>/statistics``
-    :param stats: a snapshot of the link's counters
+    :param node_name: node name of the link on the graph; its counters are published on ``/<node_name>/statistics``
+    :param stats: returns a snapshot of the link's counters
     :param clock: s, monotonic
-    :ivar failed: times that it could not be told
+    :ivar failed: how often publishing failed
     :raises MiddlewareError: when the topics cannot be announced
     """
 
@@ -59,11 +59,11 @@ class Diagnostics:
         self.failed = 0
 
     def start(self) -> None:
-        """Begin; once only."""
+        """Start the thread. Call this only once."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and take both topics off the graph. Idempotent."""
+        """Stop the thread, and remove both topics from the graph. Idempotent."""
         self._stop.set()
         if self._thread.ident is None:
             self._leave()
@@ -74,7 +74,7 @@ class Diagnostics:
         while not self._stop.wait(self._period_s):
             try:
                 self._tell()
-            except Exception as error:  # noqa: BLE001 - nobody would see that the link's state is told no more
+            except Exception as error:  # noqa: BLE001 - nobody would notice that the diagnostics have ended
                 self.failed += 1
                 if self.failed == 1:
                     trace = None if isinstance(error, GrRos2Error) else error
@@ -86,7 +86,7 @@ class Diagnostics:
         statuses = self._health.judge(stats, self._clock())
         array = diagnostic_array(statuses, self._node_name, time.time_ns())
         for publisher, message in ((self._array, array), (self._counters, statistics(stats))):
-            # What came before may have taken longer than ``stop`` waits.
+            # The step before may have taken longer than ``stop`` waits.
             if not self._stop.is_set():
                 publisher.publish(message)
 

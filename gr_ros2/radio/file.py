@@ -1,8 +1,9 @@
-"""The `file` front end: what would be sent goes into a SigMF recording, what was recorded is received again.
+"""The `file` front end: samples to send are written to a SigMF recording, and recorded samples are received again.
 
-Invariants: a replay comes at its sample rate by the clock, whole packets' worth of zeros behind it, so that its last
-packet comes out too; a sample that is not a finite number comes as 0 and is counted, since no receiver's filters and
-loops would recover from it; a transmission is recorded without the silence between packets, each burst annotated.
+Invariants: the clock paces a replay at its sample rate. Zeros for whole packets follow, so that the receiver completes
+the last packet too. A sample that is not a finite number is replaced by 0 and counted, because the filters and loops of
+a receiver would not recover from it. A transmission is recorded without the silence between packets, and each burst is
+annotated.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 _STEP_S = 0.005
 _LONGEST_WAIT_S = 0.1
 _BEHIND = 2
-"""Packets' worth of zeros behind a replay."""
+"""Length of the zeros behind a replay, in packets."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -91,7 +92,8 @@ class FileFrontEnd(FrontEnd):
         return self._replay is not None and self._replay.finished and self._recorder is None
 
     def counters(self) -> dict[str, int]:
-        """Samples. ``unwritten``: not written, as on a full disk; ``not_finite``: recorded as no number, taken as 0."""
+        """Numbers of samples. ``unwritten``: not written, for example because the disk is full. ``not_finite``: not a
+        finite number in the recording, replaced by 0."""
         written = {} if self._recorder is None else {"unwritten": self._recorder.failed}
         return written if self._replay is None else {**written, "not_finite": self._replay.not_finite}
 
@@ -101,7 +103,7 @@ class FileFrontEnd(FrontEnd):
 
 
 class _Replay(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Samples of a recording out, by the clock."""
+    """Gives the samples of a recording, paced by the clock."""
 
     def __init__(self, samples: NDArray[np.complex64], phy: Phy, options: FileOptions) -> None:
         super().__init__("gr_ros2_replay", None, [np.complex64])
@@ -113,9 +115,9 @@ class _Replay(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._given = 0
         self._begin: float | None = None
         self.finished = False
-        """Whether the last sample, and the zeros behind it, are out."""
+        """Whether the last sample and the zeros behind it have been given."""
         self.not_finite = 0
-        """Samples that were no finite numbers."""
+        """Number of samples that were not finite numbers."""
         self.set_blkd_input_timer_value(AGAIN_MS)
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
@@ -137,7 +139,7 @@ class _Replay(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         return count
 
     def _due(self, most: int) -> int:
-        """Samples that may go now, after waiting for some."""
+        """Number of samples that may be given now. Waits for some if there are none."""
         if not self._rate:
             return most
         if self._begin is None:

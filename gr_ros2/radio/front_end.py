@@ -1,7 +1,7 @@
-"""What a link asks of a front end: a place to put samples, a place samples come from, and how long a packet takes.
+"""The interface of a front end: a block that takes samples, a block that gives samples, and the time of a packet.
 
-Invariants: a front end is opened when it is made, so that a wrong device or address is an error at once and not later
-in a thread; `close` gives everything back and may be called twice; whatever it loses it counts in `counters`.
+Invariants: the constructor opens the front end, so that a wrong device or address is an error at once and not later in
+a thread. `close` releases everything and may be called twice. `counters` counts everything that is lost.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
 
 AGAIN_MS = 1
-"""ms after which GNU Radio calls a source again that had nothing to give; otherwise it waits 250."""
+"""Time after which GNU Radio calls a source without data again, ms; its default is 250 ms."""
 Hertz = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -32,9 +32,9 @@ class FrontEndOptions:
 
 
 class FrontEnd(ABC):
-    """One robot's way to the air.
+    """The connection of one robot to the air.
 
-    :param phy: whose samples it carries, at its sample rate
+    :param phy: PHY whose samples it carries, at its sample rate
     :param options: fields of ``Options``
     :raises ConfigError: for an option that is unknown or out of range, or a PHY without samples
     :raises RadioError: when the device, address or file cannot be opened
@@ -43,13 +43,13 @@ class FrontEnd(ABC):
     name: ClassVar[str]
     Options: ClassVar[type[FrontEndOptions]] = FrontEndOptions
     has_radio: ClassVar[bool] = False
-    """Whether the channel is a real one, which no setting can impair."""
+    """Whether the channel is a real one. Settings cannot impair a real channel."""
     loops_back: ClassVar[bool] = False
-    """Whether a robot hears itself as if it were another."""
+    """Whether a robot receives its own packets as if another robot had sent them."""
     any_length: ClassVar[bool] = False
-    """Whether bursts may be of different lengths; else each is as long as the longest, and packets with it."""
+    """Whether bursts may have different lengths. If not, all bursts and packets are as long as the longest."""
     refuses: ClassVar[frozenset[str]] = frozenset()
-    """Options of its base that it cannot have, and GRC does not offer."""
+    """Options of its base class that it does not support. GRC does not offer them."""
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
@@ -64,52 +64,52 @@ class FrontEnd(ABC):
     @property
     @abstractmethod
     def sink(self) -> Any:
-        """Block that takes the transmitter's samples; None where the transmitter is not connected."""
+        """Block that takes the transmitter's samples; None if the transmitter is not connected."""
 
     @property
     @abstractmethod
     def source(self) -> Any:
-        """Block that gives the samples received; None where nothing is received."""
+        """Block that gives the received samples; None if nothing is received."""
 
-    def wire(self, graph: Any) -> None:  # noqa: B027 - most are one block each way
-        """Connect what lies behind ``sink`` and before ``source`` in a flowgraph."""
+    def wire(self, graph: Any) -> None:  # noqa: B027 - most have one block in each direction
+        """Connect the blocks after ``sink`` and before ``source`` in a flowgraph."""
 
     @property
     def receive_frequency(self) -> float | None:
-        """Hz at which it receives; None where there is no radio."""
+        """Frequency at which it receives, Hz; None if there is no radio."""
         return None
 
     def airtime(self, packet_len: int | None = None) -> float:
-        """s from the start of one packet to the earliest start of the next.
+        """Time from the start of one packet to the earliest start of the next, s.
 
-        :param packet_len: its bytes, None = those of the longest
+        :param packet_len: length of the packet, bytes; None: that of the longest
         """
         return self.phy.airtime(packet_len) + float(self.options.guard_s)
 
     def early(self) -> float:
-        """s before its airtime is over at which a packet has to come: 0 where samples need no time to pass."""
+        """How long before the end of its airtime a packet must arrive, s. It is 0 if samples take no time to pass."""
         return 0.0
 
     @property
     def ends(self) -> bool:
-        """Whether what is received comes to an end by itself, as a recording does."""
+        """Whether reception ends by itself, as a recording does."""
         return False
 
     @property
     def finished(self) -> bool:
-        """Whether nothing will ever be received any more, as at the end of a recording."""
+        """Whether nothing more will be received, as at the end of a recording."""
         return False
 
     def check(self, now: float) -> None:  # noqa: B027 - most have nothing that can break
-        """To be called now and then while the flowgraph runs.
+        """Check the device. Call this from time to time while the flowgraph runs.
 
         :param now: s, monotonic
-        :raises RadioError: when the device has gone silent
+        :raises RadioError: when the device gives or takes no more samples
         """
 
     def counters(self) -> dict[str, int]:
-        """What was lost or refused here, and what came and went, by name."""
+        """Counters by name: what was lost or refused here, and what was received and sent."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 - most have nothing to give back
-        """Give back device, sockets and files. The flowgraph has stopped."""
+    def close(self) -> None:  # noqa: B027 - most have nothing to release
+        """Release device, sockets and files. The flowgraph must have stopped."""

@@ -1,8 +1,8 @@
-"""One robot's end of a link as a flowgraph: its ROS graph to the air and back, until it is stopped.
+"""One robot's end of a link as a flowgraph: from its ROS graph to the air and back, until it is stopped.
 
-Invariants: neither direction waits for the other; packets leave at the pace of the air, and are composed just before; a
-robot does not take its own packets, except from a front end that loops back; everything opened is given back by `stop`,
-also when opening failed half-way.
+Invariants: neither direction waits for the other. Packets leave at the pace of the air, and each is composed just
+before it leaves. A robot ignores its own packets, except from a front end that loops back. `stop` releases everything
+that was opened. If opening fails half-way, everything is released too.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ class RobotLink(Flowgraph):
     """A robot's end of a link.
 
     :param config: see :class:`LinkConfig`
-    :param middleware: an open one for both blocks, closed by who opened it; None opens what the configuration says
-    :param observer: told of everything that is sent and received; when it raises, it is told nothing more, and the link
-        goes on
-    :param clock: s, monotonic, of events and blocks
+    :param middleware: an open Middleware for both blocks, which the caller closes; None: opened as the configuration
+        says
+    :param observer: called with everything that is sent and received. If it raises, it is not called again, and the
+        link continues
+    :param clock: clock of events and blocks, s, monotonic
     :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
-    :raises ConfigError: when the parts do not fit each other
+    :raises ConfigError: when the parts do not fit together
     :raises MiddlewareError: when the ROS graph cannot be joined
     :raises RadioError: when the front end cannot be opened
     """
@@ -92,7 +93,7 @@ class RobotLink(Flowgraph):
             self._stack.callback(self._diagnostics.stop)
 
     def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """Both directions around one end, so that what is heard changes what is sent."""
+        """Both directions share one endpoint, so that received packets can change what is sent."""
         both = RosLink(
             self.registry,
             self.config.ros_source,
@@ -109,7 +110,7 @@ class RobotLink(Flowgraph):
         self.msg_connect(self.radio, "pdus", both, "pdus")
 
     def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """A robot that hears itself is two: one that sends and one that receives."""
+        """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
         self.source = RosSource(self.registry, middleware=graphs[0], **common, **source)
@@ -122,11 +123,11 @@ class RobotLink(Flowgraph):
 
     @property
     def node_name(self) -> str:
-        """As ``ros2 node list`` shows it."""
+        """The node name that ``ros2 node list`` shows."""
         return f"gr_ros2_link_{self.config.ros_source.src_id()}"
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
-        """The source's and the sink's participant: one for both where they are on the same graph."""
+        """The participants of source and sink: one for both if they are on the same graph."""
         if middleware is not None:
             return middleware, middleware
         source, sink = self.config.ros_source, self.config.ros_sink
@@ -142,7 +143,7 @@ class RobotLink(Flowgraph):
         return graph
 
     def _sink_config(self) -> SinkConfig:
-        """The sink's settings; on a medium that others share it knows its own packets."""
+        """The settings of the sink. Its robot id lets it recognise the robot's own packets on a shared medium."""
         sink = self.config.ros_sink
         if sink.robot_id == AUTO:
             return replace(sink, robot_id=self.config.ros_source.src_id())
@@ -162,37 +163,37 @@ class RobotLink(Flowgraph):
             self._diagnostics.start()
 
     def stop(self) -> None:
-        """Stop, leave the ROS graph and close the front end. Idempotent; a stopped link does not start again."""
+        """Stop, leave the ROS graph and close the front end. Idempotent. A stopped link cannot start again."""
         super().stop()
-        # A device is let go with its blocks, which the flowgraph would hold for as long as it is held itself.
+        # A device is released with its blocks. The flowgraph would keep them as long as it exists itself.
         self.disconnect_all()
         self._stack.close()
 
     def check(self) -> None:
-        """To be called now and then while it runs, for instance with each look at `stats`.
+        """Check the device. Call this from time to time while the link runs, for instance with each call of `stats`.
 
-        :raises RadioError: when the device has gone silent, which GNU Radio tells nobody
+        :raises RadioError: when the device gives or takes no more samples; GNU Radio does not report this
         """
         if self._running:
             self.front_end.check(self._clock())
 
     @property
     def remark(self) -> str:
-        """What whoever starts it is to know; often nothing."""
+        """A remark for the person who starts the link; often empty."""
         open_to_all = self.config.version and not self.config.key
         return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
 
     @property
     def finished(self) -> bool:
-        """Whether nothing will be received any more, as at the end of a recording that is replayed."""
+        """Whether nothing more will be received, as at the end of a replayed recording."""
         return self.front_end.finished
 
     def incomplete(self) -> list[str]:
-        """What observers missed and what the recording lacks, with why and how much, one line each; often none."""
+        """What observers missed and what the recording lacks: one line each, with reason and number; often none."""
         return [*self._observers.told(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, packets to and from the air, the PHY, what the front end counts, and
+        """A snapshot: both blocks, packets to and from the air, the PHY, the counters of the front end, and
         :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {

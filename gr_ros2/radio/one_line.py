@@ -1,7 +1,7 @@
-"""A link described in one line of a command: a robot's number, a radio, and where that radio finds the others.
+"""A link described on one command line: a robot's number, a radio, and how this radio reaches the others.
 
-Invariant: what comes out is what a YAML file of a link has, and goes through the same loader; nothing is set that the
-file could not set, and what is left out takes the file's defaults.
+Invariant: the result has the form of a link's YAML file and goes through the same loader. The command line sets nothing
+that the file could not set. Settings that are left out have the defaults of the file.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ DEFAULT_PHY = "psk"
 class Flag:
     """An option of the command line.
 
-    :param setting: of a front end, which it sets
-    :param meaning: for help and errors
+    :param setting: setting of a front end that the option sets
+    :param meaning: description for help and errors
     """
 
     setting: str
@@ -45,8 +45,8 @@ def one_line(robot: int, radio: str, registry: str | None, flags: Mapping[str, A
     :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
     :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``
     :param flags: value of each option of ``FLAGS`` that was given
-    :raises ConfigError: for an unknown radio, an option it has no use for, or one that it needs
-    :raises BackendMissingError: when what the radio needs is not installed
+    :raises ConfigError: for an unknown radio, an option that the radio does not have, or a missing option that it needs
+    :raises BackendMissingError: when software that the radio needs is not installed
     """
     known = {item.name: item for item in fields(FRONT_ENDS.load(radio).Options)}
     for flag in flags:

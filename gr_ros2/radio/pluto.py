@@ -1,9 +1,11 @@
 """The `pluto` front end: ADALM-Pluto through IIO.
 
-Its transmitter takes whole buffers, so a buffer is exactly one burst and leaves at once; between bursts the converter
-has nothing to send, and each burst ends in zeros. Invariants: GNU Radio's blocks go on where the device refuses a
-setting, so each that matters is read back; what libiio writes to stderr while a device is opened comes out when that
-went well, else in the log of debugging, and our line says what went wrong; the connection stays open until the process
+The transmitter takes whole buffers. One buffer is exactly one burst and leaves at once. Each burst ends in zeros, and
+between bursts the converter has nothing to send.
+
+Invariants: GNU Radio's blocks continue if the device refuses a setting, so each important setting is read back. What
+libiio writes to stderr while a device is opened is held back. It is written afterwards if the device was opened. If
+not, it goes to the debug log, and our error line says what went wrong. The connection stays open until the process
 ends.
 """
 
@@ -31,7 +33,7 @@ from gr_ros2.radio.front_end import Hertz
 from gr_ros2.setting import AUTO, Auto
 
 SLOWEST, FASTEST = 521e3, 61.44e6
-"""samples/s; below 2.083 million with the decimating filter that GNU Radio's block loads by itself."""
+"""Range of the sample rate, samples/s. Below 2.083 million, GNU Radio's block loads a decimating filter by itself."""
 
 _CHANNELS = [True, True]
 _LARGEST_ATTENUATION = 89.75
@@ -41,7 +43,7 @@ _CONVERTERS = {"tx": "cf-ad9361-dds-core-lpc", "rx": "cf-ad9361-lpc"}
 _OSCILLATORS = {"tx": "altvoltage1", "rx": "altvoltage0"}
 _DOUBLE = struct.Struct("=d")
 _EVERY_MS, _PATIENCE_S = 5, 10.0
-"""How often a setting is asked for, and s until it is not told: more than libiio waits for an answer."""
+"""Interval at which a setting is read, ms, and time until reading is given up, s. libiio waits less for an answer."""
 _STDERR = 2
 _log = logging.getLogger(__name__)
 
@@ -91,7 +93,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
         rate, options = self.phy.sample_rate, self.options
         size = max(1024, int(rate * 0.005)) if options.buffer_rx == AUTO else options.buffer_rx
         block = iio.fmcomms2_source_fc32(self.device_args, _CHANNELS, size)
-        self._receiving = block  # for `close`, should it not be as it ought to be
+        self._receiving = block  # for `close`, if a setting below is wrong
         block.set_filter_params(*_AUTOMATIC_FILTER)
         block.set_samplerate(int(rate))
         block.set_frequency(int(options.receive_frequency))
@@ -105,10 +107,10 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     def close(self) -> None:
         if self._receiving is not None:
-            with suppress(RuntimeError):  # from GNU Radio 3.10.9 on, of one that does not run or was stopped already
+            with suppress(RuntimeError):  # GNU Radio 3.10.9 and later: the block does not run
                 self._receiving.stop()
-            # Never deleted: its destructor waits for a thread of its own that never ends when it was not started, or
-            # ran for less than a second.
+            # The block is never deleted. Its destructor waits for its thread, and this thread never ends if the block
+            # was not started or ran for less than a second.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._receiving))
         super().close()
 
@@ -118,10 +120,10 @@ class PlutoFrontEnd(DeviceFrontEnd):
             yield
 
     def _check_settings(self, direction: Direction) -> None:
-        """:raises RadioError: when the device is not as asked"""
+        """:raises RadioError: when the device does not have the requested settings"""
         output = direction == "tx"
         for device in (_CONVERTERS[direction], _PHY):
-            # Where the converters tell no rate they have no filter either, and run at that of the chip.
+            # If the converters report no rate, they have no filter either, and run at the rate of the chip.
             if rate := self._read(device, "voltage0", "sampling_frequency", output=output):
                 break
         self.check_rate(rate)
@@ -129,14 +131,14 @@ class PlutoFrontEnd(DeviceFrontEnd):
         self.check_gain(direction, self._read(_PHY, "voltage0", "hardwaregain", output=output))
 
     def _read(self, device: str, channel: str, attribute: str, *, output: bool) -> float:
-        """A setting as the device has it, 0 where it does not tell."""
+        """A setting as the device has it; 0 if the device does not report it."""
         kind = (iio.data_type_t.DOUBLE, iio.attr_type_t.CHANNEL)
         asked = iio.attr_source(self.device_args, device, channel, attribute, _EVERY_MS, 1, *kind, output, 0)
         asked.set_log_level("error")
         told = blocks.vector_sink_b(_DOUBLE.size)
         graph = Flowgraph("gr_ros2_pluto_setting", f"front_end {self.name}")
         graph.connect(asked, blocks.head(_DOUBLE.size, 1), told)
-        with graph:  # it would go on asking
+        with graph:  # ends the reading, which would continue otherwise
             end = time.monotonic() + _PATIENCE_S
             while not told.nitems_read(0) and time.monotonic() < end:
                 time.sleep(_EVERY_MS * 1e-3)
@@ -145,7 +147,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
 @contextmanager
 def _stderr_deferred() -> Iterator[None]:
-    """Keeps what any thread writes to stderr meanwhile: it comes out afterwards, or is logged after an error."""
+    """Holds back what any thread writes to stderr. It is written afterwards, or logged after an error."""
     with tempfile.TemporaryFile() as kept, os.fdopen(os.dup(_STDERR), "wb") as real:
         os.dup2(kept.fileno(), _STDERR)
         try:

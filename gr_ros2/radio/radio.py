@@ -1,7 +1,7 @@
 """PHY and front end as one GNU Radio block: packets to the air and back.
 
-Invariants: packets leave at the pace of the air, and each credit asks for one just before it is due; neither direction
-waits for the other; what is received can be impaired and looked at only where no real channel does it already.
+Invariants: packets leave at the pace of the air, and each credit asks for one packet just before it is due. Neither
+direction waits for the other. Received samples can be impaired only if the channel is not a real one.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
 class Radio(PacketPath, HierBlock):
     """Message ports `pdus` in, `pdus` out and `credit` out (one message: one more packet may come).
 
-    :param phy: makes samples of packets
-    :param front_end: carries the samples; closed with this
+    :param phy: converts packets to samples and back
+    :param front_end: carries the samples; ``close`` closes it too
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
-    :param changeable: build in a channel that can be changed while running, where there is no radio
-    :param instrumented: build in what a person at a dashboard uses: a channel that can be changed, and taps for
-        spectrum and constellation
-    :raises ConfigError: for a channel that this PHY or front end cannot have, or a recording of nothing
+    :param changeable: add a channel that can be changed while running, if the front end has no radio
+    :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
+        constellation
+    :raises ConfigError: for a channel that this PHY or front end cannot have, or a recording without samples
     :raises RadioError: when the recording cannot be written
     """
 
@@ -87,9 +87,10 @@ class Radio(PacketPath, HierBlock):
             self.connect(self._transmit(self._gate), front_end.sink)
         if front_end.source is None:
             return
-        # The channel stops tags too.
+        # The channel also stops tags.
         faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
-        # GNU Radio tells no block that samples have ended, so a receiver beside it could not finish before the sink.
+        # GNU Radio does not tell a block that samples have ended. So a receiver in another process could not finish
+        # before the sink.
         heard = self._receive(front_end.source, faded=faded, shown=instrumented, own_process=not front_end.ends)
         if record:
             frequency = front_end.receive_frequency
@@ -100,8 +101,8 @@ class Radio(PacketPath, HierBlock):
             self.connect(heard, self._recorder)
 
     def close(self) -> None:
-        """Give back device, sockets, files and memory. The flowgraph has stopped, or never ran. Idempotent."""
-        # A device is let go with its blocks only.
+        """Release device, sockets, files and memory. The flowgraph must have stopped or never run. Idempotent."""
+        # A device is released only with its blocks.
         for hier_block in (self._transmitter, self._receiver, self):
             if hier_block is not None:
                 hier_block.release()
@@ -110,21 +111,22 @@ class Radio(PacketPath, HierBlock):
         self.front_end.close()
 
     def recorded(self) -> dict[str, int]:
-        """Samples. ``unrecorded``: not in the recording, as on a full disk; nothing where none is made."""
+        """Numbers of samples. ``unrecorded``: not in the recording, for example because the disk is full. Empty if
+        there is no recording."""
         return {} if self._recorder is None else {"unrecorded": self._recorder.failed}
 
     def incomplete(self) -> list[str]:
-        """What the recording lacks and why, as one line; none where it is whole, or none is made."""
+        """What the recording lacks and why, as one line. Empty if nothing is missing, or if there is no recording."""
         return [] if self._recorder is None else self._recorder.told()
 
     @property
     def refused(self) -> int:
-        """PDUs the transmitter could not take."""
+        """Number of PDUs that the transmitter could not take."""
         return 0 if self._transmitter is None else self._transmitter.refused
 
     @property
     def damaged(self) -> int:
-        """Packets heard that were not whole, as far as the PHY tells."""
+        """Number of received packets that were damaged, as far as the PHY reports it."""
         return 0 if self._receiver is None else self._receiver.damaged
 
     @property
@@ -143,15 +145,15 @@ def make_radio(
     record: str = "",
     **options: Any,
 ) -> Radio:
-    """A radio by the names of its parts, as GRC makes it.
+    """Make a radio from the names of its parts, as GRC does.
 
     :param phy: a name of ``gr_ros2.phy.PHY``
     :param packet_len: bytes on the wire
     :param sample_rate: samples/s
     :param front_end: a name of ``gr_ros2.radio.FRONT_ENDS``
-    :param phy_options: settings of the PHY beside these
-    :param channel: settings of :class:`gr_ros2.config.ChannelConfig`, for front ends without a radio; given, even
-        empty, they can be changed while the radio runs
+    :param phy_options: further settings of the PHY
+    :param channel: settings of :class:`gr_ros2.config.ChannelConfig`, for front ends without a radio. If they are
+        given, even empty, they can be changed while the radio runs
     :param record: SigMF recording to write of all samples received, '' = none
     :param options: settings of the front end
     :raises ConfigError: for an unknown name or setting, or a value out of range

@@ -1,8 +1,8 @@
-"""SigMF recordings: samples in `NAME.sigmf-data`, what they are in `NAME.sigmf-meta` (sigmf.org, version 1.0.0).
+"""SigMF recordings: samples in `NAME.sigmf-data`, metadata in `NAME.sigmf-meta` (sigmf.org, version 1.0.0).
 
-Invariants: samples are cf32_le, one channel; a recording that was cut off by a kill is still one, with the metadata it
-began with; a recording is never written over another; writing waits in a thread of its own, and an error ends the
-recording alone.
+Invariants: samples are cf32_le, one channel. A recording whose process was killed is still valid, with the metadata of
+its start. A recording never overwrites another one. A separate thread writes to the disk. An error of writing ends only
+the recording.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ META, DATA = ".sigmf-meta", ".sigmf-data"
 SAMPLE = np.dtype("<c8")
 _DATATYPE = "cf32_le"
 _MOST_ANNOTATIONS = 100_000
-"""Bursts annotated; those beyond are recorded all the same."""
+"""Largest number of annotated bursts. Bursts beyond it are recorded without annotation."""
 _MOST_GAPS = 10_000
 _HELD_BYTES = 1 << 26
-"""Of samples that wait for the disk: 0.4 s at 20 million samples/s."""
+"""Memory for samples that wait for the disk: 0.4 s at 20 million samples/s."""
 _PATIENCE_S = 5.0
-"""s a recording may take to end."""
+"""Time that a recording may take to end, s."""
 
 
 @dataclass
 class SigmfRecording:
-    """What a recording says of its samples.
+    """The metadata of a recording.
 
     :param sample_rate: samples/s
     :param frequency: Hz, of the receiver; None where there is none
     :param description: for people
     :param annotations: (first sample, samples, label)
-    :param gaps: (sample in the recording, its number in the stream that was recorded), where some before it are missing
+    :param gaps: (sample in the recording, its number in the recorded stream), for each sample that follows missing ones
     """
 
     sample_rate: float
@@ -56,7 +56,7 @@ class SigmfRecording:
     gaps: list[tuple[int, int]] = field(default_factory=list)
 
     def index_at(self, sample: int) -> int:
-        """Number in the stream that a sample behind the last gap has."""
+        """The number, in the recorded stream, of a sample after the last gap."""
         start, index = self.gaps[-1] if self.gaps else (0, 0)
         return index + sample - start
 
@@ -79,7 +79,7 @@ class SigmfRecording:
         }
 
     def _capture(self, start: int, index: int, began: datetime) -> dict[str, Any]:
-        """One stretch of the stream without gaps."""
+        """The metadata of one part of the stream without gaps."""
         at = began + timedelta(seconds=index / self.sample_rate)
         found: dict[str, Any] = {"core:sample_start": start, "core:datetime": at.strftime("%Y-%m-%dT%H:%M:%S.%fZ")}
         if index:
@@ -95,9 +95,10 @@ def base_path(path: Path) -> Path:
 
 
 def read_recording(path: Path) -> tuple[SigmfRecording, NDArray[np.complex64]]:
-    """A recording and its samples, which stay in the file until they are looked at.
+    """Read a recording. Its samples stay in the file until they are used.
 
-    :raises ConfigError: when it is not there, is no SigMF, or is of a datatype other than cf32_le; names it
+    :raises ConfigError: when the recording does not exist, is not SigMF, or has a datatype other than cf32_le; the
+        message names it
     """
     base = base_path(path)
     meta, data = Path(f"{base}{META}"), Path(f"{base}{DATA}")
@@ -113,22 +114,23 @@ def read_recording(path: Path) -> tuple[SigmfRecording, NDArray[np.complex64]]:
     if datatype != _DATATYPE or about.get("core:num_channels", 1) != 1:
         raise ConfigError(f"recording {meta}: datatype {datatype!r}; only {_DATATYPE} of one channel can be replayed")
     frequency = captures[0].get("core:frequency") if captures else None
-    # An empty file cannot be mapped; a torn last sample is left out.
+    # An empty file cannot be mapped; an incomplete last sample is left out.
     count = size // SAMPLE.itemsize
     samples = np.memmap(data, SAMPLE, "r", shape=(count,)) if count else np.empty(0, SAMPLE)
     return SigmfRecording(sample_rate, frequency, str(about.get("core:description", ""))), samples
 
 
 class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Samples in, a recording out.
+    """Writes samples to a recording.
 
-    A disk that is full, or slower than the samples, costs the recording samples and the flowgraph nothing: ``failed``
-    counts them. Where some are missing in between, a new capture begins, whose ``core:global_index`` tells how many.
+    If the disk is full or slower than the samples, the recording loses samples, and ``failed`` counts them. The
+    flowgraph is not affected. After missing samples a new capture begins. Its ``core:global_index`` tells how many are
+    missing.
 
     :param path: of the recording, with or without suffix
-    :param burst: samples of a packet, to annotate each; 0 = a continuous stream, without annotations
-    :param lossless: let the flowgraph wait for a slow disk instead
-    :raises ConfigError: when there is a recording already
+    :param burst: samples of a packet, to annotate each packet; 0 = a continuous stream, without annotations
+    :param lossless: let the flowgraph wait for a slow disk instead of losing samples
+    :raises ConfigError: when the recording exists already
     :raises RadioError: when it cannot be written
     """
 
@@ -142,7 +144,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._refused = self._unwritten = 0
         self._guard = Guard(f"recording {self._data}")
         try:
-            # Unbuffered: what a full disk does not take is known at once, and not when the file is closed.
+            # Unbuffered: a full disk is an error at once, and not when the file is closed.
             self._file = self._data.open("xb", buffering=0)
             self._write_meta()
         except FileExistsError as error:
@@ -155,11 +157,11 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     @property
     def failed(self) -> int:
-        """Samples that could not be written, as on a full disk."""
+        """Number of samples that could not be written, for example because the disk is full."""
         return self._refused + self._unwritten
 
     def told(self) -> list[str]:
-        """What is missing and why, as one line; none where nothing is."""
+        """What is missing and why, as one line. Empty if nothing is missing."""
         if self._guard.error is None and not self.failed:
             return []
         why = "the disk is slower than the samples" if self._guard.error is None else one_line(self._guard.error)
@@ -174,7 +176,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         return len(samples)
 
     def stop(self) -> bool:
-        # A flowgraph made by GRC stops, and closes nothing.
+        # A flowgraph made by GRC calls `stop`, but not `close`.
         if self._backlog.settle(_PATIENCE_S) and not self._file.closed:
             self._finish_meta()
         return super().stop()
@@ -186,7 +188,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             self._finish_meta()
 
     def _write(self, data: bytes, place: int) -> None:
-        """Write samples that came as number ``place`` and following."""
+        """Write samples; the first one has the number ``place`` in the stream."""
         count, at = len(data) // SAMPLE.itemsize, self._written
         if self._guard.error is None:
             try:
@@ -195,7 +197,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
                     left = left[self._file.write(left) :]
             except OSError as error:
                 self._guard.end(error)
-                # Of the rest nothing follows, so that what stands there is one stretch of whole samples.
+                # Nothing more is written, so the file ends with a whole sample.
                 with suppress(OSError):
                     self._file.truncate(at * SAMPLE.itemsize)
         if self._guard.error is not None:
@@ -216,6 +218,6 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             self._guard.end(error)
 
     def _write_meta(self) -> None:
-        """Replace the metadata, which on a full disk stay as they are."""
+        """Replace the metadata. If the disk is full, they stay as they are."""
         with replacing(self._meta) as part:
             part.write_text(json.dumps(self._about.to_json(self._began), indent=1) + "\n", encoding="utf-8")

@@ -1,6 +1,6 @@
-"""The `sim` front end: no radio; what a robot sends comes back through the channel model, as another hears it.
+"""The `sim` front end: no radio. What a robot sends comes back through the channel model, as another robot receives it.
 
-For trying a configuration on one machine: publish on the robot's topics, and see them under the sink's namespace.
+Use it to try a configuration on one machine: publish on the robot's topics, and see them in the sink's namespace.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from gr_ros2.radio.front_end import FrontEnd
 
 
 class SimFrontEnd(FrontEnd):
-    """See the module; the channel itself is the link's, set under ``channel``."""
+    """See the module. The channel model belongs to the link; its settings are under ``channel``."""
 
     name = "sim"
     loops_back = True

@@ -1,9 +1,11 @@
 """A SoapySDR device's transmitter as a GNU Radio block, through the C interface of SoapySDR's own library.
 
-`soapy.sink` of GNU Radio 3.10 does not initialise its count of what remains of a burst: now and then it drops the first
-packets, or hands the driver a negative length and the process dies. Invariants: one call brings a whole burst and ends
-it; what a device does not take in time is dropped and counted, so that a device that hangs does not hang the link; what
-it tells of its bursts is asked for with each of them, never waited for.
+`soapy.sink` of GNU Radio 3.10 does not initialise its count of the samples left in a burst. Sometimes it drops the
+first packets, or it passes a negative length to the driver and the process dies.
+
+Invariants: one call brings a whole burst and ends it. Samples that a device does not take in time are dropped and
+counted, so that a device that hangs does not block the link. After each burst the device is asked for its events,
+without waiting for them.
 """
 
 from __future__ import annotations
@@ -27,25 +29,25 @@ _TX, _CHANNEL = 0, 0
 _END_BURST = 1 << 1
 _TIMEOUT, _NOT_SUPPORTED, _UNDERFLOW = -1, -5, -7
 _EVENTS = {_UNDERFLOW: "underflows", -6: "late", -3: "corrupted"}
-"""What we call what a device tells, by SoapySDR's code."""
+"""Names of the events that a device reports, by SoapySDR's code."""
 _MOST_EVENTS = 256
-"""Events read at a time, because a driver may report events without end."""
+"""Largest number of events read at a time, because a driver may report events without end."""
 _AGAIN = (0, _TIMEOUT, _UNDERFLOW)
-"""What a call that brings samples may return without having taken any: then it is made again."""
+"""Results of a write that took no samples. The write is then repeated."""
 _CALL_US = 100_000
 _PATIENCE_S = 1.0
-"""s beyond its airtime that a burst may take to be taken."""
+"""Time beyond its airtime in which the device must take a burst, s."""
 _log = logging.getLogger(__name__)
 
 
 class _Range(ctypes.Structure):
-    """SoapySDR's, of a gain in dB."""
+    """SoapySDR's range of a gain, in dB."""
 
     _fields_ = (("minimum", c_double), ("maximum", c_double), ("step", c_double))
 
 
 def _library() -> Any:
-    """SoapySDR's library with the types of what we call.
+    """SoapySDR's library, with the types of the functions that are called here.
 
     :raises ImportError: when it is not installed
     """
@@ -94,12 +96,12 @@ _soapy = _library()
 
 
 def _call(function: str, *arguments: Any) -> Any:
-    """Call it; what it says went wrong becomes an error.
+    """Call a function of the library. Its error becomes an exception.
 
-    :raises RuntimeError: with the driver's words
+    :raises RuntimeError: with the driver's message
     """
     result = getattr(_soapy, f"SoapySDRDevice_{function}")(*arguments)
-    # Functions that make something return nothing, the others a code other than 0.
+    # After an error, functions that make an object return None. The others return a code other than 0.
     failed = result is None if function in ("makeStrArgs", "setupStream") else isinstance(result, int) and result != 0
     if failed:
         said = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
@@ -108,13 +110,14 @@ def _call(function: str, *arguments: Any) -> Any:
 
 
 class SoapySink(gr.sync_block):  # type: ignore[misc]
-    """Samples in, bursts of ``burst`` samples out on the air.
+    """Takes samples, and sends them in bursts of ``burst`` samples.
 
     :param args: which device
     :param sample_rate: samples/s
-    :param counted: what became of bursts, by name. ``unsent``: samples the device did not take in time. As soon as it
-        tells of any, ``bursts_out``: bursts it has sent whole; ``underflows``: it ran out of samples; ``late``: bursts
-        whose time was over; ``corrupted``: bursts damaged on their way to it
+    :param counted: counters of bursts, by name. ``unsent``: samples that the device did not take in time. Each of the
+        others appears when the device first reports it. ``bursts_out``: bursts sent completely; ``underflows``: the
+        device ran out of samples; ``late``: bursts that came too late; ``corrupted``: bursts damaged on their way to
+        the device
     :raises RuntimeError: when there is no such device, or it cannot send
     """
 
@@ -129,7 +132,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         self._thread_state = ThreadState()
         self.set_output_multiple(burst)
         self.trouble = ""
-        """Why the device does not begin to send: GNU Radio takes no notice of it."""
+        """Why the device does not begin to send. GNU Radio ignores this error."""
         self._device: Any = _call("makeStrArgs", args.encode())
         try:
             if not _soapy.SoapySDRDevice_getNumChannels(self._device, _TX):
@@ -141,11 +144,11 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     @property
     def sample_rate(self) -> float:
-        """samples/s the device runs at."""
+        """Sample rate of the device, samples/s."""
         return float(_soapy.SoapySDRDevice_getSampleRate(self._device, _TX, _CHANNEL))
 
     def antennas(self) -> list[str]:
-        """Its ports to send from."""
+        """Names of the ports that the device can send from."""
         count = c_size_t()
         names = _soapy.SoapySDRDevice_listAntennas(self._device, _TX, _CHANNEL, byref(count))
         known = [names[number].decode() for number in range(count.value)]
@@ -154,21 +157,21 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     @property
     def frequency(self) -> float:
-        """Hz the device is tuned to."""
+        """Frequency of the device, Hz."""
         return float(_soapy.SoapySDRDevice_getFrequency(self._device, _TX, _CHANNEL))
 
     @property
     def gain(self) -> float:
-        """dB the device is set to."""
+        """Gain of the device, dB."""
         return float(_soapy.SoapySDRDevice_getGain(self._device, _TX, _CHANNEL))
 
     def gains(self) -> tuple[float, float, float]:
-        """dB it can have: from, to, and in which steps, 0 where it does not tell."""
+        """Possible gains, dB: smallest, largest and step. The step is 0 if the device does not report one."""
         has = _soapy.SoapySDRDevice_getGainRange(self._device, _TX, _CHANNEL)
         return has.minimum, has.maximum, has.step
 
     def tune(self, frequency: float, gain: float, bandwidth: float, antenna: str) -> None:
-        """Set it up and open its stream; 0 Hz of bandwidth and '' leave the device's choice.
+        """Set up the device and open its stream. A bandwidth of 0 Hz and an antenna '' leave the choice to the device.
 
         :raises RuntimeError: when the device refuses
         """
@@ -194,7 +197,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         return True
 
     def close(self) -> None:
-        """Let the device go. Idempotent."""
+        """Release the device. Idempotent."""
         with self._asking:
             if self._stream is not None:
                 _soapy.SoapySDRDevice_closeStream(self._device, self._stream)
@@ -203,14 +206,14 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
             self._device = self._stream = None
 
     def ask(self) -> None:
-        """Count what the device has to tell of its bursts by now. From any thread."""
+        """Count the events of bursts that the device has reported so far. Any thread may call this."""
         with self._asking:
             for _ in range(_MOST_EVENTS):
                 if not self._tells or self._stream is None or not self._look():
                     break
 
     def _look(self) -> bool:
-        """Count one thing the device tells; whether there was one."""
+        """Count one event of the device. Returns whether there was one."""
         channels, flags, when = c_size_t(1 << _CHANNEL), c_int(), c_longlong()
         result = _soapy.SoapySDRDevice_readStreamStatus(
             self._device, self._stream, byref(channels), byref(flags), byref(when), 0

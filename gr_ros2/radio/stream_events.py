@@ -1,6 +1,6 @@
-"""What a device tells while it runs, counted by name: samples it lost, bursts that came too late or were cut.
+"""Events that a device reports while it runs, counted by name: lost samples, bursts that came too late or were cut.
 
-Invariants: one name means the same on every device; what a device does not tell is left out, never counted as none.
+Invariants: a name means the same on every device. An event that a device cannot report is left out, not counted as 0.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _NAMES = {
     "seq_error_in_burst": "sequence_errors",
     "time_error": "late",
 }
-"""What we call what ``uhd.usrp_sink`` calls that."""
+"""Our names for the events of ``uhd.usrp_sink``."""
 
 
 class GapCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Samples in; counts the places where some are missing.
+    """Counts the places where samples are missing.
 
-    A source marks its first sample, and each that follows lost ones, with a tag `rx_rate`: ``uhd.usrp_source``, and
-    ``soapy.source`` of GNU Radio 3.10.5 and later.
+    A source sets a tag `rx_rate` on its first sample, and on each sample that follows lost ones. ``uhd.usrp_source``
+    does so, and ``soapy.source`` of GNU Radio 3.10.5 and later.
     """
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_gap_counter", [np.complex64], None)
         self.gaps: int | None = None
-        """Places so far; None where the source marks nothing."""
+        """Number of places so far; None if the source sets no tags."""
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         count = len(input_items[0])
@@ -48,10 +48,10 @@ class GapCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
 
 class UsrpEvents(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
-    """Message port `async_msgs` in: what a ``uhd.usrp_sink`` tells of its bursts.
+    """Message port `async_msgs` in: the events of bursts that a ``uhd.usrp_sink`` reports.
 
-    :ivar counted: ``bursts_out``: bursts the USRP has sent whole; ``underflows``: it ran out of samples within one;
-        ``sequence_errors``: packets lost on their way to it; ``late``: bursts whose time was over
+    :ivar counted: ``bursts_out``: bursts that the USRP has sent completely; ``underflows``: it ran out of samples
+        within a burst; ``sequence_errors``: packets lost on their way to the USRP; ``late``: bursts that came too late
     """
 
     def __init__(self) -> None:

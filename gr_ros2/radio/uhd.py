@@ -1,11 +1,11 @@
-"""The `uhd` front end: USRPs. A burst ends where the shaper's tag says; between bursts the USRP sends nothing."""
+"""The `uhd` front end: USRPs. The shaper's tag sets the end of a burst. Between bursts the USRP sends nothing."""
 
 from __future__ import annotations
 
 import os
 from typing import Annotated, Any
 
-# Otherwise its library greets on stderr before every word of ours; what it warns of still comes.
+# Otherwise the UHD library prints a greeting to stderr before our first line. Its warnings are still printed.
 os.environ.setdefault("UHD_LOG_CONSOLE_LEVEL", "warning")
 
 from gnuradio import uhd

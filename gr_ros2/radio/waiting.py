@@ -1,6 +1,6 @@
-"""What a link waits for: topics of its own that nobody publishes, beside those that are published.
+"""Topics that a link waits for because nobody publishes them, and the topics that are published instead.
 
-Invariant: a line is told when it has changed, and not again; looking changes nothing on the graph.
+Invariant: a line is returned only if it has changed. A look changes nothing on the graph.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 ALL_THERE = "every topic has a publisher"
 _SHOWN = 6
-"""Topics that a line names; of the others it tells how many they are."""
+"""Largest number of topics that a line names. Of further topics it tells only the number."""
 
 
 class Waiting:
-    """Looks whether the topics of a link have publishers.
+    """Checks whether the topics of a link have publishers.
 
-    :param source: of a link that is open
+    :param source: source of an open link
     """
 
     def __init__(self, source: RosSource) -> None:
@@ -30,7 +30,8 @@ class Waiting:
         self._told = ALL_THERE
 
     def look(self) -> str | None:
-        """One line for a person, None while the last one told still holds; at first all is held to be there.
+        """One line for the user; None if the last line is still true. At first, every topic is assumed to have a
+        publisher.
 
         :raises MiddlewareError: when the graph cannot be asked
         """
@@ -46,11 +47,11 @@ class Waiting:
 
 
 def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo]) -> str:
-    """What a link waits for and what there is instead, those first that may have been meant.
+    """The topics that a link waits for, and the topics that are published instead. Similar topics come first.
 
     :param missing: topics without a publisher, at least one
-    :param types: of every topic of the link, by name
-    :param found: what is on the graph
+    :param types: type of every topic of the link, by name
+    :param found: topics on the graph
     """
     published = [info for info in found if info.publishers and info.topic not in INFRASTRUCTURE]
     wrong = [info for info in published if types.get(info.topic, info.type_name) != info.type_name]

@@ -1,11 +1,13 @@
 """The `zmq` front end: bursts of samples over ZeroMQ, between processes or machines without radios.
 
-Every robot publishes what it sends at one address and subscribes to those of the others; each packet is one message: a
-header, then its samples. Invariants: bursts only, so silence costs nothing, and a burst leaves whole or not at all;
-nobody waits for a peer: what is sent while it is away, or while the cable is unplugged, is lost as on the air; either
-end may be killed and started again, the other carries on; nothing of a message is believed before its header is
-checked, and no sample that is not a finite number goes on to a receiver, whose filters and loops would never recover
-from it.
+Every robot publishes at one address and subscribes to the addresses of the others. Each packet is one message: a
+header, then its samples.
+
+Invariants: only bursts are sent, so silence costs nothing. A burst is sent completely or not at all. Nobody waits for a
+peer. What is sent while a peer is away, or while the cable is unplugged, is lost as on the air. Either end may be
+killed and started again, and the other end continues. The header of a message is checked before anything else in it is
+used. A sample that is not a finite number never reaches a receiver, because the filters and loops of a receiver would
+not recover from it.
 """
 
 from __future__ import annotations
@@ -32,22 +34,24 @@ from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
-"""Magic, who sends (random at each start), number of the burst, samples/s; then complex64, little-endian."""
+"""Magic, number of the sender (random at each start), number of the burst, samples/s. The samples follow as complex64,
+little-endian."""
 MAGIC = b"GRI0"
 
 _SAMPLE = np.dtype("<c8")
 _HEARTBEAT_MS, _DEAD_MS = 250, 1000
-"""A peer silent for so long is given up, with what waits for it, and looked for again."""
+"""Interval and limit of heartbeats. The connection to a peer that is silent up to the limit is closed, with all bursts
+that wait for it. Then a new connection is tried."""
 _RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
 _POLL_MS = 100
 MAX_SENDERS = 256
-"""Senders whose numbers are followed; beyond, the one heard longest ago is forgotten."""
+"""Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
 _MAX_PORT = 65535
 _log = logging.getLogger(__name__)
 
 
 def _with_port(address: str) -> str:
-    # ZeroMQ takes a port's last 16 bits, or what of it is a number, and listens elsewhere than the peers call.
+    # ZeroMQ accepts a wrong port and uses its last 16 bits, or the part that is a number. No peer calls that port.
     _, colon, port = address.removeprefix("tcp://").rpartition(":")
     numbered = address.startswith("tcp://") and colon and port != "*"
     if numbered and not (port.isdecimal() and 1 <= int(port) <= _MAX_PORT):
@@ -64,7 +68,7 @@ def _any_interface(address: str) -> str:
 
 
 Address = Annotated[str, Field(min_length=1), AfterValidator(_with_transport), AfterValidator(_with_port)]
-"""As ZeroMQ writes them; what names no transport is TCP."""
+"""An address as ZeroMQ writes it. Without a transport it is a TCP address."""
 OwnAddress = Annotated[
     str,
     Field(min_length=1),
@@ -72,7 +76,7 @@ OwnAddress = Annotated[
     AfterValidator(_with_transport),
     AfterValidator(_with_port),
 ]
-"""The same; a port alone is on all interfaces."""
+"""The same, but a port alone means all interfaces."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -124,10 +128,10 @@ class ZmqFrontEnd(FrontEnd):
         return self._source
 
     def counters(self) -> dict[str, int]:
-        """What passed and what did not.
+        """Counters of what passed and what did not.
 
-        ``bursts_out``, ``bursts_in``; ``missed``: gaps in a sender's numbers; ``restarts``: senders beyond one for each
-        address; ``malformed`` and ``wrong_rate``: messages refused.
+        ``bursts_out``, ``bursts_in``: bursts sent and received. ``missed``: gaps in the numbers of a sender.
+        ``restarts``: senders beyond one for each address. ``malformed`` and ``wrong_rate``: refused messages.
         """
         counted = {name: self._counters[name] for name in ("bursts_out", "bursts_in", "missed")}
         counted["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
@@ -148,7 +152,7 @@ class ZmqFrontEnd(FrontEnd):
         socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
         socket.setsockopt(zmq.IPV6, any("[" in address for address in (self.options.bind, *self.options.connect)))
-        # One burst is one message; anything larger is none of ours.
+        # One burst is one message. A larger message does not come from this front end.
         socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + 2 * self.phy.airtime_samples() * _SAMPLE.itemsize)
         return socket
 
@@ -170,7 +174,7 @@ def _open(action: Callable[[str], object], key: str, address: str) -> None:
 
 
 class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Samples in, each packet's as one message."""
+    """Sends the samples of each packet as one message."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
         super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
@@ -193,7 +197,7 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
 
 class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Messages in, their samples out."""
+    """Receives messages and gives their samples."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
         super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
@@ -206,7 +210,7 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):
-            # Wait without Python's lock, and for a limited time: GNU Radio can end this thread only between two calls.
+            # Wait without Python's lock and for a limited time: GNU Radio can end this thread only between two calls.
             if not self._socket.poll(_POLL_MS):
                 return 0
             self._rest = self._take(self._socket.recv(zmq.NOBLOCK))
@@ -216,7 +220,7 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         return count
 
     def _take(self, message: bytes) -> NDArray[np.complex64]:
-        """The samples of a message, none where it is not one of ours."""
+        """The samples of a message; empty if the message is refused."""
         nothing: NDArray[np.complex64] = np.empty(0, np.complex64)
         size = len(message) - HEADER.size
         if size < 0 or size % _SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
@@ -241,7 +245,7 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         before = self._senders.pop(sender, None)
         if before is None:
             if len(self._senders) == MAX_SENDERS:
-                # Each moves to the end when it is heard.
+                # A sender moves to the end when it is heard, so the first one is the oldest.
                 del self._senders[next(iter(self._senders))]
             self._counters["senders"] += 1
         else:

@@ -1,9 +1,9 @@
 """`ros2 run gr_ros2 link`: one robot's end of a link as a node whose parameters are the link's settings.
 
-Invariants: the configuration file names what the link is, parameters given at the start replace single settings of it,
-and both are checked as one; what the running blocks can change may be set while they run, everything else is read-only;
-an error is one line on stderr, exit status 2 for wrong settings and 1 for a failed run, as of `gr-ros2 link`; what the
-library logs goes where the node's own lines go, console and /rosout.
+Invariants: the configuration file describes the link. Parameters given at the start replace single settings of it, and
+the result is checked as a whole. Settings that the running blocks can change may be set while they run. All other
+settings are read-only. An error is one line on stderr. The exit status is 2 for wrong settings and 1 for a failed run,
+as for `gr-ros2 link`. The log of the library goes where the node's own log goes: to the console and to /rosout.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LIBRARY_LOG = logging.getLogger("gr_ros2")
 
 
 class LinkNode(Node):  # type: ignore[misc]
-    """A link with its parameters.
+    """A link as a node with parameters.
 
     :raises ConfigError: for a missing file, an unknown parameter or a wrong value
     :raises MiddlewareError: when the ROS graph cannot be joined
@@ -68,7 +68,7 @@ class LinkNode(Node):  # type: ignore[misc]
         super().destroy_node()
 
     def _show(self, parameter: Parameter) -> None:
-        """Declare a parameter with the value the link has, also one that was given at the start as some other type."""
+        """Declare a parameter with the value in the link. At the start it may have been given as another type."""
         if self.has_parameter(parameter.name):
             self.undeclare_parameter(parameter.name)
         descriptor = _descriptor(parameter, read_only=parameter.name not in self._setters)
@@ -86,14 +86,15 @@ class LinkNode(Node):  # type: ignore[misc]
 
 
 class _NodeLog(logging.Handler):
-    """Passes log records on to a node's logger; those of ``debug``, which somebody asked for, as information."""
+    """Passes log records on to a node's logger. Those of ``debug`` become information, because the user asked for
+    them."""
 
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._logger = node.get_logger()
 
     def emit(self, record: logging.LogRecord) -> None:
-        # One call each: rclpy wants every line of code to keep to one severity.
+        # One call for each severity: rclpy requires that a line of code always logs with the same one.
         if record.levelno >= logging.ERROR:
             self._logger.error(self.format(record))
         elif record.levelno >= logging.WARNING:
@@ -103,7 +104,7 @@ class _NodeLog(logging.Handler):
 
 
 def _settings(link: RobotLink) -> list[Parameter]:
-    """Those of the configuration, with all that PHY and front end have settings for, each once."""
+    """The settings of the configuration, and all settings of the PHY and the front end, each once."""
     found = list(parameters(link.config))
     for prefix, part in (("phy.options.", link.phy), ("front_end.", link.front_end)):
         found += parameters(part.options, prefix)
@@ -111,7 +112,7 @@ def _settings(link: RobotLink) -> list[Parameter]:
 
 
 def _setters(link: RobotLink) -> list[tuple[str, Callable[[Any], None]]]:
-    """What the blocks can change while they run."""
+    """The settings that the blocks can change while they run, with their setters."""
     return [
         (f"{end}.{name.removeprefix('set_')}", getattr(block, name))
         for end, block in (("ros_source", link.source), ("ros_sink", link.sink))
@@ -141,12 +142,12 @@ def _descriptor(parameter: Parameter, *, read_only: bool) -> ParameterDescriptor
 
 
 def _join(words: Sequence[str]) -> None:
-    """Start rclpy with the arguments of the command line, its own name first.
+    """Start rclpy with the arguments of the command line, the program's name first.
 
     :raises ConfigError: for arguments that ROS cannot read, or that are not for ROS
     """
     try:
-        # Handlers of our own: rclpy's would end every context at once, also one that the link still publishes through.
+        # We use our own handlers. Those of rclpy would end every context at once, also one that the link still uses.
         rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         raise ConfigError(f"{error}; write {_USAGE}") from error
@@ -156,12 +157,12 @@ def _join(words: Sequence[str]) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the node until it is interrupted or its link is over.
+    """Run the node until it is interrupted or its link has finished.
 
     :param args: the command line, the program's name first
     """
     asked: list[int] = []
-    # Not KeyboardInterrupt: raised in an import or a callback of C, while all this opens, it would be lost. And one
+    # Not KeyboardInterrupt: if it is raised in an import or a C callback during the start, it is lost. And one
     # Ctrl-C may come twice, from the terminal and from `ros2 launch`.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))

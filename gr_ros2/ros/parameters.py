@@ -1,7 +1,7 @@
-"""Every setting of a link as one flat list of named values, as ROS parameters have them.
+"""Every setting of a link as one flat list of named values, in the form of ROS parameters.
 
-Invariants: names, meanings and ranges are those of the configuration classes, never written a second time; a value that
-ROS has no type for (complex numbers, mappings) appears as text; nothing here knows rclpy.
+Invariants: names, meanings and ranges come from the configuration classes and are never written a second time. A value
+without a ROS type (complex numbers, mappings) appears as text. This module does not use rclpy.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ class Parameter:
     """One setting.
 
     :param name: dots between nested keys, as in YAML overrides
-    :param value: now; None where it is not set
+    :param value: current value; None if it is not set
     :param meaning: one line
-    :param minimum: smallest number allowed, None without
-    :param maximum: largest number allowed, None without
+    :param minimum: smallest number allowed; None if there is no limit
+    :param maximum: largest number allowed; None if there is no limit
     :param rule: what else is allowed, in words
-    :param strict: whether only values of this very type fit
+    :param strict: whether only values of exactly this type are allowed
     """
 
     name: str
@@ -39,7 +39,7 @@ class Parameter:
 
 
 def parameters(settings: Any, prefix: str = "") -> Iterator[Parameter]:
-    """The settings of a configuration object, in their order, those of nested objects in place.
+    """The settings of a configuration object, in their order. Settings of nested objects follow in place.
 
     :param prefix: with a dot at its end, or ''
     """
@@ -54,7 +54,7 @@ def parameters(settings: Any, prefix: str = "") -> Iterator[Parameter]:
 
 
 def overrides(values: Mapping[str, Any]) -> list[str]:
-    """ROS parameters as `key=value`, the way the command line writes settings."""
+    """ROS parameters as `key=value`, in the form that the command line uses."""
     return [f"{name}={_text(value)}" for name, value in values.items()]
 
 

@@ -1,9 +1,9 @@
-"""Drives one robot from place to place: pure pursuit along the roadmap, behind a guard that cannot be overruled.
+"""Drives one robot from place to place: pure pursuit along the roadmap, with a safety check that has the last word.
 
-Invariant: a robot takes a command only if, after it, braking at once would bring it to rest without touching anything.
-The points it would then pass are its ``reserved`` path; robots decide one after the other and stay clear of what
-the others have reserved. Braking along the reserved path is therefore always left as a safe choice, so no robot
-ever touches a wall, an obstacle or another robot, whatever the route.
+Invariant: a robot takes a command only if it could brake at once after it and stop without touching anything. The
+points it would pass while braking are its ``reserved`` path. Robots decide one after the other and stay clear of the
+reserved paths of the others. So braking along the reserved path is always a safe choice. No robot ever touches a wall,
+an obstacle or another robot, whatever the route.
 """
 
 from __future__ import annotations
@@ -21,34 +21,35 @@ _LOOKAHEAD_M = 1.2
 _ARRIVED_M = 0.5
 _TRIP_M = 7.0
 _PATIENCE = 15
-"""Ticks without moving before the driver backs out and goes elsewhere."""
+"""Ticks without motion before the driver retreats and chooses another route."""
 _RETREAT = 25
-"""Ticks that it then spends on getting away from what is nearest."""
+"""Ticks for which it then moves away from the nearest things."""
 _COMFORT_M = 1.0
-"""Gap to another robot that the driver likes to keep beyond what safety asks."""
+"""Gap to another robot that the driver prefers, beyond the gap that safety requires."""
 _COMFORT_WALL_M = 0.15
-"""The same to walls and obstacles."""
+"""The same for walls and obstacles."""
 
 
 class Driver:
     """Decides the commands of one robot.
 
-    :param node: place of the roadmap it starts at
-    :param rng: of destinations and of the small irregularity of its commands
+    :param node: place of the roadmap where it starts
+    :param rng: generator of destinations and of small irregularities in its commands
     """
 
     def __init__(self, world: World, roadmap: Roadmap, node: int, max_speed: float, rng: np.random.Generator) -> None:
         self._world, self._roadmap, self._rng = world, roadmap, rng
         self._max_speed = max_speed
         self._brake_ticks = math.ceil(max_speed / (ACCELERATION * TICK))
-        # Paths are checked at points at most max_speed * TICK apart, so in between half of that may be missing.
+        # Paths are checked only at points, at most max_speed * TICK apart. Between two points the clearance may be
+        # smaller by half of that.
         self._wall_gap = RADIUS + max_speed * TICK / 2 + 0.03
         self._robot_gap = 2 * RADIUS + max_speed * TICK + 0.05
         self._stuck = self._retreat = 0
         self._route: list[int] = [node]
         x, y = roadmap.nodes[node]
         self.state = State(float(x), float(y), float(rng.uniform(-math.pi, math.pi)), 0.0, 0.0)
-        """At the latest tick."""
+        """State at the latest tick."""
         self.reserved: Floats = np.array([[x, y]], dtype=np.float64)
         """Points (n, 2) the robot would pass if it braked now."""
 
@@ -75,7 +76,7 @@ class Driver:
             now = self.state.towards(float(speeds[best]), float(turns[best]))
             self.reserved = paths[best]
         else:
-            # The rest of the path reserved before: clear of everything since the tick that chose it.
+            # Follow the rest of the path reserved before. It has been clear since the tick that chose it.
             now = self.state.towards(*self.state.braking())
         self.state = now.after(TICK)
         self._stuck = self._stuck + 1 if self.state.speed < 0.05 else 0
@@ -96,7 +97,7 @@ class Driver:
         )
 
     def _cost(self, target: Floats, speeds: Floats, turns: Floats) -> Floats:
-        """How far each command is from what pure pursuit wants: turn to the target, slow down in sharp turns."""
+        """Distance of each command from pure pursuit: turn to the target, slow down in sharp turns."""
         state = self.state
         bearing = math.atan2(target[1] - state.y, target[0] - state.x) - state.heading
         bearing = math.atan2(math.sin(bearing), math.cos(bearing))
@@ -105,7 +106,7 @@ class Driver:
         return ((speeds - wanted_speed) / self._max_speed) ** 2 + ((turns - wanted_turn) / MAX_TURN) ** 2
 
     def _target(self, others: Sequence[Driver]) -> Floats:
-        """The point to steer for: ahead on the line to the farthest place of the route that is in sight."""
+        """The point to steer to: ahead on the line to the farthest place of the route that is in sight."""
         here = np.array([self.state.x, self.state.y])
         nodes = self._roadmap.nodes
         if self._stuck > _PATIENCE:
@@ -128,7 +129,7 @@ class Driver:
         return np.asarray(here + way * min(1.0, _LOOKAHEAD_M / max(length, 1e-9)))
 
     def _away(self, here: Floats, others: Sequence[Driver]) -> Floats:
-        """A metre away from whatever is near, the nearer the more."""
+        """A vector of one metre away from things that are near. Nearer things count more."""
         probes = here + 0.01 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         middle, right, left, up, down = self._world.clearance(probes).tolist()
         away = np.array([right - left, up - down]) / (0.02 * max(0.01, middle - RADIUS))
@@ -139,7 +140,7 @@ class Driver:
         return np.asarray(away / max(1e-9, math.hypot(*away)))
 
     def _new_route(self, start: int, others: Sequence[Driver]) -> None:
-        """Off to a far place; of a few, the one whose first step leads farthest from the other robots."""
+        """Choose a route to a far place: of three, the one whose first step is farthest from the other robots."""
         far = self._roadmap.far_from(start, _TRIP_M)
         routes = [self._roadmap.route(start, int(goal)) for goal in self._rng.choice(far, 3)]
 

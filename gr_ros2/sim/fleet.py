@@ -1,8 +1,8 @@
 """The robots together: their true motion, and the messages of all of them in time order.
 
-Invariants: no clock, no thread, no global generator: time is simulated, t = 0 at the start; the same settings give the
-same bytes, and a second call of ``messages`` gives them again; a topic at ``rate`` sends exactly rate * duration
-messages where that is a whole number, each robot's topic at a phase of its own, as sensors do.
+Invariants: no clock, no thread, no global generator. Time is simulated, with t = 0 at the start. The same settings give
+the same bytes, also in a second call of ``messages``. A topic at ``rate`` sends exactly rate * duration messages if
+that is a whole number. Each topic of each robot has its own phase, as real sensors have.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class SimMessage:
     """One message of one robot.
 
     :param t: simulated time, s
-    :param topic: absolute name, ``/robot_1/odom``
-    :param type_name: ``nav_msgs/msg/Odometry``
+    :param topic: absolute name, for instance ``/robot_1/odom``
+    :param type_name: for instance ``nav_msgs/msg/Odometry``
     :param payload: serialized message with its encapsulation header
     """
 
@@ -45,7 +45,7 @@ class SimMessage:
 class Fleet:
     """Robots 1, 2, ... driving in one world.
 
-    :ivar world: what they drive in
+    :ivar world: the world in which they drive
     :ivar robot_ids: 1, 2, ...
     """
 
@@ -62,7 +62,7 @@ class Fleet:
         self._log: list[list[State]] = [[] for _ in self._drivers]
 
     def _places(self, roadmap: Roadmap, rng: np.random.Generator) -> Sequence[int]:
-        """Where the robots start, well apart."""
+        """Start places of the robots, at a distance from each other."""
         places: list[int] = []
         for node in rng.permutation(roadmap.reachable).tolist():
             away = [math.hypot(*(roadmap.nodes[node] - roadmap.nodes[other])) for other in places]
@@ -84,7 +84,7 @@ class Fleet:
         return {name: getattr(self.settings, f"{name}_rate") for name in TYPES}
 
     def state(self, robot_id: int, t: float) -> State:
-        """The truth: where a robot is at simulated time ``t`` >= 0 and how it moves."""
+        """The true place and motion of a robot at simulated time ``t`` >= 0."""
         tick = int(t / TICK)
         while len(self._log[0]) <= tick:
             for driver, log in zip(self._drivers, self._log, strict=True):
@@ -103,11 +103,11 @@ class Fleet:
     def messages(
         self, duration_s: float, start_time_s: float | None = None, topics: Collection[str] | None = None
     ) -> Iterator[SimMessage]:
-        """All messages with 0 <= t < duration_s, in time order, made as they are asked for.
+        """All messages with 0 <= t < duration_s, in time order, each made when it is asked for.
 
         :param duration_s: s, may be infinite
         :param start_time_s: stamps are this + t; None takes ``settings.start_time_s``
-        :param topics: absolute names of those wanted, None = all; the others change no byte of them
+        :param topics: absolute names of the topics to return, None = all. The choice does not change their bytes
         """
         start_ns = round((self.settings.start_time_s if start_time_s is None else start_time_s) * 1e9)
         sensors = {i: Sensors(self.settings, self.world, i, self.state(i, 0.0), start_ns) for i in self.robot_ids}

@@ -1,7 +1,8 @@
 """How a differential-drive robot moves within one control period.
 
-Invariant: speed and turn rate change linearly within a period of ``TICK`` seconds, by no more than ``ACCELERATION`` and
-``TURN_ACCELERATION`` allow; a pose between two ticks is the integral of exactly that, so paths have no corners.
+Invariant: speed and turn rate change linearly within a period of ``TICK`` seconds. ``ACCELERATION`` and
+``TURN_ACCELERATION`` limit the change. A pose between two ticks is the integral of this motion, so paths have no
+corners.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from gr_ros2.sim.world import Floats
 
 TICK = 0.1
-"""s between two commands."""
+"""Time between two commands, s."""
 RADIUS = 0.35
-"""m, of a robot's round footprint."""
+"""Radius of a robot's round footprint, m."""
 ACCELERATION = 1.0
 """m/s^2, speeding up and braking."""
 MAX_TURN = 1.5
@@ -74,8 +75,8 @@ def stopping_paths(state: State, speeds: Floats, turns: Floats, longest: int) ->
 
     :param speeds: commanded speeds, shape (n,)
     :param turns: commanded turn rates, shape (n,)
-    :param longest: ticks in which it stops from any speed
-    :returns: points of shape (n, 2 + longest, 2), the first one where the robot is now
+    :param longest: number of ticks in which it stops from any speed
+    :returns: points of shape (n, 2 + longest, 2); the first one is where the robot is now
     """
     ticks = np.arange(longest + 1)
     speed = np.maximum(0.0, speeds[:, None] - ACCELERATION * TICK * ticks)

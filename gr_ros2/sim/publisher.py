@@ -1,8 +1,8 @@
 """Plays simulated robots on ROS graphs in real time.
 
-Invariants: message n goes out when the clock reaches start + t(n), never before; one that is late goes at once and
-moves no later one; ``stop`` takes effect before the next message; an error of the graph ends the play and is
-raised by ``stop``, never lost.
+Invariants: message n is published when the clock reaches start + t(n), never before. A late message is published at
+once and does not delay later ones. ``stop`` takes effect before the next message. An error of the graph ends the
+playback, and ``stop`` raises it.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ _JOIN_S = 1.0
 
 
 class SimPublisher:
-    """A fleet on ROS graphs, in a thread of its own.
+    """Publishes a fleet on ROS graphs, in a thread of its own.
 
-    Publishers are announced at construction, so subscribers can be found before ``start``. They stay until
-    ``close``, so that a late joiner still gets the map.
+    Publishers are announced at construction, so subscribers can be found before ``start``. They stay until ``close``,
+    so that a late joiner still gets the map.
 
-    :param middleware: one graph for all robots, or one per robot id; robots left out do not publish
-    :param duration_s: of play, s; may be infinite
-    :param start_time: called at ``start`` for the stamp of t = 0; None takes the fleet's ``start_time_s`` setting
+    :param middleware: one graph for all robots, or one per robot id; robots without a graph do not publish
+    :param duration_s: duration of the playback, s; may be infinite
+    :param start_time: called at ``start``, returns the stamp of t = 0, s; None takes the fleet's ``start_time_s``
+        setting
     :param clock: monotonic, s
     :ivar published: messages published, per topic
-    :ivar worst_lag_s: the longest that a message left after its time
+    :ivar worst_lag_s: largest delay of a message, s
     :raises MiddlewareError: when a topic cannot be announced
     """
 
@@ -73,27 +74,27 @@ class SimPublisher:
 
     @property
     def publishers(self) -> Mapping[str, Publisher]:
-        """By absolute topic name, for instance to wait until they are matched."""
+        """Publishers by absolute topic name, for instance to wait until they are matched."""
         return self._publishers
 
     @property
     def finished(self) -> bool:
-        """True once the play has begun and is over: all published, stopped, or failed."""
+        """True if the playback has started and is over: all published, stopped, or failed."""
         return self._thread.ident is not None and not self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin to play; t = 0 is now. Once only."""
+        """Start the playback; t = 0 is now. Call this only once."""
         self._thread.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Block until finished; whether it is."""
+        """Wait until the playback is finished. Returns whether it is."""
         self._thread.join(timeout_s)
         return self.finished
 
     def stop(self) -> None:
-        """End the play; the publishers stay. Idempotent.
+        """End the playback; the publishers stay. Idempotent.
 
-        :raises Exception: what ended the play early, for instance a MiddlewareError
+        :raises Exception: the error that ended the playback early, for instance a MiddlewareError
         """
         self._stop.set()
         if self._thread.ident is not None:
@@ -105,7 +106,7 @@ class SimPublisher:
             raise error
 
     def close(self) -> None:
-        """Stop, and take the publishers off the graph."""
+        """Stop, and remove the publishers from the graph."""
         try:
             self.stop()
         finally:

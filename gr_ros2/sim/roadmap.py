@@ -19,9 +19,9 @@ _SAMPLES = 400
 
 
 class Roadmap:
-    """Random places no nearer to each other than a metre, joined where the line between them is clear.
+    """Random places at least a metre apart, joined if the line between them is clear.
 
-    :param clearance: m from the centre of a robot to anything
+    :param clearance: distance from the centre of a robot to anything, m
     """
 
     def __init__(self, world: World, clearance: float, rng: np.random.Generator) -> None:
@@ -34,7 +34,7 @@ class Roadmap:
                 places.append(sample)
         nodes = np.array(places)
         distance, step = self._routes(nodes)
-        # Gaps are wide enough that nearly everything is one piece; a place that is not is left out.
+        # Gaps are so wide that nearly all places are connected. A place that is not connected is left out.
         hub = int(np.isfinite(distance).sum(axis=1).argmax())
         self._distance, self._step = distance, step
         self.nodes = nodes
@@ -43,7 +43,7 @@ class Roadmap:
         """Indices of the places that can reach each other."""
 
     def _routes(self, nodes: Floats) -> tuple[Floats, Places]:
-        """Shortest distances and next steps between all places (Floyd and Warshall)."""
+        """Shortest distances and next steps between all places (Floyd-Warshall algorithm)."""
         count = len(nodes)
         lengths = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
         distance = np.full((count, count), np.inf)
@@ -70,7 +70,7 @@ class Roadmap:
         return int(order[0])
 
     def far_from(self, node: int, least_m: float) -> Places:
-        """Places at least that far to drive, or the farthest one if none is."""
+        """Places to which the drive is at least that long, or the farthest place if there are none."""
         distance = self._distance[node, self.reachable]
         far = self.reachable[distance >= least_m]
         return far if len(far) else self.reachable[[int(distance.argmax())]]

@@ -1,8 +1,8 @@
-"""What one robot's sensors say: true motion and a generator in, serialized ROS 2 messages out.
+"""The sensors of one robot: true motion and a generator in, serialized ROS 2 messages out.
 
-Invariants: payloads are CDR, little endian, with the 4-byte encapsulation header; every topic draws from its own
-generator, so the bytes of one do not depend on the rate of another; stamps are nanoseconds handed in.
-Frame names are those of REP 105; with them an Odometry is 724 B and an Imu 324 B, as in common recordings.
+Invariants: payloads are CDR, little endian, with the 4-byte encapsulation header. Every topic has its own generator, so
+the bytes of one topic do not depend on the rate of another. Stamps are counted in ns from the start time that is passed
+in. Frame names are those of REP 105. With them an Odometry is 724 B and an Imu 324 B, as in common recordings.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Sensors:
     def __init__(self, settings: SimSettings, world: World, robot_id: int, start: State, start_ns: int) -> None:
         self._settings, self._world, self._start_ns = settings, world, start_ns
         self._prefix = settings.frame_prefix(robot_id)
-        # One generator per topic; 2 keeps them apart from world and routes, which are 0 and 1.
+        # One generator per topic. The 2 separates their seeds from those of world and routes, which have 0 and 1.
         self._rng = {name: np.random.default_rng([settings.seed, 2, robot_id, i]) for i, name in enumerate(TYPES)}
         self._believed = (start.x, start.y, start.heading)
         self._odom_t = 0.0
@@ -56,7 +56,7 @@ class Sensors:
         self._accel_bias = rng.normal(0.0, settings.imu_accel_noise / 5, 3)
         turn = 2 * math.pi / settings.beams
         self._bearings: Floats = -math.pi + turn * np.arange(settings.beams, dtype=np.float64)
-        # What drivers fill in: how far wrong position, height, roll, pitch and heading may be.
+        # Variances as drivers fill them in: position, height, roll, pitch and heading.
         pose = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
         twist = (settings.odom_linear_noise**2, 1e-6, 1e6, 1e6, 1e6, settings.odom_angular_noise**2)
         self._pose_covariance, self._twist_covariance = np.diag(pose).ravel(), np.diag(twist).ravel()
@@ -66,9 +66,9 @@ class Sensors:
         ]
 
     def read(self, topic: str, t: float, state: State, others: Sequence[State]) -> bytes:
-        """The message of one topic at simulated time ``t``, t not before that topic's last.
+        """The message of one topic at simulated time ``t``, which is not before the topic's last message.
 
-        :param others: the other robots now
+        :param others: states of the other robots at ``t``
         """
         message = getattr(self, f"_{topic}")(t, state, others)
         return bytes(_STORE.serialize_cdr(message, TYPES[topic]))
@@ -138,7 +138,7 @@ class Sensors:
         )
 
     def _cmd_vel(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
-        """The state handed in carries the command: what it reaches at the end of its period."""
+        """``state`` is the motion at the end of the period, which is the command."""
         return _twist(state.speed, max(-MAX_TURN, min(MAX_TURN, state.turn)))
 
     def _map(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
@@ -165,7 +165,7 @@ def _twist(speed: float, turn: float) -> Any:
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Any:
-    """Roll and pitch are small tilts, rad: the composition of the three half-angle rotations (REP 103 axes)."""
+    """The quaternion of the three half-angle rotations, rad (REP 103 axes). Roll and pitch are small tilts."""
     sr, cr = math.sin(roll / 2), math.cos(roll / 2)
     sp, cp = math.sin(pitch / 2), math.cos(pitch / 2)
     sy, cy = math.sin(yaw / 2), math.cos(yaw / 2)

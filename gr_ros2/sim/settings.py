@@ -1,6 +1,6 @@
 """Settings of the simulator.
 
-Invariant: the same settings give the same bytes; what one topic does (its rate, its noise) changes no byte of another.
+Invariant: the same settings give the same bytes. The rate and noise of one topic do not change the bytes of another.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class SimSettings(Seeded):
     transforms: bool = False
 
     def frame_prefix(self, robot_id: int) -> str:
-        """What the names of a robot's frames begin with, '' where they carry no name."""
+        """The prefix of the names of a robot's frames; '' if they have none."""
         return f"robot_{robot_id}/" if self.prefix_frames else ""
 
     @model_validator(mode="after")

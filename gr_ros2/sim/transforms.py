@@ -1,7 +1,7 @@
-"""Where a robot's frames are, as robots tell it on ``/tf`` and ``/tf_static`` (REP 105).
+"""The transforms between the frames of a robot, published on ``/tf`` and ``/tf_static`` as robots do (REP 105).
 
-Invariants: what moves is what the robot's odometry says; everything else is fixed. The odometry starts at the true
-place, so ``odom`` lies on ``map``; laser and IMU are in the middle of the robot.
+Invariants: only the transform from the robot's odometry moves; all others are fixed. The odometry starts at the true
+place, so ``odom`` and ``map`` coincide. Laser and IMU are in the middle of the robot.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ _DEPTH: Final = 100
 
 
 class TransformPublisher:
-    """The transforms of one robot on a graph, which all tools that draw ask for.
+    """Publishes the transforms of one robot on a graph. All visualization tools need them.
 
     :param middleware: the robot's graph
-    :param prefix: of its frames, such as ``robot_1/``; ``''`` none. Its own ``map`` then lies on the one of all robots
+    :param prefix: prefix of its frames, such as ``robot_1/``; ``''`` for none. With a prefix, the robot's own ``map``
+        coincides with the ``map`` of all robots
     :raises MiddlewareError: when the topics cannot be announced
     """
 
@@ -36,14 +37,14 @@ class TransformPublisher:
         self._pairs = ([(_WORLD, f"{prefix}{_WORLD}")] if prefix else []) + fixed
 
     def start(self, stamp_ns: int) -> None:
-        """Tell what never moves, from this time on, ns."""
+        """Publish the fixed transforms, valid from ``stamp_ns`` on, ns."""
         stamp = _TYPE["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         origin = _TYPE["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
         level = _TYPE["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
         self._fixed.publish(_message(_transform(stamp, *pair, origin, level) for pair in self._pairs))
 
     def follow(self, odometry: bytes) -> None:
-        """Tell where the robot is, by its odometry, serialized."""
+        """Publish the place of the robot, from its serialized odometry."""
         said: Any = _STORE.deserialize_cdr(odometry, "nav_msgs/msg/Odometry")
         pose, header = said.pose.pose, said.header
         place = _TYPE["geometry_msgs/msg/Vector3"](x=pose.position.x, y=pose.position.y, z=pose.position.z)

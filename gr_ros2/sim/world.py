@@ -1,8 +1,8 @@
 """The room the robots drive in: four walls, boxes at any angle, round pillars.
 
-Invariants: lengths in m, angles in rad, the room's lower left corner is the origin of the map frame; between any two
-obstacles, and between an obstacle and a wall, there is a gap of ``GAP`` or more, so every free place can be
-reached; nothing here changes after construction.
+Invariants: lengths are in m, angles in rad. The room's lower left corner is the origin of the map frame. Between any
+two obstacles, and between an obstacle and a wall, there is a gap of ``GAP`` or more, so every free place can be
+reached. Nothing here changes after construction.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 GAP = 1.7
-"""m between obstacles: a robot of 0.7 m passes with half a metre to each side."""
+"""Smallest gap between obstacles, m. A robot of 0.7 m passes with half a metre on each side."""
 BORDER = 0.4
-"""m of wall that the map shows around the room."""
+"""Width of the wall that the map shows around the room, m."""
 _TRIES = 200
 
 
@@ -25,8 +25,8 @@ class World:
     """A room with obstacles, drawn from a generator.
 
     :param size: side of the square room, m
-    :param count: obstacles wished for; places that leave no ``GAP`` are not used, so there may be fewer
-    :param rng: where the places come from
+    :param count: requested number of obstacles. Places that leave no ``GAP`` are not used, so there may be fewer
+    :param rng: generator of the places
     """
 
     def __init__(self, size: float, count: int, rng: np.random.Generator) -> None:
@@ -84,11 +84,11 @@ class World:
     def cast(self, x: float, y: float, angles: Floats, others: Floats | None = None) -> Floats:
         """Distance along each ray to the first wall, obstacle or other robot.
 
-        :param angles: of the rays, in the map frame
-        :param others: rows x, y, radius of round things that move
+        :param angles: directions of the rays, in the map frame
+        :param others: rows x, y, radius of moving round objects
         """
         dir_x, dir_y = np.cos(angles)[:, None], np.sin(angles)[:, None]
-        with np.errstate(divide="ignore"):  # a ray along a wall: +-inf is what the slabs need
+        with np.errstate(divide="ignore"):  # a ray along a wall gives +-inf, as the slab method needs
             room = np.maximum((0.0 - x) / dir_x, (self.size - x) / dir_x)
             room = np.minimum(room, np.maximum((0.0 - y) / dir_y, (self.size - y) / dir_y))
             hits = [room]
@@ -123,10 +123,10 @@ class World:
         return -BORDER, (self.size + 2 * BORDER) / cells
 
     def occupancy(self, cells: int) -> NDArray[np.int8]:
-        """The map of nav_msgs/OccupancyGrid: rows of growing y, 100 where a cell's centre is in a wall or an
-        obstacle or within half a cell of its edge, else 0."""
+        """The map of nav_msgs/OccupancyGrid: rows of growing y. A cell is 100 if its centre is in a wall or an
+        obstacle, or within half a cell of its edge, else 0."""
         origin, resolution = self.map_origin_resolution(cells)
         centres = origin + (np.arange(cells) + 0.5) * resolution
         grid = np.stack(np.meshgrid(centres, centres), axis=-1)
-        clearance = np.stack([self.clearance(row) for row in grid])  # row by row: a large map stays small in memory
+        clearance = np.stack([self.clearance(row) for row in grid])  # row by row, to save memory
         return np.where(clearance < resolution / 2, 100, 0).astype(np.int8)
