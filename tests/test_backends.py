@@ -87,6 +87,7 @@ def test_a_thread_loads_too() -> None:
 
 @pytest.mark.parametrize("table", [MIDDLEWARE, PHY, FRONT_ENDS, SCHEDULER], ids=lambda table: table.family)
 def test_every_row_has_a_summary_of_one_line(table: BackendTable[Backend]) -> None:
+    assert table.own
     assert all(row.summary and "\n" not in row.summary for row in table.own.values())
 
 

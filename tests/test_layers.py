@@ -229,6 +229,7 @@ def test_every_module_says_what_it_is(module: str) -> None:
 def test_everything_but_the_adapters_imports_without_any_back_end() -> None:
     wanted = [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/")).with_suffix(".py").exists()]
     wanted += [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/") / "__init__.py").exists()]
+    assert set(wanted) == set(WITHOUT_BACKENDS)
     wanted += [f"gr_ros2.{m.removesuffix('.py').replace('/', '.')}" for m in MODULES if part(m) in PURE]
     code = f"""
 import sys

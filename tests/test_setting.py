@@ -76,7 +76,9 @@ def nested(hint: Any) -> Iterator[type[Any]]:
 
 def every() -> list[tuple[type[Any], Setting]]:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    return [(cls, setting) for cls in classes() for setting in settings_of(cls)]
+    found = [(cls, setting) for cls in classes() for setting in settings_of(cls)]
+    assert {cls for cls, _ in found} >= set(ROOTS)
+    return found
 
 
 def test_a_field_tells_all_there_is_to_say() -> None:

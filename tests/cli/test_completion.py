@@ -59,4 +59,5 @@ def test_the_settings_offered_are_there() -> None:
     for key in keys:
         value = dump(load_scenario("demo"))
         for name in key.split("."):
+            assert name in value, key
             value = value[name]

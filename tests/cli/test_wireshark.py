@@ -200,7 +200,9 @@ def test_repairs_are_shown(tmp_path: Path) -> None:
         packets = [bytes.fromhex(hello(vector | {"hex": vector["repairs"][0]})), *map(bytes.fromhex, vector["repairs"])]
         path = capture(tmp_path / "repairs.pcapng", packets)
         members = vector["members"]
-        for layers in dissected(path)[2::2]:
+        shown = dissected(path)[2::2]
+        assert len(shown) == len(vector["repairs"])
+        for layers in shown:
             tree = layers["gr_ros2"]
             assert values(tree, "gr_ros2.kind") == ["1"]
             assert values(tree, "gr_ros2.packet_number") == [str(max(members))]

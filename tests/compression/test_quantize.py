@@ -63,7 +63,9 @@ def test_everything_not_named_stays() -> None:
         payload, clean = Writer(random.Random(seed)).message(POSE)
         out = codec_for(POSE, quantize=steps).decode(0, codec_for(POSE, quantize=steps).encode(0, payload))
         assert out[:4] + out[28:] == clean[:4] + clean[28:]
-    for payload in simulated("odom", 1.0):
+    odometry = simulated("odom", 1.0)
+    assert odometry
+    for payload in odometry:
         codec = codec_for("nav_msgs/Odometry", quantize="pose.pose.position=0.001")
         before, after = (
             STORE.deserialize_cdr(p, "nav_msgs/msg/Odometry")

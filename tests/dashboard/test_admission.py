@@ -150,7 +150,9 @@ def test_a_viewer_that_leaves_while_it_is_let_in_leaves_nothing(monkeypatch: pyt
             wire.close()
 
     with Dashboard(port=0) as dashboard:
-        asyncio.run(leave_at_once(dashboard, token(get(dashboard.url)[1])))
+        page = get(dashboard.url)[1]
+        assert dashboard.viewers == 1
+        asyncio.run(leave_at_once(dashboard, token(page)))
         wait_for(lambda: dashboard.viewers == 0, "the page to be forgotten")
 
 
@@ -239,7 +241,7 @@ def test_a_page_that_cannot_be_made_leaves_its_place(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("gr_ros2.dashboard.server._UNUSED_MS", 200)
     monkeypatch.setattr("gr_ros2.dashboard.live_page.tiles_html", None)
     with Dashboard(port=0) as dashboard:
-        get(dashboard.url)
+        assert get(dashboard.url)[0] == 500
         monkeypatch.undo()
         wait_for(lambda: get(dashboard.url)[0] == 200, "a place")
 

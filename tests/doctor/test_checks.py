@@ -88,8 +88,8 @@ def test_back_ends_that_are_missing_say_what_they_need(monkeypatch: pytest.Monke
 def test_flowgraphs_that_do_not_find_the_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     found = installed.companion()
-    if found.state == "note":  # else the blocks are installed for everybody
-        assert found.remedy == "gr-ros2 grc-path --install"
+    # Where the blocks are installed for everybody, they are found all the same.
+    assert (found.state, found.remedy) in (("note", "gr-ros2 grc-path --install"), ("ok", ""))
 
 
 def test_a_radio_on_usb_and_whether_it_may_be_opened(tmp_path: Path) -> None:

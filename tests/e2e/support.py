@@ -35,6 +35,7 @@ def set_options(overrides: Sequence[str]) -> list[str]:
 
 def check_books(result: Result) -> None:
     """Every message is in exactly one row, and none is corrupt."""
+    assert result.topics
     for topic in result.topics:
         assert sum(topic.ledger.values()) == topic.sent, topic
         assert topic.ledger.get("delivered", 0) == topic.delivered

@@ -55,7 +55,7 @@ def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path
         assert done.returncode == 0, done.stderr
         result = read_result(out)
         odom = next(topic for topic in result.topics if topic.topic == "/robot_1/odom")
-        assert arrived.received
+        assert len(arrived.received) > 5
         # The subscribers ran all along: what came out is what went in, and nowhere else.
         assert all(any(same(got, one, 3) for one in sent.received) for got in arrived.received[5:])
         assert not_sent_there.received == not_leaked.received == []

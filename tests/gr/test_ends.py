@@ -30,7 +30,10 @@ def test_publish_as_counts() -> None:
 
 
 def test_other_topics_are_fine() -> None:
-    check_loop(["/robot_1/odom", "/tf", "/rx_robot_300/odom"], SinkConfig(), REGISTRY)
+    fine = ["/robot_1/odom", "/tf", "/rx_robot_300/odom"]
+    check_loop(fine, SinkConfig(), REGISTRY)
+    with pytest.raises(ConfigError, match="/rx_robot_30/odom"):
+        check_loop([*fine, "/rx_robot_30/odom"], SinkConfig(), REGISTRY)
 
 
 def test_the_same_graph_is_the_same_domain() -> None:

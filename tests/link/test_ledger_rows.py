@@ -44,10 +44,13 @@ def test_what_a_codec_cannot_decode_ends_in_a_row() -> None:
 @pytest.mark.parametrize("row", LedgerRow)
 def test_rows_are_not_written_out_where_they_are_meant(row: LedgerRow) -> None:
     """``Lost``, ``Refused`` and ``Dropped`` are made with a LedgerRow, so that none can be misspelt."""
+    made = 0
     for path in (*(ROOT / "link").glob("*.py"), *(ROOT / "gr").glob("*.py"), *(ROOT / "record").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in MADE_WITH_A_ROW:
                 assert not [arg for arg in node.args if isinstance(arg, ast.Constant) and arg.value == row.value], path
+                made += 1
+    assert made
 
 
 MADE_WITH_A_ROW = {"Lost", "Refused", "Dropped"}

@@ -154,6 +154,7 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
         packets = []
         while (data := link.sender.next_packet(now)) is not None:
             packets.append(data)
+        assert len(packets) == fragments
         for data in packets[:lost]:
             link.receiver.receive(data, now)
         for _ in range(255):

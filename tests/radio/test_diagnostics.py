@@ -95,7 +95,7 @@ def test_no_period_no_diagnostics(tmp_path: Path) -> None:
         }
     )
     with RobotLink(config), MemoryMiddleware(domain_id=domain()) as listener:
-        assert "/diagnostics" not in {info.topic for info in listener.discover()}
+        assert {info.topic for info in listener.discover()} == {"/point"}
 
 
 STATS = {

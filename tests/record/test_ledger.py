@@ -380,6 +380,7 @@ def test_the_engines_over_a_bad_link(
             if isinstance(event, Delivered):
                 outcome[event.topic_id] += 1
     books = ledger.finish()
+    assert sum(book.sent for book in books) == sum(submitted)
     for book in books:
         assert book.sent == submitted[book.topic_id] == book.rows.total()
         assert book.corrupt == 0

@@ -77,9 +77,12 @@ def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     before = write_report([run], tmp_path / "a")
     after = write_report(read_runs([tmp_path / "run"]), tmp_path / "b")
+    compared = set()
     for one, other in zip(before, after, strict=True):
         if one.suffix in (".png", ".csv", ".parquet"):
             assert one.read_bytes() == other.read_bytes(), one.name
+            compared.add(one.suffix)
+    assert compared == {".png", ".csv", ".parquet"}
 
 
 @pytest.mark.slow

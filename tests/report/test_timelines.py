@@ -109,8 +109,8 @@ def test_nothing_can_be_drawn_too(tmp_path: Path) -> None:
             age_figure({"/t": {"run": _messages([1.0], [NAN])}}, {"run": 2.0}),
         ]
     ):
-        for path in save_figure(figure, tmp_path, f"figure{number}"):
-            assert path.stat().st_size
+        written = save_figure(figure, tmp_path, f"figure{number}")
+        assert [path.stat().st_size > 0 for path in written] == [True] * 2
 
 
 @pytest.mark.parametrize(

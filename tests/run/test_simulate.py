@@ -131,6 +131,7 @@ def test_a_link_that_carries_everything_carries_everything() -> None:
     paced = books(
         run("demo", "ros_source.scheduler=freshness", "ros_source.compression=true", "ros_sink.compression=true")
     )
+    assert paced.keys() == plain.keys() == {"scan", "odom", "imu", "cmd_vel", "map", "clock"}
     for name, topic in paced.items():
         assert topic.pdr == 1.0
         assert topic.latency_s.p50 <= plain[name].latency_s.p50 + 1e-9

@@ -173,7 +173,9 @@ def test_imu_measures_motion_and_gravity(fleet: Fleet, messages: list[SimMessage
 
 
 def test_commands_are_where_the_motion_goes(fleet: Fleet, messages: list[SimMessage]) -> None:
-    for t, twist in parsed(messages, "/robot_1/cmd_vel"):
+    commands = parsed(messages, "/robot_1/cmd_vel")
+    assert len(commands) == 10 * DURATION
+    for t, twist in commands:
         state = fleet.state(1, t)
         assert abs(twist.linear.x - state.speed) <= ACCELERATION * 0.1 + 1e-9
         assert abs(twist.angular.z - state.turn) <= TURN_ACCELERATION * 0.1 + 1e-9

@@ -37,7 +37,9 @@ def test_obstacles_leave_room_to_pass(world: World) -> None:
 def test_rays_end_on_the_first_surface(world: World) -> None:
     rng = np.random.default_rng(7)
     points = rng.uniform(0.2, world.size - 0.2, (40, 2))
-    for x, y in points[world.clearance(points) > 0.1]:
+    free = points[world.clearance(points) > 0.1]
+    assert len(free) > 10
+    for x, y in free:
         angles = rng.uniform(-math.pi, math.pi, 50)
         ranges = world.cast(x, y, angles)
         direction = np.column_stack([np.cos(angles), np.sin(angles)])

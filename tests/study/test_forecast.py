@@ -43,7 +43,9 @@ def test_what_fits_is_said_to_fit() -> None:
 def test_a_forecast_is_what_the_link_does() -> None:
     scenario = load_scenario("six-topics-paced", ["time=packets"], duration_s=5.0)
     done = {topic.topic: topic for topic in simulate(scenario).topics}
-    for topic in Planner(scenario).forecast().topics:
+    forecast = Planner(scenario).forecast()
+    assert {topic.topic for topic in forecast.topics} == set(done)
+    for topic in forecast.topics:
         assert topic.result.delivered == done[topic.topic].delivered
 
 
@@ -79,7 +81,9 @@ def test_a_forecast_of_six_topics_is_what_the_flowgraph_does() -> None:
     """On the clock of its samples; in real time it is a row of the benchmark."""
     scenario = load_scenario("six-topics-paced", ["time=samples"], duration_s=5.0)
     real = {topic.topic: topic for topic in run_scenario(scenario).result.topics}
-    for topic in Planner(scenario).forecast().topics:
+    forecast = Planner(scenario).forecast()
+    assert {topic.topic for topic in forecast.topics} == set(real)
+    for topic in forecast.topics:
         delivered = topic.result.delivered
         assert real[topic.topic].delivered == pytest.approx(delivered, rel=0.10, abs=1), topic.topic
         if delivered > 1:
@@ -153,6 +157,7 @@ def test_what_is_proposed(effects: list[Effect], used: tuple[float, float], wort
 @pytest.mark.parametrize("name", ["six-topics-paced", "demo", "narrow-ofdm-paced"])
 def test_nothing_is_called_better_that_makes_more_topics_older_than_younger(name: str) -> None:
     proposed = planner(name, duration=3.0).advice()
+    assert proposed
     for advice in proposed:
         younger, older = ([e for e in advice.effects if getattr(e, word)] for word in ("younger", "older"))
         assert sum(e.weight for e in older) < sum(e.weight for e in younger) or advice.harmless
@@ -171,8 +176,9 @@ def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> No
 
 
 def test_packet_lengths_too_small_for_the_largest_message_are_not_proposed() -> None:
-    plan = planner("demo")
-    assert all(255 * (packet_len - 13) >= 10104 for packet_len in plan._packet_lens())
+    packet_lens = planner("demo")._packet_lens()
+    assert packet_lens
+    assert all(255 * (packet_len - 13) >= 10104 for packet_len in packet_lens)
 
 
 @pytest.mark.parametrize(

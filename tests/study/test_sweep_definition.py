@@ -45,6 +45,7 @@ def test_values_are_taken_as_they_stand(tmp_path: Path) -> None:
 
 def test_repetitions_differ_in_all_seeds_and_cells_share_them(tmp_path: Path) -> None:
     made = plan(tmp_path, repetitions=3, set={"seed": 5})
+    assert len(made.cells) == 3
     for cell in made.cells:
         assert [(run.seed, run.sim.seed, run.channel.seed) for run in cell.runs] == [(n, n, n) for n in (5, 6, 7)]
 

@@ -229,6 +229,7 @@ def test_a_table_reads_back(table: list[Row]) -> None:
 def test_any_table_reads_or_is_refused_by_name(data: bytes) -> None:
     try:
         table = read_table(data)
-    except WireError:
+    except WireError as error:
+        assert error.kind in {"entry_bounds", "entry_kind"}
         return
     assert read_table(write_table(table)) == table

@@ -34,6 +34,7 @@ def talk(one: Robot, air: Air, first: int, count: int) -> None:
 
 def attack(victim: Robot, packets: list[bytes], now: float) -> None:
     """None of it is delivered, and nothing of what arrives changes what was."""
+    assert packets
     before = len(victim.delivered())
     for data in packets:
         victim.receive(data, now)
