@@ -41,7 +41,6 @@ class Setting:
     :param most: largest allowed number; None if there is no such limit
     :param above: numbers must be above this; None if there is no such limit
     :param below: numbers must be below this; None if there is no such limit
-    :param below: numbers have to be below this; None without
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
@@ -14,10 +14,12 @@ from gr_ros2.setting import AUTO
 from gr_ros2.settings_file import BUILTIN_DIR
 
 
-class ScenarioName(click.ParamType):
-    """The name of a built-in scenario or the path of a YAML file. ``load_scenario`` finds out which of them it is."""
+class Completed(click.ParamType):
+    """A parameter whose values the shell can complete."""
 
-    name = "scenario"
+    def candidates(self) -> Iterable[CompletionItem]:
+        """All values that the shell may offer."""
+        raise NotImplementedError
 
     def shell_complete(
         self,
@@ -25,8 +27,19 @@ class ScenarioName(click.ParamType):
         param: click.Parameter,  # noqa: ARG002
         incomplete: str,
     ) -> list[CompletionItem]:
-        names = sorted(path.stem for path in BUILTIN_DIR.glob("*.yaml") if path.stem.startswith(incomplete))
-        return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+        return [item for item in self.candidates() if item.value.startswith(incomplete)]
+
+
+class ScenarioName(Completed):
+    """The name of a built-in scenario or the path of a YAML file. ``load_scenario`` finds out which of them it is."""
+
+    name = "scenario"
+
+    def candidates(self) -> Iterable[CompletionItem]:
+        return map(CompletionItem, sorted(path.stem for path in BUILTIN_DIR.glob("*.yaml")))
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return super().shell_complete(ctx, param, incomplete) or [CompletionItem(incomplete, type="file")]
 
 
 SCENARIO = ScenarioName()
@@ -43,7 +56,7 @@ class OrAuto(click.ParamType):
         return value if value == AUTO else self._other.convert(value, param, ctx)
 
 
-class RowName(click.ParamType):
+class RowName(Completed):
     """A name in a table of back-ends. The table checks the name later, when the row is loaded."""
 
     name = "name"
@@ -51,20 +64,11 @@ class RowName(click.ParamType):
     def __init__(self, table: BackendTable[Any]) -> None:
         self._table = table
 
-    def shell_complete(
-        self,
-        ctx: click.Context,  # noqa: ARG002 - click's signature
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        return [
-            CompletionItem(name, help=row.summary)
-            for name, row in self._table.own.items()
-            if name.startswith(incomplete)
-        ]
+    def candidates(self) -> Iterable[CompletionItem]:
+        return (CompletionItem(name, help=row.summary) for name, row in self._table.own.items())
 
 
-class Setting(click.ParamType):
+class Setting(Completed):
     """`KEY=VALUE`. The shell completes the key.
 
     :param settings: class of the configuration that has the key
@@ -75,13 +79,8 @@ class Setting(click.ParamType):
     def __init__(self, settings: type[Any]) -> None:
         self._settings = settings
 
-    def shell_complete(
-        self,
-        ctx: click.Context,  # noqa: ARG002 - click's signature
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        return [CompletionItem(key) for key in setting_keys(self._settings) if key.startswith(incomplete)]
+    def candidates(self) -> Iterable[CompletionItem]:
+        return map(CompletionItem, setting_keys(self._settings))
 
 
 def setting_keys(settings: type[Any], prefix: str = "") -> Iterator[str]:

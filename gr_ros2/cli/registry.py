@@ -6,7 +6,7 @@ import csv
 import io
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gr_ros2.cli.params import OrAuto
+from gr_ros2.cli.params import Completed, OrAuto
 from gr_ros2.config import DEFAULT_MIDDLEWARE, TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
@@ -61,7 +61,7 @@ _topics = click.option("--topics", default="", metavar="A,B,…", help="Only the
 _out = click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write; default: print it.")
 
 
-class SharedGraph(click.ParamType):
+class SharedGraph(Completed):
     """A middleware whose graph other processes can join. Those of other packages are looked up only when named."""
 
     name = "middleware"
@@ -71,13 +71,8 @@ class SharedGraph(click.ParamType):
             self.fail(f"{value!r} has no graph that a robot could be on; take {', '.join(_SHARED)}", param, ctx)
         return value
 
-    def shell_complete(
-        self,
-        ctx: click.Context,  # noqa: ARG002 - click's signature
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        return [CompletionItem(name) for name in _SHARED if name.startswith(incomplete)]
+    def candidates(self) -> Iterable[CompletionItem]:
+        return map(CompletionItem, _SHARED)
 
 
 @click.command("from-graph")

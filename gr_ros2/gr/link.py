@@ -9,13 +9,12 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings, read_registry, start_of
+from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
@@ -33,7 +32,6 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
     :param half_duplex: whether sending and receiving share the airtime
-    :param start: what version 1 must know about this start; None: read from the files in the settings
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -46,18 +44,15 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         *,
         middleware: tuple[Middleware, Middleware] | None = None,
         half_duplex: bool = False,
-        start: Start | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        begin = start or start_of(source, source.src_id(), reports=True, half_duplex=half_duplex)
+        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex)
         rng = random.Random(seed)
-        self.end = LiveEnd(
-            lambda hears: make_endpoint(rows, source, sink, start=replace(begin, reports=True), rng=rng, observer=hears)
-        )
+        self.end = LiveEnd(lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears))
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
         common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))

@@ -29,7 +29,7 @@ from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.v1.settings import NOBODY
+from gr_ros2.link.v1.settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS
@@ -82,8 +82,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             check_outputs(rows, self.config)
             self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            own = NOBODY if self.config.robot_id == AUTO else self.config.robot_id
-            start = start_of(self.config, own, reports=False)
+            start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
         self._end, self._work = end.endpoint, end.work
         self._announced: dict[tuple[int, int], Topic] = {}

@@ -47,11 +47,11 @@ class Delivered:
 class Lost:
     """A message will not be delivered, although at least a part of it arrived.
 
-    ``reason`` is a :class:`gr_ros2.link.ledger_rows.Row`: ``lost_fragments`` (overtaken, contradicted, or after an
-    outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or E),
-    ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (its topic
-    is not announced or registered), ``sender_restarted``. If the message is complete but cannot be decoded, the reason
-    is that of its codec: ``unknown_dictionary`` or ``damaged``.
+    ``reason`` is a :class:`gr_ros2.link.ledger_rows.LedgerRow`: ``lost_fragments`` (overtaken, contradicted, or after
+    an outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or
+    E), ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (its
+    topic is not announced or registered), ``sender_restarted``. If the message is complete but cannot be decoded, the
+    reason is that of its codec: ``unknown_dictionary`` or ``damaged``.
     """
 
     src_id: int

@@ -9,7 +9,6 @@ an argument and never goes back.
 from __future__ import annotations
 
 import random
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import inf
 from typing import Any
@@ -21,6 +20,7 @@ from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntr
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
 from gr_ros2.link.stats import SenderStats
@@ -31,9 +31,6 @@ from gr_ros2.wire.v0 import V0, Entry, Packet
 
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that make sense to change while running."""
-
-_INTERVALS = 15
-"""Number of packet intervals whose median estimates the interval of credits."""
 
 Observer = Callable[[SenderEvent], None]
 
@@ -82,11 +79,7 @@ class Sender:
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
         self._seq = self._rng.randrange(self._numbers)
         self._serial = 0
-        self._slot = -inf
-        self._credits: int | None = None
-        self._busy_since = inf
-        """When the last packet left, if another was waiting for a credit then."""
-        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._pace = Pace(config.packet_rate)
         self._latched: dict[int, tuple[int, bytes]] = {}
         """Per topic, serial and coded bytes of the message for robots that join late."""
         self._repeat_at: dict[int, float] = {}
@@ -134,7 +127,7 @@ class Sender:
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
-        if self.out_of_credit or now < self._slot:
+        if self._pace.out_of_credit or now < self._pace.slot:
             return None
         if self._repeat_at:
             self._repeat(now)
@@ -144,12 +137,8 @@ class Sender:
         if plan is None or now < self._departure(plan):
             return None
         data = self._compose(plan, now)
-        if self._credits is not None and not self.unpaced:
-            self._spend_credit(now)
-        if self._rate:
-            interval = 1 / self._rate
-            # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.
-            self._slot = max(self._slot, now - interval) + interval
+        if self._pace.known:
+            self._pace.left(now, waiting=not self.idle)
         return data
 
     def next_timeout(self) -> float | None:
@@ -162,7 +151,7 @@ class Sender:
             times.append(self._departure(plan))
         if self._plan_until < inf:
             times.append(self._plan_until)
-        return max(min(times), self._slot) if times else None
+        return max(min(times), self._pace.slot) if times else None
 
     def follow(self, topic_id: int, *, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0) -> bool:
         """Adapt a topic's queue to the QoS of its publishers, where the configuration leaves it open.
@@ -191,28 +180,17 @@ class Sender:
         return self.config.queue_depth if depth == AUTO else depth
 
     def use_credit(self) -> None:
-        """From now on, a packet leaves only when there is a credit, unless the sender is :attr:`unpaced`."""
-        if self._credits is None:
-            self._credits = 0
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        self._pace.use_credit()
 
     def credit(self, packets: int = 1) -> None:
-        """The PHY can take this many further packets; the first call does what ``use_credit`` does."""
-        self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        self._pace.credit(packets)
 
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit, whatever is submitted."""
-        return self._credits == 0 and not self.unpaced
-
-    @property
-    def unpaced(self) -> bool:
-        """Whether every packet leaves as soon as there is one, whatever the PHY grants."""
-        return self.config.packet_rate == 0
-
-    @property
-    def _rate(self) -> float:
-        """Most packets/s, 0 without limit."""
-        return 0.0 if self.config.packet_rate == AUTO else self.config.packet_rate
+        return self._pace.out_of_credit
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
@@ -220,13 +198,8 @@ class Sender:
 
     @property
     def interval(self) -> float:
-        """s from one packet to the next while the source is busy: from ``packet_rate``, or measured from the credits.
-
-        0 if neither is known.
-        """
-        if self._rate:
-            return 1 / self._rate
-        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        return self._pace.interval
 
     @property
     def idle(self) -> bool:
@@ -249,7 +222,7 @@ class Sender:
         self._scheduler.config = self.config
         self._plan_until = -inf
         if "packet_rate" in settings:
-            self._slot = -inf
+            self._pace.change(self.config.packet_rate)
 
     def _deadlines(self) -> list[TopicQueue]:
         return [queue for queue in self._queues.values() if queue.deadline_s]
@@ -290,15 +263,6 @@ class Sender:
             if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
                 # The message is useless now, or a newer one exists; so it is not kept for robots that join late.
                 del self._latched[message.topic_id], self._repeat_at[message.topic_id]
-
-    def _spend_credit(self, now: float) -> None:
-        """A packet used a credit; while packets wait for their credits, measure the interval of the credits."""
-        assert self._credits is not None
-        if self._busy_since < inf:
-            self._intervals.append(now - self._busy_since)
-        self._credits -= 1
-        busy = not self._credits and any(self._queues.values())
-        self._busy_since = now if busy else inf
 
     def _departure(self, plan: Plan) -> float:
         """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout_s``."""

@@ -28,7 +28,7 @@ from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.v1.settings import NOBODY
+from gr_ros2.link.v1.settings import robot_of
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -233,9 +233,7 @@ def _end(
     told: list[SenderEvent] = []
     rng = None if out is None else random.Random(out.seed)
     endpoint = make_endpoint(registry, source, sink, start=start, codec=codec, rng=rng, observer=told.append)
-    own = NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id
-    src_id = own if source is None else source.src_id()
-    return End(endpoint, told, src_id)
+    return End(endpoint, told, robot_of(source, sink))
 
 
 class Branch:

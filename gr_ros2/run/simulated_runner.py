@@ -158,27 +158,42 @@ class _PendingPacket:
 
 
 class _Air:
-    """A channel that passes packets one by one, for ends whose next packet depends on what arrived."""
+    """A channel that loses packets as measured, or passes them through the flowgraph.
+
+    :ivar batches: the flowgraph, which takes packets in batches; None if the losses are those measured for packets
+    :ivar losses: what a setting of the channel drops
+    """
 
     def __init__(self, scenario: Scenario, phy: Phy, channel: ChannelConfig) -> None:
-        self._losses = PduLosses(channel)
-        self._batches_through: BatchChannel | None = None
+        self.losses = PduLosses(channel)
+        self.lost_by_phy: Counter[str] = Counter()
+        self.batches: BatchChannel | None = None
         self._measured: PduLosses | None = None
         if scenario.time == "samples" and phy.has_samples:
-            from gr_ros2.phy.measure import BatchChannel
+            from gr_ros2.phy.measure import BatchChannel  # with GNU Radio
 
-            self._batches_through = BatchChannel(phy, channel)
+            self.batches = BatchChannel(phy, channel)
         else:
             self._measured = PduLosses(packet_losses(phy, channel))
+            self.lost_by_phy = self._measured.dropped
 
     def pass_one(self, data: bytes, now: float) -> Iterator[bytes]:
-        """The packets that arrive after one packet was sent."""
+        """The packets that arrive after one packet was sent, for ends whose next packet depends on that."""
         if self._measured is not None:
             arrived = [data] if self._measured.passes(now) else []
         else:
-            assert self._batches_through is not None
-            arrived = [packet for _, packet in self._batches_through.send([data])]
-        yield from (packet for packet in arrived if self._losses.passes(now))
+            (arrived,) = self.through([data])
+        yield from (packet for packet in arrived if self.losses.passes(now))
+
+    def through(self, sent: Sequence[bytes]) -> list[list[bytes]]:
+        """What comes out of the flowgraph for each of some packets, without the losses of ``losses``."""
+        assert self.batches is not None
+        arrived: list[list[bytes]] = [[] for _ in sent]
+        for place, packet in self.batches.send(sent):
+            arrived[place].append(packet)
+        for data, packets in zip(sent, arrived, strict=True):
+            self.lost_by_phy["phy"] += data not in packets
+        return arrived
 
 
 class _Direction:
@@ -190,45 +205,32 @@ class _Direction:
     def __init__(self, scenario: Scenario, registry: Registry, phy: Phy, ends: tuple[End, End]) -> None:
         self.way = LinkDirection(scenario, ends, phy.airtime, offered(scenario, registry))
         self._scenario, self._registry = scenario, registry
-        self._losses = PduLosses(scenario.channel)
-        self._lost_by_phy: Counter[str] = Counter()
-        self._batches_through: BatchChannel | None = None
+        self._air = _Air(scenario, phy, scenario.channel)
         self._pending: list[_PendingPacket] = []
-        if scenario.time == "samples" and phy.has_samples:
-            from gr_ros2.phy.measure import BatchChannel  # with GNU Radio
-
-            self._batches_through = BatchChannel(phy, scenario.channel)
-            if ends[1].endpoint.answers or scenario.receivers:
-                self.way.air = self._packet_by_packet
-        else:
-            measured = PduLosses(packet_losses(phy, scenario.channel))
-            self._lost_by_phy = measured.dropped
-            self.way.air = lambda data, now: [data] if measured.passes(now) and self._losses.passes(now) else ()
+        if self._air.batches is None or ends[1].endpoint.answers or scenario.receivers:
+            self.way.air = self._air.pass_one
 
     def land(self, data: bytes) -> _PendingPacket:
         """Take a packet whose samples have been on the air. Whether it arrives is known when its batch is full."""
         pending = _PendingPacket(data)
         self._pending.append(pending)
-        if self._batches_through is not None and len(self._pending) == self._batches_through.batch:
+        if self._air.batches is not None and len(self._pending) == self._air.batches.batch:
             self.decide()
         return pending
 
     def decide(self) -> None:
         """Send the packets of the current batch through the flowgraph."""
-        if self._batches_through is None or not self._pending:
+        if self._air.batches is None or not self._pending:
             return
-        arrived: list[list[bytes]] = [[] for _ in self._pending]
-        for place, packet in self._batches_through.send([pending.data for pending in self._pending]):
-            arrived[place].append(packet)
+        arrived = self._air.through([pending.data for pending in self._pending])
         for pending, packets in zip(self._pending, arrived, strict=True):
             pending.arrived = packets
-            self._lost_by_phy["phy"] += pending.data not in packets
         self._pending.clear()
 
     def arrive(self, pending: _PendingPacket, now: float) -> Iterator[TimedEvent]:
         """What came out of the flowgraph for a packet, without the packets that a setting of the channel drops."""
         for data in pending.arrived or ():
-            if self._losses.passes(now):
+            if self._air.losses.passes(now):
                 yield from self.way.arrive(data, now)
 
     def counters(self) -> dict[str, Any]:
@@ -257,14 +259,8 @@ class _Direction:
                 "packet_loss_est": got.packet_loss_est,
                 "message_loss_est": got.message_loss_est,
             },
-            "channel": {"phy": self._lost_by_phy.total(), **self._losses.dropped},
+            "channel": {"phy": self._air.lost_by_phy.total(), **self._air.losses.dropped},
         }
-
-    def _packet_by_packet(self, data: bytes, now: float) -> Iterator[bytes]:
-        """For ends that answer: their next packet depends on whether this one arrives."""
-        pending = self.land(data)
-        self.decide()
-        yield from (packet for packet in pending.arrived or () if self._losses.passes(now))
 
 
 def _recorder(

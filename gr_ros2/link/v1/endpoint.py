@@ -12,7 +12,6 @@ the boot number and the stored state.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
@@ -36,6 +35,7 @@ from gr_ros2.link.events import (
 )
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.pace import Pace
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
@@ -77,7 +77,6 @@ FORCED = 20
 """New packets after which a report that found no room is sent in a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
-_INTERVALS = 15
 _POLL_S = 0.02
 """s after which a thrifty sender that is in doubt checks again."""
 
@@ -137,10 +136,7 @@ class Endpoint:
         self._speaks = bool(topics) or settings.hears
         self._events: list[ReceiverEvent] = []
         self._now = -inf
-        self._slot = -inf
-        self._credits: int | None = None
-        self._busy_since = inf
-        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._pace = Pace(settings.packet_rate)
         self._talk = Talk(settings, boot, encrypts=self.keys.encrypts)
         self._started = False
         self._hello_number = -1
@@ -164,7 +160,7 @@ class Endpoint:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self.paced and self._mode() != "off" and self.window.unconfirmed(self._now)
+        mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
@@ -209,7 +205,7 @@ class Endpoint:
         self.settings = settings
         self.outbox.reconfigure(settings)
         if "packet_rate" in changes:
-            self._slot = -inf
+            self._pace.change(settings.packet_rate)
 
     def knows(self, src_id: int) -> bool:
         """Whether the state of a robot is held at present."""
@@ -239,44 +235,26 @@ class Endpoint:
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if self.out_of_credit or now < self._slot or not self._speaks:
+        if self._pace.out_of_credit or now < self._pace.slot or not self._speaks:
             return None
         data = self._compose(now)
         if data is None:
             return None
-        if self._credits is not None and not self.unpaced:
-            if self._busy_since < inf:
-                self._intervals.append(now - self._busy_since)
-            self._credits -= 1
-            self._busy_since = now if not self._credits and not self.outbox.idle else inf
-        if rate := self._rate:
-            # A slot missed by less than its length is made up for, so that late wake-ups do not lower the rate.
-            self._slot = max(self._slot, now - 1 / rate) + 1 / rate
+        self._pace.left(now, waiting=not self.outbox.idle)
         return data
 
     def use_credit(self) -> None:
-        """From now on, a packet leaves only when there is a credit."""
-        if self._credits is None:
-            self._credits = 0
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        self._pace.use_credit()
 
     def credit(self, packets: int = 1) -> None:
-        """Add credits: the PHY can take this number of further packets."""
-        self._credits = (self._credits or 0) + (0 if self.unpaced else packets)
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        self._pace.credit(packets)
 
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit."""
-        return self._credits == 0 and not self.unpaced
-
-    @property
-    def unpaced(self) -> bool:
-        """Whether every packet leaves as soon as there is one, whatever the PHY grants."""
-        return self.settings.packet_rate == 0
-
-    @property
-    def _rate(self) -> float:
-        """Most packets/s, 0 without limit."""
-        return 0.0 if self.settings.packet_rate == AUTO else self.settings.packet_rate
+        return self._pace.out_of_credit
 
     def follow(
         self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
@@ -293,15 +271,8 @@ class Endpoint:
 
     @property
     def interval(self) -> float:
-        """s from one packet to the next while there is always one to send; 0 if unknown."""
-        if self._rate:
-            return 1 / self._rate
-        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
-
-    @property
-    def paced(self) -> bool:
-        """Whether the slots are known (from a rate or from credits), so that an idle slot can be noticed."""
-        return self._rate > 0 or (self._credits is not None and not self.unpaced)
+        """See :class:`gr_ros2.link.pace.Pace`."""
+        return self._pace.interval
 
     # ---- receiving
 
@@ -344,9 +315,9 @@ class Endpoint:
             leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self.paced and self._mode() != "off" and self.window.unconfirmed(now):
+        if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
             leaving.append(now if self._mode() == "idle" else now + _POLL_S)
-        return max(min(leaving), self._slot)
+        return max(min(leaving), self._pace.slot)
 
     # ---- what leaves
 
@@ -374,7 +345,7 @@ class Endpoint:
         asks = self._talk.asks(self.neighbours, now)
         if asks:
             return self._control(asks, "hello", now)
-        if self.paced:
+        if self._pace.known:
             self.window.mode = self._mode()
             return self._repair(now)
         return None

@@ -74,6 +74,16 @@ class Settings:
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")
 
 
+def robot_of(source: SourceConfig | None, sink: SinkConfig | None) -> int:
+    """Id of the robot that an end belongs to; ``NOBODY`` for an end that only receives and has none.
+
+    :raises ConfigError: when the source names no robot
+    """
+    if source is not None:
+        return source.src_id()
+    return NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id
+
+
 def settings_of(
     source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False, fixed: bool = True
 ) -> Settings:
@@ -86,7 +96,7 @@ def settings_of(
     send = SourceConfig() if source is None else source
     take = SinkConfig() if sink is None else sink
     return Settings(
-        src_id=(NOBODY if take.robot_id == AUTO else take.robot_id) if source is None else source.src_id(),
+        src_id=robot_of(source, sink),
         packet_len=take.packet_len if source is None else source.packet_len,
         fixed=fixed,
         dst_id=send.dst_id,

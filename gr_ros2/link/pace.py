@@ -1,0 +1,80 @@
+"""When packets may leave: the credits of the PHY and the configured rate, the same for every version.
+
+Invariants: time is an argument and never goes back; without a rate and before the first credit or ``use_credit``, every
+packet may leave at once.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+from gr_ros2.setting import AUTO, Auto
+
+_INTERVALS = 15
+"""Number of packet intervals whose median estimates the interval of credits."""
+
+
+class Pace:
+    """The pace of one sending half.
+
+    :param packet_rate: see :class:`gr_ros2.config.SourceConfig`
+    """
+
+    def __init__(self, packet_rate: float | Auto) -> None:
+        self._credits: int | None = None
+        self._busy_since = inf
+        """When the last packet left, if another was waiting for a credit then."""
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self.change(packet_rate)
+
+    def change(self, packet_rate: float | Auto) -> None:
+        """Set the rate. The next packet need not wait for the old one."""
+        self._unpaced = packet_rate == 0
+        self._rate = 0.0 if packet_rate == AUTO else packet_rate
+        self.slot = -inf
+        """Earliest time at which the rate lets a packet leave."""
+
+    def use_credit(self) -> None:
+        """From now on, a packet leaves only when there is a credit, unless every packet leaves at once (rate 0)."""
+        if self._credits is None:
+            self._credits = 0
+
+    def credit(self, packets: int = 1) -> None:
+        """The PHY can take this many further packets; the first call does what ``use_credit`` does."""
+        self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
+
+    @property
+    def out_of_credit(self) -> bool:
+        """Whether nothing leaves before the next credit, whatever is submitted."""
+        return self._credits == 0 and not self._unpaced
+
+    @property
+    def known(self) -> bool:
+        """Whether the slots are known (from a rate or from credits), so that an idle slot can be noticed."""
+        return self._rate > 0 or (self._credits is not None and not self._unpaced)
+
+    @property
+    def interval(self) -> float:
+        """s from one packet to the next while the source is busy: from the rate, or measured from the credits.
+
+        0 if neither is known.
+        """
+        if self._rate:
+            return 1 / self._rate
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
+
+    def left(self, now: float, *, waiting: bool) -> None:
+        """A packet left. While packets wait for their credits, the interval of the credits is measured.
+
+        :param waiting: whether more is waiting
+        """
+        if self._credits is not None and not self._unpaced:
+            if self._busy_since < inf:
+                self._intervals.append(now - self._busy_since)
+            self._credits -= 1
+            self._busy_since = now if not self._credits and waiting else inf
+        if self._rate:
+            interval = 1 / self._rate
+            # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.
+            self.slot = max(self.slot, now - interval) + interval

@@ -1,0 +1,60 @@
+"""The pace of a sending half: credits, a rate, both, or none."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+from gr_ros2.link.pace import Pace
+from gr_ros2.setting import AUTO
+
+
+def test_without_rate_and_credits_packets_leave_at_once() -> None:
+    pace = Pace(AUTO)
+    assert not pace.out_of_credit
+    assert not pace.known
+    pace.left(1.0, waiting=True)
+    assert (pace.slot, pace.interval) == (-inf, 0.0)
+
+
+def test_every_packet_takes_a_credit() -> None:
+    pace = Pace(AUTO)
+    pace.use_credit()
+    assert pace.out_of_credit
+    pace.credit(2)
+    pace.left(0.0, waiting=True)
+    assert not pace.out_of_credit
+    pace.left(0.0, waiting=True)
+    assert pace.out_of_credit
+    assert pace.known
+
+
+def test_the_interval_of_credits_is_measured_while_packets_wait() -> None:
+    pace = Pace(AUTO)
+    for at, waiting in ((0.0, True), (0.1, True), (0.2, False), (9.0, True)):
+        pace.credit()
+        pace.left(at, waiting=waiting)
+    assert pace.interval == pytest.approx(0.1)
+
+
+def test_a_late_packet_does_not_lower_the_rate() -> None:
+    pace = Pace(10.0)
+    assert pace.interval == pytest.approx(0.1)
+    pace.left(0.0, waiting=True)
+    assert pace.slot == pytest.approx(0.0)
+    pace.left(0.0, waiting=True)
+    assert pace.slot == pytest.approx(0.1)
+    pace.left(0.15, waiting=True)
+    assert pace.slot == pytest.approx(0.2)
+    pace.left(5.0, waiting=True)
+    assert pace.slot == pytest.approx(5.0)
+
+
+def test_a_rate_of_0_heeds_no_credits() -> None:
+    pace = Pace(0)
+    pace.use_credit()
+    assert not pace.out_of_credit
+    assert not pace.known
+    pace.change(AUTO)
+    assert pace.out_of_credit
