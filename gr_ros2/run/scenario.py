@@ -23,7 +23,7 @@ from gr_ros2.phy import PHY
 from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.setting import Auto
 from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 
 _GRAPH_KEYS = ("middleware", "domain_id")
 """Settings of a block that say on which ROS graph it is."""

@@ -28,7 +28,7 @@ from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.v1.settings import robot_of
+from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
@@ -38,7 +38,7 @@ from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet, SimMessage
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire import BROADCAST
 
 _LONGEST_GAP_S = 30 * 86400.0

@@ -19,7 +19,7 @@ import zmq
 
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy import PHY
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd, ZmqOptions
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
