@@ -69,7 +69,8 @@ class Direction:
         # A bag that is read as fast as the link takes it needs a source that makes the reader wait instead of dropping.
         pulled = scenario.bag_path is not None and scenario.bag_speed == 0
         backpressure = scenario.ros_source.backpressure or pulled
-        sends, hears = (self._end(source=True), self._end(source=False)) if scenario.version else (None, None)
+        sends = self._end(scenario.ros_source, None, phy.any_length) if scenario.version else None
+        hears = self._end(None, scenario.ros_sink, phy.any_length) if scenario.version else None
         self.source = RosSource(
             registry,
             middleware=self.input,
@@ -98,11 +99,10 @@ class Direction:
         )
         stack.callback(self.link.stop)
 
-    def _end(self, *, source: bool) -> LiveEnd:
+    def _end(self, source: SourceConfig | None, sink: SinkConfig | None, any_length: bool) -> LiveEnd:
         """One end of a run. Its starts are not counted, because no end exists longer than the run."""
-        ends = (self.scenario.ros_source, None) if source else (None, self.scenario.ros_sink)
-        start = Start(self.scenario.seed + 1)
-        return LiveEnd(lambda observer: make_endpoint(self.registry, *ends, start=start, observer=observer))
+        start = Start(self.scenario.seed + 1, any_length=any_length)
+        return LiveEnd(lambda observer: make_endpoint(self.registry, source, sink, start=start, observer=observer))
 
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""
