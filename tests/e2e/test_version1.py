@@ -122,6 +122,6 @@ def test_packets_take_as_much_air_as_they_need(tmp_path: Path) -> None:
         phy = {"name": "psk", "sample_rate": 1e5, "options": {"lengths": lengths}}
         result, _ = run(lossy(reports={}, phy=phy), tmp_path / lengths)
         assert result.topics[0].pdr == 1.0
-        means[lengths] = result.packets["airtime_mean_s"] / result.packets["airtime_s"]
+        means[lengths] = result.phy["airtime_mean_s"] / result.phy["airtime_s"]
     assert means["fixed"] == pytest.approx(1.0)
     assert means["any"] < 0.95
