@@ -196,8 +196,8 @@ class RobotLink(Flowgraph):
         return [*self._observers.told(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front end, and
-        :meth:`incomplete`."""
+        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
+        end, and :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
