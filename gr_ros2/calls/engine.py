@@ -80,6 +80,19 @@ class Service:
 
 
 @dataclass(frozen=True, slots=True)
+class Offer:
+    """A service of this robot.
+
+    :param name: on the graph of this end
+    :param deadline_s: s that its server has for a reply, where the caller does not ask for less; ``NO_DEADLINE``
+        without limit
+    """
+
+    name: str
+    deadline_s: float = NO_DEADLINE
+
+
+@dataclass(frozen=True, slots=True)
 class _Made:
     """A call made here that waits for its reply."""
 
@@ -167,12 +180,12 @@ class Calls:
     # ---- frames
 
     def receive(
-        self, sender: tuple[int, int], data: bytes, names: Mapping[int, str], now: float
+        self, sender: tuple[int, int], data: bytes, offers: Mapping[int, Offer], now: float
     ) -> Request | Answer | None:
         """Take the bytes of a frame.
 
         :param sender: id of the robot that sent it, and the start of that robot
-        :param names: the services on the graph of this end that other robots may call, by id
+        :param offers: the services of this robot whose server is there, by id
         :return: what it asks for; None for a frame that is dropped, and counted
         """
         self.expire(now)
@@ -184,7 +197,7 @@ class Calls:
             return self._dropped("not_for_us")
         if frame.dst_boot != self._boot:
             return self._dropped("other_start")
-        return self._request(sender, frame, names, now) if frame.is_request else self._answer(sender, frame)
+        return self._request(sender, frame, offers, now) if frame.is_request else self._answer(sender, frame)
 
     def started(self, robot: int, boot: int) -> None:
         """A start of a robot is heard: its earlier starts neither answer nor wait for an answer."""
@@ -205,22 +218,23 @@ class Calls:
         return len(self._made), len(self._served)
 
     def _request(
-        self, sender: tuple[int, int], frame: Frame, names: Mapping[int, str], now: float
+        self, sender: tuple[int, int], frame: Frame, offers: Mapping[int, Offer], now: float
     ) -> Request | Answer | None:
         robot, boot = sender
         newest, last = self._last.get(robot, (-1, 0))
         if boot == newest and frame.number <= last:
             return self._dropped("repeated")
         self._last[robot] = (boot, frame.number)
-        name = names.get(frame.service_id)
-        if name is None:
+        offer = offers.get(frame.service_id)
+        if offer is None:
             return self._dropped("no_server")
+        name = offer.name
         self.counters[f"served:{name}"] += 1
         waiting = [ticket for ticket, call in self._served.items() if call.robot == robot]
         if len(waiting) >= MAX_CALLS and not self._room(self._served, waiting, "refused"):
             return self._dropped(f"refused:{name}")
         self._ticket += 1
-        expires = now + frame.deadline_s if frame.deadline_s else inf
+        expires = now + min(frame.deadline_s or inf, offer.deadline_s or inf)
         self._served[self._ticket] = _Served(name, robot, boot, frame.number, expires)
         return Request(self._ticket, frame.service_id, frame.payload)
 

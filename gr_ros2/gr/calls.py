@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Outgoing, Request, Service
+from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, Outgoing, Request, Service
 from gr_ros2.errors import ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.gr.ends import LOOP_GUARD, LiveEnd
 from gr_ros2.gr.sink import RosSink
@@ -70,9 +70,9 @@ class LiveCalls:
         self._counters: Counter[str] = Counter()
         self._changing = threading.Lock()  # for the servers; held while they are made and closed
         self._closed = False
-        self._names = {topic.topic_id: name for name, topic in source.services.items()}
-        self._offered: dict[int, str] = {}
-        """Names of the services of this robot whose server is there, by id."""
+        self._own = {topic.topic_id: Offer(name, _deadline(topic)) for name, topic in source.services.items()}
+        self._offered: dict[int, Offer] = {}
+        """The services of this robot whose server is there, by id."""
         self._clients: dict[int, ServiceClient] = {}
         for name, topic in source.services.items():
             graph = _with_services(source.middleware, name)
@@ -112,7 +112,7 @@ class LiveCalls:
             made, served = self._engine.waiting
             counters = self._engine.counters + self._counters
             refused = {reason: n for (topic_id, reason), n in self._end.sent.refused.items() if topic_id == self._row}
-            offered = sorted(self._offered.values())
+            offered = sorted(offer.name for offer in self._offered.values())
         with self._changing:
             proxies = sorted(
                 self._name(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers
@@ -134,13 +134,13 @@ class LiveCalls:
     def _server_changed(self, topic_id: int, there: bool) -> None:
         with self._lock:
             if there:
-                self._offered[topic_id] = self._names[topic_id]
+                self._offered[topic_id] = self._own[topic_id]
                 self._end.offer(self._row, offered=True)
             else:
                 self._offered.pop(topic_id, None)
             self._end.offer(topic_id, offered=there)
             self._work.notify()
-        _log.info("service %s: %s", self._names[topic_id], "offered to other robots" if there else "no server")
+        _log.info("service %s: %s", self._own[topic_id].name, "offered to other robots" if there else "no server")
 
     def _reply(self, ticket: int, payload: bytes) -> None:
         with self._lock:
@@ -197,14 +197,10 @@ class LiveCalls:
             self._tell_first(f"not_served:{name}", error)
 
     def _request(self, src_id: int, topic: Topic, client: Hashable, payload: bytes) -> None:
-        name, wanted = self._name(src_id, topic), topic.options.deadline_s
-        if wanted == AUTO:
-            wanted = NO_DEADLINE if topic.name.endswith(_NEVER_LATE) else DEADLINE_S
-        robot = self._robots[src_id]
-        service = Service(src_id, robot.boot, topic.topic_id, name)
+        service = Service(src_id, self._robots[src_id].boot, topic.topic_id, self._name(src_id, topic))
         with self._lock:
             now = self._clock()
-            self._send(self._engine.call(service, client, payload, deadline_s=wanted, now=now), now)
+            self._send(self._engine.call(service, client, payload, deadline_s=_deadline(topic), now=now), now)
 
     def _name(self, src_id: int, topic: Topic) -> str:
         return topic.republished(self._sink.config.namespace_format, src_id)
@@ -243,6 +239,13 @@ class LiveCalls:
             first = self._counters[counter] == 1
         if first:
             _log.warning("calls: %s (counted as %s)", error, counter)
+
+
+def _deadline(topic: Topic) -> float:
+    """s that a call of a service waits for its reply."""
+    if topic.options.deadline_s != AUTO:
+        return topic.options.deadline_s
+    return NO_DEADLINE if topic.name.endswith(_NEVER_LATE) else DEADLINE_S
 
 
 def _with_services(graph: Middleware, service: str) -> ServiceGraph:

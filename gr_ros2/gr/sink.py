@@ -198,9 +198,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             stats = self._end.received
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
-            keys = {key: None for key in keys if key not in self._announced or self._announced[key].is_topic}
-            topics = {key: self._topic_stats(key) for key in keys}
-            windows = {key: self._latency[key].copy() for key in keys if key in self._latency}
+            topics = {key: self._topic_stats(key) for key in keys if self._is_topic(key)}
+            windows = {key: self._latency[key].copy() for key in topics if key in self._latency}
             counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
@@ -250,6 +249,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if key[1] < len(self.registry):
             return self.registry[key[1]]
         raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
+
+    def _is_topic(self, key: tuple[int, int]) -> bool:
+        """Whether a sender's topic id means a topic: neither its table, nor its calls, nor something unknown."""
+        topic = self._announced.get(key)
+        return key[1] < len(self.registry) if topic is None else topic.is_topic
 
     def _learn(self, event: Announced) -> None:
         """Take over the topics that a sender announces. A publisher whose topic has a new name or type is closed."""

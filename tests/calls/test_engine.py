@@ -8,11 +8,11 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.calls import Answer, Calls, Outgoing, Request, Service
+from gr_ros2.calls import Answer, Calls, Offer, Outgoing, Request, Service
 from gr_ros2.calls.engine import MAX_CALLS
 
 FAR = Service(2, 20, 5, "/rx_robot_2/add")
-NAMES = {5: "/robot_2/add"}
+OFFERS = {5: Offer("/robot_2/add")}
 CALLER = (1, 10)
 
 
@@ -27,7 +27,7 @@ def call(one: Calls, token: int = 0, *, deadline_s: float = 30.0, now: float = 0
 
 
 def asked(two: Calls, data: bytes, *, now: float = 0.0, sender: tuple[int, int] = CALLER) -> Request:
-    request = two.receive(sender, data, NAMES, now)
+    request = two.receive(sender, data, OFFERS, now)
     assert isinstance(request, Request)
     return request
 
@@ -56,6 +56,14 @@ def test_a_call_without_a_reply_times_out_at_both_ends_by_name() -> None:
     assert one.waiting == two.waiting == (0, 0)
 
 
+def test_a_server_may_have_less_time_than_the_caller_waits() -> None:
+    one, two = pair()
+    request = two.receive(CALLER, call(one, deadline_s=30.0), {5: Offer("/robot_2/add", 2.0)}, 0.0)
+    assert isinstance(request, Request)
+    assert two.reply(request.ticket, b"", 2.0) is None
+    assert one.waiting == (1, 0)
+
+
 def test_a_late_reply_reaches_nobody() -> None:
     one, two = pair()
     request = asked(two, call(one, deadline_s=2.0), now=0.5)
@@ -80,10 +88,10 @@ def test_a_request_is_for_one_start_of_one_robot_and_taken_once() -> None:
     first, second = call(one, 1), call(one, 2)
     asked(two, second)
     for data in (second, first):  # repeated, and out of order
-        assert two.receive(CALLER, data, NAMES, 0.0) is None
+        assert two.receive(CALLER, data, OFFERS, 0.0) is None
     assert two.counters["repeated"] == 2
     again, other = Calls(2, 21), Calls(3, 20)
-    assert again.receive(CALLER, second, NAMES, 0.0) is other.receive(CALLER, second, NAMES, 0.0) is None
+    assert again.receive(CALLER, second, OFFERS, 0.0) is other.receive(CALLER, second, OFFERS, 0.0) is None
     assert (again.counters, other.counters) == ({"other_start": 1}, {"not_for_us": 1})
 
 
@@ -113,7 +121,7 @@ def test_calls_end_with_the_service_and_with_the_robots_start() -> None:
 def test_what_nobody_offers_and_what_is_no_frame_is_counted() -> None:
     one, two = pair()
     assert two.receive(CALLER, call(one), {}, 0.0) is None
-    assert two.receive(CALLER, b"\2", NAMES, 0.0) is None
+    assert two.receive(CALLER, b"\2", OFFERS, 0.0) is None
     assert two.counters == {"no_server": 1, "malformed": 1}
 
 
@@ -133,7 +141,7 @@ def test_memory_is_bounded_at_both_ends() -> None:
     for data in frames:
         asked(two, data)
     one.expire(30.0)
-    assert two.receive(CALLER, call(one, now=30.0, deadline_s=9.0), NAMES, 29.0) is None
+    assert two.receive(CALLER, call(one, now=30.0, deadline_s=9.0), OFFERS, 29.0) is None
     assert two.counters["refused:/robot_2/add"] == 1
     assert asked(two, call(Calls(3, 30)), now=29.0, sender=(3, 30))
 
@@ -176,7 +184,7 @@ def test_whatever_is_lost_repeated_late_or_restarted_nothing_runs_twice_and_the_
                 air.remove((to, sender, data))
             if sender[1] != starts[sender[0]]:
                 continue  # the link takes nothing of an earlier start
-            found = (one if to == 1 else two).receive(sender, data, NAMES if to == 2 else {}, now)
+            found = (one if to == 1 else two).receive(sender, data, OFFERS if to == 2 else {}, now)
             if isinstance(found, Request):
                 executed[starts[1], found.payload] += 1
                 waiting.append(found.ticket)
