@@ -95,7 +95,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._end = end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
-        self._clock = clock
+        self.clock = clock
         self._pdus = PduMaker()
         self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -117,13 +117,15 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
         chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
-        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen}
+        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen if topic.is_topic}
         """Topic of the registry by its absolute name on the ROS graph."""
+        self.services = {topic.on_graph(self.config.namespace): topic for topic in chosen if topic.is_service}
+        """The same for the services that other robots may call."""
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
-            LOOP_GUARD.add_source(self, self._graph, self.subscribed)
+            LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
             self._subscribe()
         except GrRos2Error:
             self.close()
@@ -317,7 +319,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._end.submit(topic_id, whole or payload, self._clock())
+            self._end.submit(topic_id, whole or payload, self.clock())
             if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
                 self._work.notify()
 
@@ -348,13 +350,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                if self._end.next_packet(self._clock()) is None:
+                if self._end.next_packet(self.clock()) is None:
                     break
             if packets:
                 self._room.notify_all()
             elif self._running:
                 at = self._end.next_departure()
-                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:
@@ -377,7 +379,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._composed.append(event)
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
-            name = self.registry[event.topic_id].name
+            name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
