@@ -31,7 +31,7 @@ class Settings:
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether a report takes a slot from what is received
     :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired
-    :param report_every: packets received from one report to the next
+    :param report_every: packets received from one report to the next; more while none is lost
     :param repeat_s: s between repeats of latched messages while nobody reports; 0 off
     :param give_up_s: s of silence after which a robot is taken for gone
     :param reassembly_timeout_s: s that an incomplete message waits for its next fragment

@@ -230,14 +230,15 @@ class Inbox:
     def report_due(self, now: float) -> float:
         """When the next report is due, as long as there are packets since the last one."""
         half = self._settings.half_duplex
-        most = self._settings.report_every * (4 if half else 1) * self._pause / _REPORT_S
-        if (self._missed and not half) or self._unreported >= min(most, MAP // 2):
+        every = self._settings.report_every * (4 if half else 1)
+        most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
+        if (self._missed and not half) or self._unreported >= most:
             return now
         return self._reported_at + self._pause
 
     def report(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
-        calm = not self._missed and self.loss < _CALM
+        calm = not self._missed and self.loss < _CALM and self.counts["packets"] > MAP
         self._pause = min(self._pause * _SLOWER, _CALM_S) if calm else _REPORT_S
         self._unreported = 0
         self._missed = False
