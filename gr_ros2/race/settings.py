@@ -28,8 +28,8 @@ from gr_ros2.sim.settings import SimSettings
 from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"
-PHY_OPTIONS = {"gap": 112, "detection_threshold": "stock"}
-"""The PHY consists of GNU Radio's own blocks, which take frames of any length."""
+PHY_OPTIONS: dict[str, Any] = {}
+"""The PHY as it is by default: frames are only as long as they need to be, for every contender."""
 SIM_TOPIC = "/robot_1/odom"
 _SIM_ROBOT = 1
 _SIM_START_NS = 1_700_000_000_000_000_000

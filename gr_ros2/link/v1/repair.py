@@ -42,6 +42,9 @@ SPAN = 30_000
 MAP = 64
 """Number of packets that a report covers."""
 
+PROMPT = 1 / 64
+"""Share of packets lost from which on a receiver reports every packet at once, if reports take no slot from packets. The
+sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
 TURN = 3
 """While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
@@ -51,7 +54,9 @@ _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair (thrifty)."""
 _TIMES = 512
 _PATIENCE_S = 0.2
-"""s after which a packet that no report covers counts as lost with probability 1/2."""
+"""s that are added to the time for a report, unless the receiver reports every packet at once."""
+_MARGIN = 1.2
+"""Factor on the longest recent delay of a report."""
 
 
 @dataclass(slots=True, eq=False)
@@ -116,6 +121,26 @@ class Receiver:
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it."""
         return min(self.delays) if self.delays else 0.0
+
+    @property
+    def prompt(self) -> bool:
+        """Whether it reports every packet at once, so that a report that does not come says something."""
+        return self.loss >= PROMPT and bool(self.delays)
+
+    @property
+    def answer(self) -> float:
+        """Time in s after which a report about a packet is to be expected."""
+        return max(self.delays) * _MARGIN if self.prompt else self.delay + self.interval
+
+    @property
+    def patience(self) -> float:
+        """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
+        return self.answer if self.prompt else 2 * self.answer + _PATIENCE_S
+
+    @property
+    def doubt(self) -> float:
+        """Probability that a packet is lost if its report does not come: it or the report was lost."""
+        return 1 / (2 - self.loss) if self.prompt else max(self.loss, 0.5)
 
 
 class RepairWindow:
@@ -199,7 +224,7 @@ class RepairWindow:
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
         sent_at = self._times.get(number)
-        if sent_at is not None and number >= peer.newest:
+        if sent_at is not None and number > peer.newest and number not in self._repaired:
             peer.delays.append(now - sent_at)
         peer.newest = max(peer.newest, number)
         records, bit, delay = self._records, peer.bit, peer.delay
@@ -270,6 +295,18 @@ class RepairWindow:
         if not window or (self.mode == "thrifty" and not self._worth(window, now)):
             return None
         return self._combination(window, now)
+
+    def next_doubt(self, now: float) -> float:
+        """When a report about one of the newest packets, or about a repair, is overdue next (thrifty), s; inf if none
+        is expected."""
+        times = [at for at, _, _ in self._flight if at > now][:1]
+        waits = [(peer.bit, peer.patience) for peer in self._receivers.values()]
+        for number in range(self.newest, max(self._oldest, self.newest - GROUP + 1) - 1, -1):
+            record = self._records.get(number)
+            if record is not None:
+                overdue = (record.at + patience for bit, patience in waits if not record.confirmed & bit)
+                times += [at for at in overdue if at > now]
+        return min(times, default=inf)
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
         """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and
@@ -376,15 +413,17 @@ class RepairWindow:
         if not self._receivers:
             return len(window) * self._expected > under_way * (1 - self._expected) + _ENOUGH
         for peer in self._receivers.values():
-            patience = 2 * (peer.delay + peer.interval)
+            if peer.waits and not under_way:
+                return True
+            expected = 0.0 if peer.prompt else peer.loss
+            patience, doubt = peer.patience, peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
                     if record.number in peer.lost:
                         need += 1
                     else:
-                        late = now - record.at > patience + _PATIENCE_S
-                        need += max(peer.loss, 0.5) if late else peer.loss
+                        need += doubt if now - record.at > patience else expected
             if need > under_way * (1 - peer.loss) + _ENOUGH:
                 return True
         return False
@@ -429,7 +468,7 @@ class RepairWindow:
 
     def _fly(self, now: float, first: int, last: int) -> None:
         if self.mode == "thrifty":
-            wait = max((peer.delay + peer.interval for peer in self._receivers.values()), default=inf)
+            wait = max((peer.answer for peer in self._receivers.values()), default=inf)
             self._flight.append((now + wait, first, last))
 
     def _retire(self, now: float) -> None:
