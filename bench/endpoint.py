@@ -8,8 +8,8 @@ import time
 from bench.rows import Row, median_of
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry
 
 PACKET_LEN, MESSAGES, REPEATS, LOSS = 64, 10_000, 5, 0.2

@@ -22,8 +22,8 @@ from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ReplayedError
 from gr_ros2.link.events import Delivered, Rejected
 from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.wire import v1
 

@@ -19,8 +19,8 @@ from bench.rows import Row
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
 
 RATE = 75.0

@@ -19,7 +19,7 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.settings import Settings
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario

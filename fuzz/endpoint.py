@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from fuzz.loop import main
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.settings import Settings
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.registry import Registry
 from gr_ros2.wire import v1
 

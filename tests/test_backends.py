@@ -96,7 +96,7 @@ MEANT = {
     "config.py": {"sim"},  # the simulated robots, not the front end
     "doctor/ros.py": {"rclpy", "zenoh"},  # the Python module, and a part of the name of an RMW
     "race/endpoints.py": {"dds", "zenoh"},  # these very stacks are what races
-    "race/settings.py": {"zenoh"},
+    "race/race_settings.py": {"zenoh"},
     "run/scenario.py": {"sim"},
 }
 """Modules outside the back-ends' own that may name one, and which."""

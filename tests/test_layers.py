@@ -82,7 +82,7 @@ KNOW_THEIR_VERSION = (
     "link/v1/",
 )
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
-COMPARES_WITH_VERSION_0 = ("race/settings.py",)
+COMPARES_WITH_VERSION_0 = ("race/race_settings.py",)
 SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "config", "registry"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 

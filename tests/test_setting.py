@@ -16,7 +16,7 @@ from pydantic import Field
 
 from gr_ros2.config import TopicOptions
 from gr_ros2.phy import PHY
-from gr_ros2.race.settings import RaceSettings
+from gr_ros2.race.race_settings import RaceSettings
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.run.scenario import Scenario

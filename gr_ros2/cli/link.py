@@ -30,7 +30,7 @@ from gr_ros2.wire import BROADCAST
 from gr_ros2.yaml_text import yaml_text
 
 if TYPE_CHECKING:
-    from gr_ros2.radio.link import RobotLink
+    from gr_ros2.radio.robot_link import RobotLink
     from gr_ros2.run.observers import LiveRun
 
 _SHOW_S = 0.5
@@ -92,7 +92,7 @@ def link(
         settings = _in_one_line(values, overrides, save)
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
-        from gr_ros2.radio.link import RobotLink
+        from gr_ros2.radio.robot_link import RobotLink
         from gr_ros2.run.observers import RunObservers
 
     console = make_console()

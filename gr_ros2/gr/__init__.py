@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gr_ros2.gr.link import RosLink
+from gr_ros2.gr.ros_link import RosLink
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.phy.airtime import AirtimeGate

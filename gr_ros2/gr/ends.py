@@ -24,9 +24,9 @@ from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
+from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.link.v1.settings import settings_of
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import Auto

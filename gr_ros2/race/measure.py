@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gr_ros2.compression import LinkCodec
 from gr_ros2.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
-from gr_ros2.race.settings import RaceRecording
+from gr_ros2.race.race_settings import RaceRecording
 from gr_ros2.record.metrics import age, latency
 from gr_ros2.registry import Registry
 

@@ -21,8 +21,8 @@ from gr_ros2 import __version__
 from gr_ros2.files import write_text, write_whole
 from gr_ros2.race.contenders import CONTENDERS
 from gr_ros2.race.measure import COLUMNS, RaceCell, by_condition, shown, winners
+from gr_ros2.race.race_settings import dump
 from gr_ros2.race.runner import Race
-from gr_ros2.race.settings import dump
 from gr_ros2.record.trace import write_csv
 from gr_ros2.report.figures import COLOURS, save_figure
 from gr_ros2.report.table import Grid

@@ -20,7 +20,7 @@ from gr_ros2.race.endpoints import RacePublisher, RaceSubscriber, RaceTopic
 from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
 from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
-from gr_ros2.race.settings import (
+from gr_ros2.race.race_settings import (
     PHY_NAME,
     PHY_OPTIONS,
     Condition,

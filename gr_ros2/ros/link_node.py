@@ -24,7 +24,7 @@ from rclpy.utilities import remove_ros_args
 
 from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.radio.config import load_link
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.waiting import Waiting
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 

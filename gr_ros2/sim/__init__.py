@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.publisher import SimPublisher
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import World
 
 __all__ = ["Fleet", "SimMessage", "SimPublisher", "SimSettings", "World"]

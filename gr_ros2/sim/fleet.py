@@ -19,7 +19,7 @@ from gr_ros2.sim.driver import Driver
 from gr_ros2.sim.motion import RADIUS, TICK, State
 from gr_ros2.sim.roadmap import Roadmap
 from gr_ros2.sim.sensors import TYPES, Sensors
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import Floats, World
 
 _START_GAP_M = 3.0

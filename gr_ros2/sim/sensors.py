@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.sim.motion import MAX_TURN, RADIUS, State
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import Floats, World
 
 TYPES: Final = {

@@ -8,9 +8,9 @@ import pytest
 from gr_ros2.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.measure import COLUMNS, Identity, Observed, by_condition, measure, shown, winners
-from gr_ros2.race.settings import RaceRecording
+from gr_ros2.race.race_settings import RaceRecording
 from tests.race.support import cell
-from tests.race.test_settings import text
+from tests.race.test_race_settings import text
 
 KIND = "std_msgs/msg/String"
 

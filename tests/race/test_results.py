@@ -8,9 +8,9 @@ import pyarrow.parquet
 
 from gr_ros2.errors import RunError
 from gr_ros2.race.contenders import CONTENDERS
+from gr_ros2.race.race_settings import RaceRecording, RaceSettings
 from gr_ros2.race.results import WON, notes, race_grid, write_race
 from gr_ros2.race.runner import Race
-from gr_ros2.race.settings import RaceRecording, RaceSettings
 from tests.race.support import cell
 
 RECORDING = RaceRecording(Path("bag"), "/talk", "std_msgs/msg/String", (b"\0\1\0\0aaaa", b"\0\1\0\0bbbb"), (0.0, 0.1))

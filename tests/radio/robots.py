@@ -12,7 +12,7 @@ from typing import Any
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import LinkConfig, link_from
-from gr_ros2.radio.link import LinkObserver, RobotLink
+from gr_ros2.radio.robot_link import LinkObserver, RobotLink
 from tests.domains import domain
 from tests.middleware.support import CUSTOM, message
 from tests.waiting import wait_for

@@ -20,7 +20,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.soapy import SoapyFrontEnd
 from tests.compiled import compiled
 from tests.radio.robots import RATE, ROOT, config, link_command

@@ -21,7 +21,7 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.diagnostics import DIAGNOSTICS_TYPE, STATISTICS_TYPE, Diagnostics
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from tests.domains import domain, free_domains
 from tests.waiting import wait_for
 

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError, RadioError
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for

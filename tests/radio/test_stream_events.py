@@ -17,7 +17,7 @@ from gnuradio import gr, uhd
 
 from gr_ros2.errors import RadioError
 from gr_ros2.radio.bursts import LENGTH_TAG
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
 

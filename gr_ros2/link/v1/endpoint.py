@@ -37,12 +37,12 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.stats import ReceiverStats, SenderStats
+from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
-from gr_ros2.link.v1.settings import NOBODY, Settings
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO

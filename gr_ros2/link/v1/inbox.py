@@ -23,10 +23,10 @@ from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, SPAN
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.control import Control, Report
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table

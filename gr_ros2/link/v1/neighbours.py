@@ -20,10 +20,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.errors import CrcError, EntryKindError, ReplayedError, SourcesError, TagError, WireError, WrongKeyError
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.repair import MAP
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.control import ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
     HEADER_LEN,

@@ -34,9 +34,9 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_NAMES

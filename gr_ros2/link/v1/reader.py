@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gr_ros2.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
+from gr_ros2.link.v1.endpoint_settings import MIN_PACKET_LEN
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
-from gr_ros2.link.v1.settings import MIN_PACKET_LEN
 from gr_ros2.wire.control import ENCRYPTS, Hello
 from gr_ros2.wire.table import Row, read_table
 from gr_ros2.wire.v1 import (

@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from math import inf
 
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, HEARD_LEN, HELLO_LEN, MARK_LEN, Ask, Control, Heard, Hello
 from gr_ros2.wire.v1 import TABLE_TOPIC
 

@@ -9,8 +9,8 @@ from typing import Any
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.registry import Registry, Topic
 
 KEY = bytes(range(32))

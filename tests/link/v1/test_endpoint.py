@@ -7,8 +7,8 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.link.v1.settings import Settings
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, read_header
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 

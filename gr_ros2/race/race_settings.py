@@ -24,7 +24,7 @@ from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
 from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.settings import SimSettings
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"

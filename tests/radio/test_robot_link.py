@@ -14,7 +14,7 @@ from gr_ros2.link import Delivered
 from gr_ros2.link.events import Accepted, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY
-from gr_ros2.radio.link import RobotLink
+from gr_ros2.radio.robot_link import RobotLink
 from tests.domains import domain
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
