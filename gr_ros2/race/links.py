@@ -36,7 +36,7 @@ from gr_ros2.race.tun import Tun, loopback_up
 from gr_ros2.registry import Registry
 
 DOMAINS = (1, 2)
-"""DDS domains at the sending and the receiving end of gr-ros2. One process cannot use the same domain in two namespaces."""
+"""DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""
 SOURCE_ID = 1
 DEPTH = 1000
 """Messages that the local graphs keep. The number is large, because no message may be lost there."""
@@ -54,14 +54,13 @@ class RaceRadio:
     """
 
     phy: str
-    options: dict[str, Any]
     sample_rate: float
     packet_loss: float
     seed: int
 
     def with_frames_of(self, length: int) -> Phy:
         """The PHY for frames of at most ``length`` bytes."""
-        phy: Phy = PHY.load(self.phy)(length, self.sample_rate, **self.options)
+        phy: Phy = PHY.load(self.phy)(length, self.sample_rate)
         return phy
 
     @cached_property
@@ -135,13 +134,12 @@ class RaceRosLink:
             (self._source, _), (_, self._sink) = ends
             self._sink.announce(SOURCE_ID, [0])
             self._links: list[LoopbackLink] = []
-            for direction in range(len(ends)):
-                source, sink = ends[direction][0], ends[1 - direction][1]
-                phy = radio.with_frames_of(packet_len)
-                link = LoopbackLink(phy, source, sink, channel=radio.channel(direction))
-                stack.callback(link.stop)
+            for direction, (source, _) in enumerate(ends):
+                phy, sink = radio.with_frames_of(packet_len), ends[1 - direction][1]
+                self._links.append(LoopbackLink(phy, source, sink, channel=radio.channel(direction)))
+                stack.callback(self._links[-1].stop)
+            for link in reversed(self._links):  # the receiving end listens when the sending end begins
                 link.start()
-                self._links.append(link)
             self._stack = stack.pop_all()
 
     def _end(self, direction: int, graph: Middleware) -> tuple[RosSource, RosSink]:

@@ -313,10 +313,12 @@ class Endpoint:
             leaving.append(waiting)
         if self.settings.hears:
             leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+            leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
         if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
-            leaving.append(now if self._mode() == "idle" else now + _POLL_S)
+            doubt = min(now + _POLL_S, self.window.next_doubt(now))
+            leaving.append(now if self._mode() == "idle" else doubt)
         return max(min(leaving), self._pace.slot)
 
     # ---- what leaves
@@ -347,8 +349,11 @@ class Endpoint:
             return self._control(asks, "hello", now)
         if self._pace.known:
             self.window.mode = self._mode()
-            return self._repair(now)
-        return None
+            repair = self._repair(now)
+            if repair is not None:
+                return repair
+        early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
+        return self._say(early, now) if early else None
 
     def _start(self, now: float) -> None:
         self._started = True

@@ -12,6 +12,11 @@ replaced by newer ones. With one live packet the rule is repetition, which is ag
 the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, and after 1.36
 times as many in separate groups of 64.
 
+*Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
+then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
+reports are rare, it cannot know that so soon: it sends about as many repairs as losses are to be expected, before a
+report names them.
+
 *Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
 reduced to ``FEW`` packets, and to those of the newest message.
 
@@ -43,7 +48,7 @@ MAP = 64
 """Number of packets that a report covers."""
 
 PROMPT = 1 / 64
-"""Share of packets lost from which on a receiver reports every packet at once, if reports take no slot from packets. The
+"""Share of packets lost from which on a receiver reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
 TURN = 3
 """While a long message is alive, one repair in this many is for short messages."""
@@ -114,7 +119,11 @@ class Receiver:
     loss: float = 0.0
     newest: int = -1
     interval: float = 0.0
+    waits: bool = False
+    """Whether it waits for a packet that is not alive any more. A repair tells it so."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    """Times in s from the departure of packets that were sent once to the report that covers them."""
     lost: set[int] = field(default_factory=set)
 
     @property
@@ -125,12 +134,12 @@ class Receiver:
     @property
     def prompt(self) -> bool:
         """Whether it reports every packet at once, so that a report that does not come says something."""
-        return self.loss >= PROMPT and bool(self.delays)
+        return self.loss >= PROMPT and bool(self.answers)
 
     @property
     def answer(self) -> float:
         """Time in s after which a report about a packet is to be expected."""
-        return max(self.delays) * _MARGIN if self.prompt else self.delay + self.interval
+        return max(self.answers) * _MARGIN if self.prompt else self.delay + self.interval
 
     @property
     def patience(self) -> float:
@@ -177,6 +186,9 @@ class RepairWindow:
         self._flight: deque[tuple[float, int, int]] = deque()
         """The time until which a repair may be on its way without a report about it, and its window."""
         self._times: dict[int, float] = {}
+        """When the newest packets left, s."""
+        self._once: set[int] = set()
+        """Those of them that were neither sent again nor combined: what a report says arrived when it was sent."""
         self._slots = [0.0, 0.0]
         """Recent numbers of new packets and of idle slots."""
 
@@ -190,6 +202,8 @@ class RepairWindow:
         self.newest = number
         self._times[number] = now
         self._times.pop(number - _TIMES, None)
+        self._once.add(number)
+        self._once.discard(number - _TIMES)
         slots = self._slots
         slots[0] = slots[0] * _DECAY + 1
         slots[1] *= _DECAY
@@ -224,13 +238,19 @@ class RepairWindow:
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
         sent_at = self._times.get(number)
-        if sent_at is not None and number > peer.newest and number not in self._repaired:
+        if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
+            if loss >= PROMPT and number > peer.newest and number in self._once:
+                peer.answers.append(now - sent_at)
         peer.newest = max(peer.newest, number)
         records, bit, delay = self._records, peer.bit, peer.delay
+        peer.waits = False
         for back in range(MAP):
             record = records.get(number - back)
-            if record is None or record.confirmed & bit:
+            if record is None:
+                peer.waits |= number > back and not arrived >> back & 1
+                continue
+            if record.confirmed & bit:
                 continue
             if arrived >> back & 1:
                 record.confirmed |= bit
@@ -328,6 +348,7 @@ class RepairWindow:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     record.at = now
+                    self._once.discard(number)
                     return record
         return None
 
@@ -445,6 +466,7 @@ class RepairWindow:
         assert row is not None
         combined = combine([(record.number, record.body) for record in window], row)
         self._fly(now, first, newest)
+        self._once.difference_update(range(first, newest + 1))
         self.counts["combined"] += 1
         oldest = first == self._oldest
         return Repair(newest, mask, row, oldest, combined)
