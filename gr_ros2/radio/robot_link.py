@@ -100,6 +100,7 @@ class RobotLink(Flowgraph):
             self._sink_config(),
             middleware=graphs,
             half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            any_length=self.phy.any_length,
             observer=observer,
             clock=self._clock,
         )
@@ -113,7 +114,7 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        self.source = RosSource(self.registry, middleware=graphs[0], **common, **source)
+        self.source = RosSource(self.registry, middleware=graphs[0], any_length=self.phy.any_length, **common, **source)
         self._stack.callback(self.source.close)
         self.sink = RosSink(self.registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
