@@ -165,12 +165,21 @@ class Endpoint:
         mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a serialized message."""
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a serialized message.
+
+        :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline
+        """
         if self.topics is None or not 0 <= topic_id < len(self.topics):
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
-        self.outbox.submit(topic_id, payload, now)
+        self.outbox.submit(topic_id, payload, now, lifespan_s)
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Announce a service to the other robots, or no longer. At the start, services are not announced."""
+        if self.outbox.offer(topic_id, offered=offered):
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
