@@ -44,7 +44,7 @@ from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -58,7 +58,6 @@ from gr_ros2.wire.control import (
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.v1 import (
     BROADCAST,
-    MAX_TOPICS,
     QOS_STANDING,
     TABLE_TOPIC,
     Entry,
@@ -112,8 +111,6 @@ class Endpoint:
         self.settings = settings
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
-        if topics is not None and len(topics) > MAX_TOPICS:
-            raise ConfigError(f"{len(topics)} topics; at most {MAX_TOPICS}")
         self.received = ReceiverStats()
         """What arrived and what did not."""
         self._observer = observer
@@ -133,7 +130,7 @@ class Endpoint:
         )
         self.topics = topics
         """What it sends."""
-        self._speaks = bool(topics) or settings.hears
+        self._codec = codec
         self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._pace = Pace(settings.packet_rate)
@@ -150,7 +147,7 @@ class Endpoint:
     @property
     def answers(self) -> bool:
         """Whether what it receives can change what it sends."""
-        return self._speaks
+        return bool(self.topics) or self.settings.hears
 
     @property
     def sent(self) -> SenderStats:
@@ -169,6 +166,21 @@ class Endpoint:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
         self.outbox.submit(topic_id, payload, now)
+
+    def add(self, topics: Sequence[Topic]) -> None:
+        """Send these topics too. The robots that hear this one learn of them from its next hello.
+
+        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option of a topic
+        """
+        together = Registry([*(self.topics or ()), *topics])
+        if self._codec is not None:
+            for topic in topics:
+                self._codec.add(topic)
+        self.topics = together
+        self.outbox.add(topics)
+        self._talk.hurry(self._now)
+        if self._started and self._repeat_at == inf and self.settings.repeat_s:
+            self._repeat_at = self._now + self.settings.repeat_s
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
@@ -235,7 +247,7 @@ class Endpoint:
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if self._pace.out_of_credit or now < self._pace.slot or not self._speaks:
+        if self._pace.out_of_credit or now < self._pace.slot or not self.answers:
             return None
         data = self._compose(now)
         if data is None:
@@ -257,14 +269,22 @@ class Endpoint:
         return self._pace.out_of_credit
 
     def follow(
-        self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+        self,
+        topic_id: int,
+        *,
+        reliable: bool = True,
+        latched: bool = False,
+        depth: int = 0,
+        lifespan_s: float = 0.0,
+        period_s: float = 0.0,
     ) -> bool:
         """Take over the QoS of a topic's publishers, where the configuration leaves it open.
 
         :return: whether that changed its queue
         """
         before, table = self.queue(topic_id), self.outbox.digest
-        self.outbox.follow(topic_id, reliable=reliable, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
+        kept = {"reliable": reliable, "latched": latched}
+        self.outbox.follow(topic_id, **kept, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
         if self.outbox.digest != table:
             self._talk.hurry(self._now)
         return self.queue(topic_id) != before
@@ -305,7 +325,7 @@ class Endpoint:
     def next_departure(self) -> float | None:
         """When ``next_packet`` may have something, if no other method is called before."""
         now = self._now
-        if self.out_of_credit or not self._speaks:
+        if self.out_of_credit or not self.answers:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
