@@ -150,7 +150,14 @@ def make_endpoint(
     )
 
 
-def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, half_duplex: bool = False) -> Start:
+def start_of(
+    config: SourceConfig | SinkConfig,
+    src_id: int,
+    *,
+    reports: bool,
+    half_duplex: bool = False,
+    any_length: bool = False,
+) -> Start:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
@@ -160,7 +167,7 @@ def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, h
     if not config.version:
         return Start()
     if not config.state and not config.key and src_id < 0:
-        return Start(int(time.time()), reports=reports, half_duplex=half_duplex)
+        return Start(int(time.time()), reports=reports, half_duplex=half_duplex, any_length=any_length)
     path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -169,7 +176,7 @@ def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, h
     file = BootFile(path, time.time())
     # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
     heard, save = (file.heard, file.save) if config.key else ({}, None)
-    return Start(file.boot, keys, heard, save, reports, half_duplex)
+    return Start(file.boot, keys, heard, save, reports, half_duplex, any_length)
 
 
 def state_folder() -> Path:

@@ -32,6 +32,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
     :param half_duplex: whether sending and receiving share the airtime
+    :param any_length: see :class:`RosSource`
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -44,13 +45,14 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         *,
         middleware: tuple[Middleware, Middleware] | None = None,
         half_duplex: bool = False,
+        any_length: bool = False,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex)
+        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
         self.end = LiveEnd(lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears))
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)

@@ -62,6 +62,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         block. An observer that raises is not called again
     :param clock: s, monotonic
     :param seed: seed of sequence number and entry ids; None: random
+    :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
+        packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -75,6 +77,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
+        any_length: bool = False,
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -85,7 +88,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False)
+            start = start_of(self.config, self.src_id, reports=False, any_length=any_length)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)

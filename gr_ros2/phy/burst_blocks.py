@@ -19,7 +19,7 @@ from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
+from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
@@ -35,6 +35,7 @@ STOCK = "GNU Radio's blocks"
 _log = logging.getLogger(__name__)
 
 
+_LENGTH = pmt.intern(LENGTH_TAG)
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -161,7 +162,7 @@ class TakesPackets(KeptAlive):
 
 
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
-    """Message port `pdus` in, samples out: each packet's burst and gap.
+    """Message port `pdus` in, samples out: each packet's burst and gap, tagged with its length if bursts differ in it.
 
     This is one block instead of a modulator before ``pdu_to_tagged_stream``: that block needs buffer space for a whole
     packet, and without it sleeps until the next message comes, or 250 ms.
@@ -170,6 +171,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     def __init__(self, phy: BurstPhy) -> None:
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
+        self._tagged = phy.any_length
         self._modem = phy.running_modem
         self._gap = phy.gap
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
@@ -189,6 +191,8 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
                 self._rest = self._whole[: len(burst) + self._gap]
                 self._rest[: len(burst)] = burst
                 self._rest[len(burst) :] = 0
+                if self._tagged:
+                    self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
             count = min(len(out) - done, len(self._rest))
             out[done : done + count] = self._rest[:count]
             self._rest = self._rest[count:]

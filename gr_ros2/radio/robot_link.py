@@ -101,6 +101,7 @@ class RobotLink(Flowgraph):
             self._sink_config(),
             middleware=graphs,
             half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            any_length=self.phy.any_length,
             observer=observer,
             clock=self._clock,
         )
@@ -114,7 +115,8 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        self.source = RosSource(self._registry, middleware=graphs[0], **common, **source)
+        any_length = self.phy.any_length
+        self.source = RosSource(self._registry, middleware=graphs[0], any_length=any_length, **common, **source)
         self._stack.callback(self.source.close)
         self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 from collections.abc import Sequence
-from dataclasses import dataclass
 from struct import Struct
 from struct import error as struct_error
+from typing import NamedTuple
 
 from gr_ros2.errors import (
     CrcError,
@@ -42,8 +42,7 @@ _entry_header = Struct(">BBBH")
 _crc = Struct(">H")
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """One fragment of one message.
 
     :param topic_id: registry row, 0..15
@@ -55,7 +54,7 @@ class Entry:
 
     topic_id: int
     entry_id: int
-    index: int
+    index: int  # type: ignore[assignment]  # hides a method of tuples that nobody calls
     total: int
     payload: bytes
 
@@ -74,8 +73,7 @@ class Entry:
         return f"entry_id {self.entry_id}, index {self.index} of {self.total}"
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet. Its length is not stored here: it is a property of the link.
 
     :param src_id: 0..254 (a received one may be 255)

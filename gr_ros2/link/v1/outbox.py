@@ -361,32 +361,31 @@ class Outbox:
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
         parts: list[Part] = []
         sent: list[SentEntry] = []
+        lives: dict[Life, None] = {}
+        qos = picks[0][0].qos
         for place, (message, taken) in enumerate(picks):
-            queue = self._queues[message.topic_id]
-            if not message.started:
+            topic_id, offset = message.topic_id, message.offset
+            queue = self._queues[topic_id]
+            if not message.index:
                 message.begin, message.place = number, place
                 message.life.expires = message.expires
                 queue.started(now)
-            offset = message.offset
-            payload = message.payload[offset : offset + taken]
-            message.index += 1
-            message.offset += taken
+            payload = message.take(taken)
             last = not message.remaining
-            back = number - message.begin if offset else 0
-            parts.append(Part(message.topic_id, payload, back, offset, last, message.coded))
-            key = Key(self._boot, message.begin, message.place)
+            begin = message.begin
+            parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
+            key = Key(self._boot, begin, message.place)
             total = message.index if last else 0
-            sent.append(SentEntry(message.serial, message.topic_id, key, message.index - 1, total, message.repeat))
+            sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
+            lives[message.life] = None
+            qos = min(qos, message.qos, key=RANK.__getitem__)
+            self.stats.payload_bytes += taken
             if last:
                 queue.popleft()
                 self._left(message, queue, now)
         self._turns.sent(self._holder)
         self.stats.entries += len(picks)
-        self.stats.payload_bytes += sum([taken for _, taken in picks])
-        lives = tuple({id(message.life): message.life for message, _ in picks}.values())
-        ranks = [message.qos for message, _ in picks]
-        qos = min(ranks, key=lambda qos: RANK[qos])
-        return Filling(parts, sent, lives, qos, used)
+        return Filling(parts, sent, tuple(lives), qos, used)
 
     def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""
