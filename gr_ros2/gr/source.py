@@ -97,7 +97,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._end = end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
-        self._clock = clock
+        self.clock = clock
         self._pdus = PduMaker()
         self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -121,8 +121,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.set_msg_handler(CREDIT, self._credit)
         namespace, words = self.config.namespace, self.config.topics
         chosen = self.registry.chosen(words) if self.registry else []
-        self.subscribed = {topic.on_graph(namespace): topic for topic in chosen}
+        self.subscribed = {topic.on_graph(namespace): topic for topic in chosen if topic.is_topic}
         """Topic by its absolute name on the ROS graph; replaced as a whole when a topic is added."""
+        self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
+        """The same for the services that other robots may call."""
         self.choice = TopicChoice(() if self.registry else words, namespace)
         """The topics that are looked for on the ROS graph."""
         self._left_out: set[str] = set()
@@ -133,7 +135,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
-            LOOP_GUARD.add_source(self, self._graph, self.subscribed)
+            LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
             self._subscribe()
         except GrRos2Error:
             self.close()
@@ -334,11 +336,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
         """
         options = options_of(row_name, self.config.topic_options)
-        topic = Topic(len(self.registry), row_name, normalize_type(info.type_name), options)
-        subscribed = {**self.subscribed, info.topic: topic}
         with self._lock:
-            self._end.add([topic])
-            self.registry = Registry([*self.registry, topic])
+            self.registry = self._end.add(row_name, normalize_type(info.type_name), options)
+            topic = self.registry[-1]
+            subscribed = {**self.subscribed, info.topic: topic}
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
@@ -382,7 +383,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._end.submit(topic_id, whole or payload, self._clock())
+            self._end.submit(topic_id, whole or payload, self.clock())
             if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
                 self._work.notify()
 
@@ -413,13 +414,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                if self._end.next_packet(self._clock()) is None:
+                if self._end.next_packet(self.clock()) is None:
                     break
             if packets:
                 self._room.notify_all()
             elif self._running:
                 at = self._end.next_departure()
-                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:
@@ -438,7 +439,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._composed.append(event)
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
-            name = self.registry[event.topic_id].name
+            name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:

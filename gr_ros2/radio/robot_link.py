@@ -16,6 +16,7 @@ from typing import Any
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.gr import RosLink, RosSink, RosSource
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
@@ -80,6 +81,8 @@ class RobotLink(Flowgraph):
             self.phy, self.front_end, channel=config.channel, record=config.record, instrumented=self._instrumented
         )
         self._stack.callback(self.radio.close)
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0 and where the front end loops back."""
         graphs = self._graphs(middleware)
         if self.front_end.loops_back:
             self._two_blocks(graphs, observer)
@@ -106,7 +109,7 @@ class RobotLink(Flowgraph):
             clock=self._clock,
         )
         self._stack.callback(both.close)
-        self.source, self.sink = both.source, both.sink
+        self.source, self.sink, self.calls = both.source, both.sink, both.calls
         self.msg_connect(both, "pdus", self.radio, "pdus")
         self.msg_connect(self.radio, "credit", both, "credit")
         self.msg_connect(self.radio, "pdus", both, "pdus")
@@ -201,14 +204,15 @@ class RobotLink(Flowgraph):
         return [*self._observers.told(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, packets to and from the air, the PHY, the counters of the front end, and
-        :meth:`incomplete`."""
+        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
+        end, and :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             "source": self.source.stats(),
             "sink": self.sink.stats(),
+            "calls": {} if self.calls is None else self.calls.stats(),
             "packets": {
                 "out": counts.passed,
                 "backlog": counts.backlog,

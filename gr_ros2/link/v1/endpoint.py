@@ -17,7 +17,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy
+from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.events import (
     AirKind,
@@ -162,27 +162,39 @@ class Endpoint:
         mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a serialized message."""
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a serialized message.
+
+        :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline
+        """
         if self.topics is None or not 0 <= topic_id < len(self.topics):
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
-        self.outbox.submit(topic_id, payload, now)
+        self.outbox.submit(topic_id, payload, now, lifespan_s)
 
-    def add(self, topics: Sequence[Topic]) -> None:
-        """Send these topics too. The robots that hear this one learn of them from its next hello.
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Announce a service to the other robots, or no longer. At the start, services are not announced."""
+        if self.outbox.offer(topic_id, offered=offered):
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
 
-        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option of a topic
+    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:
+        """Send one more topic. The robots that hear this one learn of it from the next hello.
+
+        :return: everything that is sent; the new topic is the last one
+        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option
         """
-        together = Registry([*(self.topics or ()), *topics])
+        before = self.topics or ()
+        topic = Topic(len(before), name, type_name, options)
+        together = Registry([*before, topic])
         if self._codec is not None:
-            for topic in topics:
-                self._codec.add(topic)
+            self._codec.add(topic)
         self.topics = together
-        self.outbox.add(topics)
+        self.outbox.add([topic])
         self._talk.hurry(self._now)
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
+        return together
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""

@@ -136,6 +136,8 @@ class Outbox:
         """Whether receivers report, so that it is known when a message is over."""
         self._with_deadline: list[TopicQueue] = []
         self._ordered: dict[int, bool] = {}
+        self._hidden: set[int] = set()
+        """Topics that the table leaves out: services whose server is not there."""
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
@@ -147,13 +149,30 @@ class Outbox:
             self._topics[topic.topic_id] = topic
             self._queues[topic.topic_id] = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
             self._lives[topic.topic_id] = deque()
+        self._hidden |= {topic.topic_id for topic in topics if not topic.is_topic}
         if TABLE_TOPIC not in self._queues:
             self._queues[TABLE_TOPIC] = TopicQueue("latest")
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
         self._tabulate()
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a message. It may be refused, or cause other messages of its topic to be dropped."""
+    def offer(self, topic_id: int, *, offered: bool) -> bool:
+        """Announce a service, or no longer.
+
+        :return: whether the table of topics has changed
+        """
+        if offered:
+            self._hidden.discard(topic_id)
+        else:
+            self._hidden.add(topic_id)
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a message. It may be refused, or cause other messages of its topic to be dropped.
+
+        :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
+        """
         topic = self._topics[topic_id]
         serial = self._serial
         self._serial += 1
@@ -171,7 +190,10 @@ class Outbox:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
             kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
         qos = QOS_NAMES.index(topic.options.qos)
-        self._admit(Message(serial, topic_id, payload, qos, now, topic.options.weight, coded=codec is not None))
+        weight = topic.options.weight
+        self._admit(
+            Message(serial, topic_id, payload, qos, now, weight, coded=codec is not None, lifespan_s=lifespan_s)
+        )
 
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
@@ -306,6 +328,8 @@ class Outbox:
         """Make the table of topics."""
         rows = []
         for topic in self._topics.values():
+            if topic.topic_id in self._hidden:
+                continue
             options = topic.options
             reliable = options.reliability
             ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
@@ -315,6 +339,8 @@ class Outbox:
             qos = QOS_NAMES.index(options.qos)
             name, kind, latched = topic.name, topic.type_name, self._is_latched(topic)
             rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, latched, min(depth, 255), codec))
+        if not rows and not self.digest:
+            return
         table = write_table(rows)
         self.digest = crc32(table)
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
