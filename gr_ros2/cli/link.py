@@ -204,6 +204,6 @@ def status_line(stats: Mapping[str, Any]) -> str:
     if sink["publish_failed"]:
         parts.append(f"{sink['publish_failed']} messages not published")
     troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
-    quiet = ("name", "bursts_in", "bursts_out")
+    quiet = ("name", "bursts_in", "bursts_out", "frames_in", "frames_out", "foreign")
     parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
     return "; ".join(parts)

@@ -184,7 +184,7 @@ class Planner:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        if not PHY.load(scenario.phy.name).has_samples:
+        if not PHY.load(scenario.phy.name).has_airtime:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
         if not scenario.simulated:
             # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
