@@ -154,8 +154,8 @@ class RacePublisher:
     """Plays one topic of a bag.
 
     :param messages: number of messages to publish
-    :param duration_s: length of the recording, s; a message that the network delays beyond this time, and a second more,
-        is never published
+    :param duration_s: length of the recording, s; a message that the network delays by more than a second beyond this
+        time is never published
     """
 
     def __init__(self, contender: Contender, topic: RaceTopic, bag: Path, messages: int, duration_s: float) -> None:
