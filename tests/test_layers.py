@@ -20,10 +20,10 @@ MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py
 LAYERS = (
     {"errors"},
     {"wire", "names", "yaml_bounds", "old_names", "setting", "files"},
-    {"yaml_text", "config_errors"},
+    {"yaml_text", "config_errors", "topic_choice"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},
-    {"link"},
+    {"link", "calls"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path", "grc_python"},
     {"gr"},
@@ -39,7 +39,7 @@ LAYERS = (
 
 MAY_PRINT = {"cli", "ros"}
 
-PURE = {"wire", "link"}
+PURE = {"wire", "link", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
@@ -56,6 +56,7 @@ WITHOUT_BACKENDS = (
     "gr_ros2",
     "gr_ros2.wire",
     "gr_ros2.link",
+    "gr_ros2.calls",
     "gr_ros2.registry",
     "gr_ros2.config",
     "gr_ros2.compression",

@@ -1,5 +1,7 @@
 """ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
 
+With version 1, services cross the link too.
+
 Invariant: the block contains a RosSource and a RosSink that share one endpoint. So received packets can change what is
 sent.
 """
@@ -14,6 +16,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
@@ -54,11 +57,18 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         rows = read_registry(registry, needed=not source.version)
         start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
-        self.end = LiveEnd(lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears))
+        calls = source.version != 0
+        self.end = LiveEnd(
+            lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
+        )
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
         common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
         self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0."""
+        if calls:
+            self.calls = LiveCalls(self.end, self.source, self.sink)
         for port in ("pdus", "credit"):
             self.message_port_register_hier_in(port)
         self.message_port_register_hier_out("pdus")
@@ -68,5 +78,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graphs. Idempotent."""
+        if self.calls is not None:
+            self.calls.close()
         self.source.close()
         self.sink.close()
