@@ -22,7 +22,7 @@ coefficients; no live packet is more than ``span`` numbers old.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
@@ -116,6 +116,10 @@ class Receiver:
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it."""
         return min(self.delays) if self.delays else 0.0
+
+
+def _never(_now: float) -> bool:
+    return False
 
 
 class RepairWindow:
@@ -253,8 +257,17 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def next(self, now: float) -> Sent | Repair | None:
-        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing."""
+    @property
+    def loss(self) -> float:
+        """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
+        return max((peer.loss for peer in self._receivers.values()), default=self._expected)
+
+    def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
+        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
+
+        :param held: whether a combination has to wait, at this time in s; only asked if there is one. One that has a
+            packet in it that is known to be lost does not wait
+        """
         slots = self._slots
         slots[0] *= _DECAY
         slots[1] = slots[1] * _DECAY + 1
@@ -269,7 +282,14 @@ class RepairWindow:
         window = self._window(now)
         if not window or (self.mode == "thrifty" and not self._worth(window, now)):
             return None
+        if held(now) and not self._named(window):
+            slots[1] -= 1  # repair cannot use this slot
+            return None
         return self._combination(window, now)
+
+    def _named(self, window: list[Sent]) -> bool:
+        """Whether a report names a packet of this window that is lost."""
+        return any(record.number in peer.lost for peer in self._receivers.values() if peer.lost for record in window)
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
         """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and
@@ -322,7 +342,7 @@ class RepairWindow:
 
     def _shrunk(self, window: list[Sent]) -> list[Sent]:
         """The window, or a part of it if idle slots cannot make up for the losses."""
-        loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+        loss = self.loss
         new, idle = self._slots
         need = loss / (1 - loss) * new if loss < 1 else inf
         if need <= idle:
