@@ -1,4 +1,4 @@
-"""One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, sink.
+"""One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, delay, sink.
 
 Invariants: any PHY of the table works here; a PHY without samples skips transmitter, channel and receiver; a block that
 would do nothing is left out, since each Python block costs as much time per packet as source or sink.
@@ -15,6 +15,7 @@ from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import PacketLoss
+from gr_ros2.phy.delay import PacketDelay
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.phy.window import CreditWindow
@@ -24,13 +25,14 @@ class LoopbackLink(PacketPath, Flowgraph):
     """A flowgraph from a source's message port `pdus` to a sink's.
 
     :param phy: which physical layer
-    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
+    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``
     :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
     :param throttled: packets pass at the rate of the channel (:class:`AirtimeGate`); False lets them pass as fast as
         the flowgraph takes them (:class:`CreditWindow`)
     :param paced: credits are granted to the source; False for a source without port `credit`. A PHY without samples
         has no airtime, so it does not set a rate
+    :param delay_s: s that a packet takes beside its airtime
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
     :raises ConfigError: for a channel that this PHY does not support
@@ -45,6 +47,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         channel: ChannelConfig | None = None,
         throttled: bool = True,
         paced: bool = True,
+        delay_s: float = 0.0,
         instrumented: bool = False,
     ) -> None:
         super().__init__("gr_ros2_loopback", f"phy {phy.name}")
@@ -70,8 +73,11 @@ class LoopbackLink(PacketPath, Flowgraph):
         if self.channel.loses_packets or instrumented:
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)
+        # Keep references, since GNU Radio holds none to a Python block.
+        self._delay = PacketDelay(delay_s) if delay_s else None
+        if self._delay is not None:
+            last = self._follow(last, self._delay)
         self._follow(last, sink)
-        # Keep a reference, since GNU Radio holds none to a Python block.
         self._pacer = self._gate if throttled else CreditWindow(self._progress)
         if paced and self._pacer is not None:
             source.use_credit()

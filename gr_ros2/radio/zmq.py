@@ -5,16 +5,19 @@ header, then its samples.
 
 Invariants: only bursts are sent, so silence costs nothing. A burst is sent completely or not at all. Nobody waits for a
 peer. What is sent while a peer is away, or while the cable is unplugged, is lost as on the air. Either end may be
-killed and started again, and the other end continues. The header of a message is checked before anything else in it is
-used. A sample that is not a finite number never reaches a receiver, because the filters and loops of a receiver would
-not recover from it.
+killed and started again, and the other end continues. A thread keeps libzmq's receive queue empty; the bounded queue
+behind it drops what the flowgraph does not take in time. The header of a message is checked before anything else in it
+is used. A sample that is not a finite number never reaches a receiver, because the filters and loops of a receiver
+would not recover from it.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import queue
 import struct
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Callable
@@ -31,6 +34,7 @@ from gr_ros2.config import STRICT
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
+from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
@@ -43,7 +47,7 @@ _HEARTBEAT_MS, _DEAD_MS = 250, 1000
 """Interval and limit of heartbeats. The connection to a peer that is silent up to the limit is closed, with all bursts
 that wait for it. Then a new connection is tried."""
 _RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
-_POLL_MS = 100
+_WAIT_S = 0.1
 MAX_SENDERS = 256
 """Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
 _MAX_PORT = 65535
@@ -86,12 +90,13 @@ class ZmqOptions(FrontEndOptions):
     :param bind: address to publish at: ``5555`` or ``tcp://*:5555`` (all interfaces), ``10.0.0.1:5555``,
         ``ipc:///tmp/a``. Whoever can reach it can listen; there is no encryption
     :param connect: addresses of the other robots, ``10.0.0.2:5555``
-    :param burst_queue: bursts that may wait for a slow peer, 1..10000; beyond, it misses them
+    :param burst_queue: bursts that may wait for a slow peer, and for this computer when received, 1..10000; beyond,
+        new ones are dropped
     """
 
     bind: Annotated[OwnAddress, Field(title="Own address")]
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
-    burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue for a slow peer (bursts)")] = 300
+    burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue (bursts)")] = 300
 
 
 class ZmqFrontEnd(FrontEnd):
@@ -99,6 +104,7 @@ class ZmqFrontEnd(FrontEnd):
 
     name = "zmq"
     Options = ZmqOptions
+    any_length = True
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
@@ -116,8 +122,10 @@ class ZmqFrontEnd(FrontEnd):
         except RadioError:
             self.close()
             raise
+        self._sockets.remove(subscriber)  # its thread closes it
+        arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters)
         self._sink = _BurstPublisher(publisher, phy, self._counters)
-        self._source = _BurstSubscriber(subscriber, phy, self._counters)
+        self._source = _BurstSubscriber(arrivals)
 
     @property
     def sink(self) -> Any:
@@ -132,10 +140,11 @@ class ZmqFrontEnd(FrontEnd):
 
         ``bursts_out``, ``bursts_in``: bursts sent and received. ``missed``: gaps in the numbers of a sender.
         ``restarts``: senders beyond one for each address. ``malformed`` and ``wrong_rate``: refused messages.
+        ``overflows``: bursts that arrived while ``burst_queue`` bursts waited for the flowgraph, and were dropped.
         """
         counted = {name: self._counters[name] for name in ("bursts_out", "bursts_in", "missed")}
         counted["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
-        return counted | {name: self._counters[name] for name in ("malformed", "wrong_rate")}
+        return counted | {name: self._counters[name] for name in ("malformed", "wrong_rate", "overflows")}
 
     def close(self) -> None:
         self._let_go()
@@ -144,7 +153,10 @@ class ZmqFrontEnd(FrontEnd):
         socket = self._context.socket(kind)
         self._sockets.append(socket)
         socket.linger = 0
-        socket.sndhwm = socket.rcvhwm = self.options.burst_queue
+        socket.sndhwm = self.options.burst_queue
+        # libzmq aborts the process if a receive queue with a limit is full while the heartbeats replace the connection
+        # (libzmq issues 3937 and 4767). So it has no limit, and _Arrivals keeps it empty.
+        socket.rcvhwm = 0
         socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
         socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
@@ -180,65 +192,81 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
         self._socket = socket
         self._sample_rate = phy.sample_rate
-        self._burst = phy.airtime_samples()
+        self._cutter = BurstCutter(phy.airtime_samples(), phy.any_length)
         self._sender = int.from_bytes(os.urandom(4), "little")
         self._counters = counters
-        self.set_output_multiple(self._burst)
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
-        samples = input_items[0]
-        bursts = len(samples) // self._burst
-        for burst in samples[: bursts * self._burst].reshape(bursts, self._burst):
+        bursts, taken = self._cutter.cut(self, input_items[0])
+        for burst in bursts:
             number = self._counters["bursts_out"]
             header = HEADER.pack(MAGIC, self._sender, number, self._sample_rate)
             self._socket.send(header + burst.astype(_SAMPLE, copy=False).tobytes(), zmq.NOBLOCK)
             self._counters["bursts_out"] = number + 1
-        return bursts * self._burst
+        return taken
 
 
-class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Receives messages and gives their samples."""
+class _Arrivals:
+    """Received bursts that wait for the flowgraph.
 
-    def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
-        super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
+    Invariants: one thread empties the socket, checks and counts each message, and never waits for the flowgraph; at
+    most ``most`` bursts wait, in the order of their arrival; the thread ends, and closes the socket, with the context.
+    """
+
+    def __init__(self, socket: Any, sample_rate: float, most: int, counters: Counter[str]) -> None:
         self._socket = socket
-        self._sample_rate = phy.sample_rate
+        self._sample_rate = sample_rate
+        self._most = most
         self._senders: dict[int, int] = {}
         self._counters = counters
-        self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
-        self.set_blkd_input_timer_value(AGAIN_MS)
+        self._waiting: queue.SimpleQueue[NDArray[np.complex64]] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name="zmq-arrivals", daemon=True).start()
 
-    def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
-        if not len(self._rest):
-            # Wait without Python's lock and for a limited time: GNU Radio can end this thread only between two calls.
-            if not self._socket.poll(_POLL_MS):
-                return 0
-            self._rest = self._take(self._socket.recv(zmq.NOBLOCK))
-        count = min(len(self._rest), len(output_items[0]))
-        output_items[0][:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
+    def take(self, timeout_s: float) -> NDArray[np.complex64] | None:
+        """The samples of the oldest burst that waits, or None if none has come in time."""
+        try:
+            return self._waiting.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
 
-    def _take(self, message: bytes) -> NDArray[np.complex64]:
-        """The samples of a message; empty if the message is refused."""
-        nothing: NDArray[np.complex64] = np.empty(0, np.complex64)
+    def _run(self) -> None:
+        with self._socket:
+            while True:
+                try:
+                    message = self._socket.recv()
+                except zmq.ContextTerminated:
+                    return
+                self.arrived(message)
+
+    def arrived(self, message: bytes) -> None:
+        """Keep the samples of a message, unless it is refused or the queue is full."""
+        samples = self._samples(message)
+        if samples is None:
+            return
+        # Only this thread adds to the queue, so there is room for what it has seen room for.
+        if self._waiting.qsize() >= self._most:
+            self._count("overflows", f"{self._most} bursts wait, this computer is too slow; new ones are dropped")
+            return
+        self._counters["bursts_in"] += 1
+        self._waiting.put(samples)
+
+    def _samples(self, message: bytes) -> NDArray[np.complex64] | None:
         size = len(message) - HEADER.size
         if size < 0 or size % _SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
-            self._refuse("malformed", f"a message of {len(message)} bytes is no burst of samples")
-            return nothing
+            self._count("malformed", f"a message of {len(message)} bytes is no burst of samples")
+            return None
         _, sender, number, sample_rate = HEADER.unpack_from(message)
         if sample_rate != self._sample_rate:
-            self._refuse(
+            self._count(
                 "wrong_rate",
                 f"a peer sends {sample_rate:g} samples/s, not {self._sample_rate:g}; set the same phy at both ends",
             )
-            return nothing
+            return None
         samples = np.frombuffer(message, _SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
         if not np.isfinite(samples).all():
-            self._refuse("malformed", "a burst has samples that are no finite numbers")
-            return nothing
+            self._count("malformed", "a burst has samples that are no finite numbers")
+            return None
         self._follow(sender, number)
-        self._counters["bursts_in"] += 1
         return samples
 
     def _follow(self, sender: int, number: int) -> None:
@@ -252,7 +280,29 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             self._counters["missed"] += max(0, number - before - 1)
         self._senders[sender] = number
 
-    def _refuse(self, name: str, problem: str) -> None:
+    def _count(self, name: str, problem: str) -> None:
         self._counters[name] += 1
         if self._counters[name] == 1:
             _log.warning("front_end zmq: %s", problem)
+
+
+class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
+    """Gives the samples of the bursts that have arrived."""
+
+    def __init__(self, arrivals: _Arrivals) -> None:
+        super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
+        self.arrivals = arrivals
+        self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
+        self.set_blkd_input_timer_value(AGAIN_MS)
+
+    def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
+        if not len(self._rest):
+            # Wait for a limited time: GNU Radio can end this thread only between two calls.
+            burst = self.arrivals.take(_WAIT_S)
+            if burst is None:
+                return 0
+            self._rest = burst
+        count = min(len(self._rest), len(output_items[0]))
+        output_items[0][:count] = self._rest[:count]
+        self._rest = self._rest[count:]
+        return count

@@ -1,4 +1,5 @@
-"""One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph.
+"""One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph; and the way back
+for reports.
 
 Invariants: the only path from the input graph to the output graph is the link; everything that is opened here is closed
 by the exit stack it was entered on.
@@ -6,22 +7,28 @@ by the exit stack it was entered on.
 
 from __future__ import annotations
 
+import random
 import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
+from gr_ros2.link.endpoint import Endpoint
+from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
+from gr_ros2.run.ends import Halves, halves_of_ends, start_of_run
 from gr_ros2.run.load import recorded_names, source_names
-from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.scenario import Reports, Scenario
 
 _QUIET_S = 0.3
 """A PHY is empty if nothing waits for it and it has given no packet for this time."""
@@ -40,10 +47,33 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     )
 
 
+def live_ends(ways: Sequence[Scenario], registry: Registry, *, any_length: bool) -> list[LiveEnd]:
+    """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`.
+
+    :param any_length: whether the PHY carries shorter packets in less time
+    """
+    start = start_of_run(ways, any_length=any_length)
+    return [
+        LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
+        for halves in halves_of_ends(ways)
+    ]
+
+
+def _endpoint(
+    registry: Registry,
+    halves: Halves,
+    start: Start,
+    rng: random.Random,
+    observer: Callable[[SenderEvent], None],
+) -> Endpoint:
+    return make_endpoint(registry, *halves, start=start, rng=rng, observer=observer)
+
+
 class Direction:
     """Both blocks and the link between them, ready to start.
 
     :param scenario: a one-way scenario, see :meth:`Scenario.directions`
+    :param ends: the end that sends and the end that receives; None: the blocks make their own (version 0)
     :param observer: receives the events of both blocks
     :param stack: closes what is opened here
     :param instrumented: see :class:`LoopbackLink`
@@ -55,6 +85,7 @@ class Direction:
         scenario: Scenario,
         registry: Registry,
         phy: Phy,
+        ends: tuple[LiveEnd | None, LiveEnd | None],
         *,
         observer: LinkObserver,
         stack: ExitStack,
@@ -69,13 +100,12 @@ class Direction:
         # A bag that is read as fast as the link takes it needs a source that makes the reader wait instead of dropping.
         pulled = scenario.bag_path is not None and scenario.bag_speed == 0
         backpressure = scenario.ros_source.backpressure or pulled
-        sends, hears = (self._end(source=True), self._end(source=False)) if scenario.version else (None, None)
         self.source = RosSource(
             registry,
             middleware=self.input,
             observer=observer,
             seed=scenario.seed,
-            end=sends,
+            end=ends[0],
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
         stack.callback(self.source.close)
@@ -83,7 +113,7 @@ class Direction:
             registry,
             middleware=self.output,
             observer=observer,
-            end=hears,
+            end=ends[1],
             **own_settings(scenario.ros_sink),
         )
         stack.callback(self.sink.close)
@@ -97,12 +127,6 @@ class Direction:
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)
-
-    def _end(self, *, source: bool) -> LiveEnd:
-        """One end of a run. Its starts are not counted, because no end exists longer than the run."""
-        ends = (self.scenario.ros_source, None) if source else (None, self.scenario.ros_sink)
-        start = Start(self.scenario.seed + 1)
-        return LiveEnd(lambda observer: make_endpoint(self.registry, *ends, start=start, observer=observer))
 
     def output_topics(self) -> dict[str, str]:
         """Name and type of every topic at the sink, in the order of ``topics``."""
@@ -135,3 +159,41 @@ class Direction:
             return open_graph(self.scenario, self.scenario.ros_source, "source")
         recorded_names(self.scenario, self.registry)  # raises if the recording has nothing for this link
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)
+
+
+class ReportDirection:
+    """The way back for reports alone, ready to start. It carries no topics.
+
+    :param there: the direction of the messages
+    :param ends: the sender, which hears the reports, and the receiver, which sends them
+    :param src_id: of the receiver
+    :param observer, stack, instrumented: see :class:`Direction`
+    """
+
+    def __init__(
+        self,
+        reports: Reports,
+        there: Direction,
+        phy: Phy,
+        ends: tuple[LiveEnd, LiveEnd],
+        src_id: int,
+        *,
+        observer: LinkObserver,
+        stack: ExitStack,
+        instrumented: bool = False,
+    ) -> None:
+        common: dict[str, Any] = {"version": 1, "packet_len": there.scenario.packet_len, "observer": observer}
+        source = RosSource(Registry.empty(), middleware=there.output, end=ends[1], robot_id=src_id, **common)
+        stack.callback(source.close)
+        sink = RosSink(Registry.empty(), middleware=there.input, end=ends[0], **common)
+        stack.callback(sink.close)
+        self.link = LoopbackLink(
+            phy,
+            source,
+            sink,
+            channel=reports.channel,
+            throttled=there.scenario.time != "unthrottled",
+            delay_s=reports.delay_s,
+            instrumented=instrumented,
+        )
+        stack.callback(self.link.stop)

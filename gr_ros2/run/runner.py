@@ -20,6 +20,7 @@ from gr_ros2.files import make_folder, write_whole
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.record.lateness import lateness_result, modem_lateness
@@ -27,7 +28,8 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
-from gr_ros2.run.direction import Direction, open_graph
+from gr_ros2.run.direction import Direction, ReportDirection, live_ends, open_graph
+from gr_ros2.run.ends import halves_of_ends
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
@@ -183,17 +185,26 @@ class _Run:
             link_observers = Observers[LinkObserver]()
             self.recording = link_observers.add(self.recorder, needed=True)
             link_observers.add(run_observers)
+            common: dict[str, Any] = {
+                "observer": link_observers,
+                "stack": stack,
+                "instrumented": run_observers.instruments,
+            }
+            first = second = None
+            if scenario.version:
+                any_length = all(phy.any_length for phy in phys)
+                first, second = live_ends(ways, self.registry, any_length=any_length)
             self.directions = [
-                Direction(
-                    way,
-                    self.registry,
-                    phy,
-                    observer=link_observers,
-                    stack=stack,
-                    instrumented=run_observers.instruments,
-                )
-                for way, phy in zip(ways, phys, strict=True)
+                Direction(way, self.registry, phy, ends, **common)
+                for way, phy, ends in zip(ways, phys, ((first, second), (second, first)), strict=False)
             ]
+            self.links = [direction.link for direction in self.directions]
+            if scenario.reports is not None and first is not None and second is not None:
+                src_id = robot_of(*halves_of_ends(ways)[1])
+                reporting = ReportDirection(
+                    scenario.reports, self.directions[0], self.phy, (first, second), src_id, **common
+                )
+                self.links.append(reporting.link)
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
             run_observers.run_started(self._live())
@@ -211,7 +222,7 @@ class _Run:
             registry=self.registry,
             topics={(way.src_id, topic_id): name for way in self.directions for name, topic_id in way.topics.items()},
             sources={way.src_id: way.source for way in self.directions},
-            links=[way.link for way in self.directions],
+            links=self.links,
             ledger=self.recorder.ledger,
         )
 
@@ -238,13 +249,13 @@ class _Run:
         scenario = self.scenario
         wall = begin = end = time.monotonic()
         try:
-            for way in self.directions:
-                way.link.start()
+            for link in self.links:
+                link.start()
             self._wait_matched()
             begin = end = time.monotonic()
             self.pulse.start()
-            for way in self.directions:
-                way.link.run_began(begin)
+            for link in self.links:
+                link.run_began(begin)
             (self.sim or self.directions[0].input).start()
             while not self._submitted(begin):
                 time.sleep(_POLL_S)
@@ -261,8 +272,8 @@ class _Run:
         drained = not self.interrupted and self._empty()
         self.pulse.close()
         stopped = time.monotonic()
-        for way in self.directions:
-            way.link.stop()
+        for link in self.links:
+            link.stop()
         self.run_observers.settle()
         self.recording.check()
         played = end - begin

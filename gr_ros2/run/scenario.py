@@ -67,7 +67,7 @@ class Back(OneWay):
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Reports(OverChannel):
-    """What receivers say of what they hear, on a channel of their own (version 1).
+    """The way back for reports of what was heard, on a channel of its own (version 1).
 
     :param channel: what lies between them and the sender; what is not set is as on the way there, but for the seed
     :param delay_s: s that a report takes beside its airtime
@@ -83,7 +83,7 @@ class Scenario(Experiment, Traffic, AnyLink):
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator; its seed is the scenario's unless given
     :param back: the way back, where both robots talk; null = one way only
-    :param reports: the way back for reports alone (version 1, simulated time); null = there is none
+    :param reports: the way back for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender, in simulated time; what is not set in one is as
         in ``channel``, but for the seed
     :param seed: of the simulator, the channel and the sender
@@ -113,8 +113,8 @@ class Scenario(Experiment, Traffic, AnyLink):
             raise ValueError("reports: version 0 has none, and with back they go along; leave reports out")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
-        if (self.reports is not None or self.receivers) and not self.simulated:
-            raise ValueError("reports and receivers are for simulated time; set time to samples or packets")
+        if self.receivers and not self.simulated:
+            raise ValueError("receivers: further ones are for simulated time; set time to samples or packets")
         return self
 
     def _check_back(self, back: Back) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
 from typing import Any
@@ -34,12 +34,11 @@ from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
+from gr_ros2.run.ends import Halves, halves_of_ends, start_of_run
 from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.wire import BROADCAST
 
 _LONGEST_GAP_S = 30 * 86400.0
 """s between two consecutive messages of a recording. A longer gap means that a stamp was never set. The link would be
@@ -201,39 +200,21 @@ class End:
 def make_ends(
     ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None, *, any_length: bool = False
 ) -> list[End]:
-    """The ends of a link. The first sends and the others receive; with two directions, the second sends too.
+    """The ends of a link, see :func:`gr_ros2.run.ends.halves_of_ends`.
 
     :param ways: one scenario per direction
     :param codec: of all messages; None makes one where ``compression`` is on
     :param any_length: whether the PHY carries shorter packets in less time
     """
-    there, back = ways[0], ways[1] if len(ways) > 1 else None
-    reports = there.reports is not None or back is not None
-    own_id = there.ros_source.src_id()
-    start = Start(there.seed + 1, reports=reports, any_length=any_length)
-    ends = [_end(registry, there, back, codec, start)]
-    for number in range(1 + len(there.receivers)):
-        sink = there.ros_sink
-        if reports and back is None and sink.robot_id in (AUTO, own_id):
-            sink = replace(sink, robot_id=_free_id(own_id, number))
-        hears = replace(there, ros_sink=sink)
-        ends.append(_end(registry, back, hears, codec, start))
-    return ends
+    start = start_of_run(ways, any_length=any_length)
+    return [_end(registry, halves, codec, start, ways[0].seed) for halves in halves_of_ends(ways)]
 
 
-def _free_id(taken: int, number: int) -> int:
-    """A source id for a receiver that reports and has no id of its own."""
-    return BROADCAST - 1 - number - (BROADCAST - 1 - number <= taken)
-
-
-def _end(
-    registry: Registry, out: Scenario | None, back: Scenario | None, codec: MessageCodec | None, start: Start
-) -> End:
-    source, sink = None if out is None else out.ros_source, None if back is None else back.ros_sink
+def _end(registry: Registry, halves: Halves, codec: MessageCodec | None, start: Start, seed: int) -> End:
     told: list[SenderEvent] = []
-    rng = None if out is None else random.Random(out.seed)
-    endpoint = make_endpoint(registry, source, sink, start=start, codec=codec, rng=rng, observer=told.append)
-    return End(endpoint, told, robot_of(source, sink))
+    rng = None if halves[0] is None else random.Random(seed)
+    endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=told.append)
+    return End(endpoint, told, robot_of(*halves))
 
 
 class Branch:

@@ -135,7 +135,7 @@ def test_channels_take_over_what_is_not_set_but_the_seed() -> None:
     ("settings", "message"),
     [
         ({"version": 0, "reports": {}}, "reports: version 0 has none"),
-        ({"time": "real", "receivers": [{}]}, "set time to samples or packets"),
+        ({"time": "real", "receivers": [{}]}, "receivers: further ones are for simulated time; set time"),
         ({"packet_len": 30}, "version 1 needs at least 40"),
         ({"version": 2}, "version = 2"),
         ({"back": {"ros_source": {"namespace": "/robot_2"}}, "receivers": [{}]}, "one receiver each way"),

@@ -139,13 +139,15 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """All packets from the oldest live one on, by number."""
+        """All packets from the oldest live one on, by number and in this order."""
         self._oldest = 0
         """No older packet is recorded."""
         self.newest = 0
         """Number of the last source packet; 0 before the first."""
         self._receivers: dict[int, Receiver] = {}
         self._everybody = 0
+        self.loss = expected_loss
+        """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
         """Negated numbers of the packets that the only receiver lacks."""
         self._rows: dict[int, int] = {}
@@ -186,6 +188,7 @@ class RepairWindow:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
             peer = self._receivers[receiver] = Receiver(1 << free, now)
             self._everybody |= peer.bit
+            self.loss = self._worst()
         return peer
 
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
@@ -202,6 +205,7 @@ class RepairWindow:
         gap = now - peer.heard
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
+        self.loss = self._worst()
         sent_at = self._times.get(number)
         if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
@@ -230,12 +234,14 @@ class RepairWindow:
         peer = self._receivers.pop(receiver, None)
         if peer is not None:
             self._everybody &= ~peer.bit
+            self.loss = self._worst()
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
-    def receivers(self) -> dict[int, tuple[float, float]]:
-        """The receivers that report: when each was last heard, and the share of packets that it lost."""
-        return {name: (peer.heard, peer.loss) for name, peer in self._receivers.items()}
+    @property
+    def reported(self) -> bool:
+        """Whether any receiver reports."""
+        return bool(self._receivers)
 
     def take_row(self, number: int) -> int | None:
         """A row that no standing packet at this number has used; None if all are used."""
@@ -257,9 +263,7 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    @property
-    def loss(self) -> float:
-        """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
+    def _worst(self) -> float:
         return max((peer.loss for peer in self._receivers.values()), default=self._expected)
 
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
@@ -318,11 +322,10 @@ class RepairWindow:
         """The packets to combine, newest first."""
         found: list[Sent] = []
         everybody = self._everybody
-        for number in range(self.newest, max(self._oldest, self.newest - self._span) - 1, -1):
-            record = self._records.get(number)
-            if record is None or (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
+        for record in reversed(self._records.values()):
+            if (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
                 continue
-            if found and found[0].number - number >= MAX_WINDOW:
+            if found and found[0].number - record.number >= MAX_WINDOW:
                 break
             found.append(record)
             if len(found) == GROUP:

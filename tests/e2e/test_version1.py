@@ -1,0 +1,127 @@
+"""Scenarios that speak version 1 in real time: repair one way, with reports over a channel of their own, and both
+ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gr_ros2.link.events import Received, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.record.result import Result
+from gr_ros2.run.observers import LiveRun
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import Scenario, scenario_from
+from gr_ros2.settings_file import find_registry
+from gr_ros2.wire.control import Report
+from tests.domains import free_domains
+from tests.e2e.support import check_books, delivered_bag
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
+RECEIVER = 254
+"""Source id of a receiver that reports and has none of its own."""
+
+
+class Reports:
+    """Counts the reports that leave each robot and those that arrive, and remembers what the run let it see."""
+
+    name = "reports"
+    instruments = False
+
+    def __init__(self) -> None:
+        self.sent: list[int] = []
+        self.heard: list[int] = []
+        self.run: LiveRun | None = None
+
+    def run_started(self, run: LiveRun) -> None:
+        self.run = run
+
+    def run_ended(self, result: Result | None) -> None:
+        pass
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        if isinstance(event, SentPacket):
+            self.sent += [src_id for entry in event.packet.body if isinstance(entry, Report)]
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
+        if isinstance(event, Received):
+            self.heard += [event.packet.src_id for entry in event.packet.body if isinstance(entry, Report)]
+
+
+def lossy(**settings: Any) -> Scenario:
+    """Odometry over a link that loses a fifth of its packets, and waits for a busy computer."""
+    sending, receiving = free_domains()
+    return scenario_from(
+        {
+            "name": "lossy",
+            "registry": find_registry("odom", Path()),
+            "sim": {"odom_rate": 35, "robots": 2},
+            "packet_len": 64,
+            "version": 1,
+            "ros_source": {
+                "namespace": "/robot_1",
+                "domain_id": sending,
+                "compression": True,
+                "subscriber_depth": 1000,
+                "queue_depth": 0,
+            },
+            "ros_sink": {"domain_id": receiving, "compression": True, "publisher_depth": 1000, "hold_s": 60},
+            "phy": {"name": "ofdm", "sample_rate": 100000, "options": {"detection_threshold": "stock"}},
+            "channel": {"packet_loss": 0.2},
+            "duration_s": 2.0,
+            "drain_s": 60.0,
+            **settings,
+        }
+    )
+
+
+def run(scenario: Scenario, out: Path) -> tuple[Result, Reports]:
+    reports = Reports()
+    result = run_scenario(scenario, out, observers=[reports]).result
+    check_books(result)
+    return result, reports
+
+
+def test_reports_cross_a_channel_of_their_own_and_everything_arrives(tmp_path: Path) -> None:
+    result, reports = run(lossy(reports={"delay_s": 0.03}), tmp_path)
+    (odom,) = result.topics
+    assert odom.pdr == 1.0, odom.ledger
+    assert odom.ledger["repaired"] > 0
+    assert len(delivered_bag(tmp_path, "/rx_robot_1/odom")) == odom.delivered
+    assert set(reports.sent) == set(reports.heard) == {RECEIVER}
+    assert len(reports.heard) < len(reports.sent), "reports are lost too"
+    assert result.packets["air_report"] > 0
+    assert sum(result.packets[f"air_{kind}"] for kind in ("new", "repair", "report", "hello")) == result.packets["sent"]
+    assert reports.run is not None
+    assert [link.channel.seed for link in reports.run.links] == [0, 100_003]
+
+
+def test_a_way_back_that_loses_everything_leaves_repair_to_the_idle_air(tmp_path: Path) -> None:
+    result, reports = run(lossy(reports={"channel": {"packet_loss": 1.0}}, drain_s=5.0), tmp_path)
+    (odom,) = result.topics
+    assert odom.ledger["repaired"] > 0
+    assert reports.sent
+    assert reports.heard == []
+
+
+def test_both_robots_report_what_they_hear_with_their_own_messages(tmp_path: Path) -> None:
+    back = {"ros_source": {"namespace": "/robot_2"}, "channel": {"packet_loss": 0.1}}
+    result, reports = run(lossy(back=back), tmp_path)
+    assert {topic.topic: topic.pdr for topic in result.topics} == {"/robot_1/odom": 1.0, "/robot_2/odom": 1.0}
+    assert all(topic.ledger["repaired"] > 0 for topic in result.topics)
+    assert set(reports.sent) == set(reports.heard) == {1, 2}
+    there, back_again = result.counters["source"], result.counters["back"]["source"]
+    assert there["packets"] + back_again["packets"] == result.packets["sent"]
+
+
+def test_packets_take_as_much_air_as_they_need(tmp_path: Path) -> None:
+    means = {}
+    for lengths in ("any", "fixed"):
+        phy = {"name": "psk", "sample_rate": 1e5, "options": {"lengths": lengths}}
+        result, _ = run(lossy(reports={}, phy=phy), tmp_path / lengths)
+        assert result.topics[0].pdr == 1.0
+        means[lengths] = result.phy["airtime_mean_s"] / result.phy["airtime_s"]
+    assert means["fixed"] == pytest.approx(1.0)
+    assert means["any"] < 0.95
