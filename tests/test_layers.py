@@ -19,7 +19,7 @@ MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
 LAYERS = (
     {"errors"},
     {"wire", "names", "yaml_bounds", "old_names", "setting", "files"},
-    {"yaml_text", "config_errors"},
+    {"yaml_text", "config_errors", "topic_choice"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},
     {"link", "calls"},

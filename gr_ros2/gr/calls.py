@@ -188,7 +188,7 @@ class LiveCalls:
         """Make a server of ours for a service of another robot."""
         name = self._name(src_id, topic)
         try:
-            LOOP_GUARD.check_output(self._sink.graph, name)
+            LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
             graph = _with_services(self._sink.middleware, name)
             self._servers[src_id, topic.topic_id] = graph.serve(
                 name, topic.type_name, partial(self._request, src_id, topic)

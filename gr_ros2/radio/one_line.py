@@ -13,6 +13,7 @@ from typing import Any
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, FrontEndBackend
+from gr_ros2.topic_choice import words_of
 
 DEFAULT_REGISTRY = "table4"
 
@@ -46,13 +47,16 @@ FLAGS: Mapping[str, Flag] = {
 }
 
 
-def one_line(robot: int, radio: str, registry: str | None, flags: Mapping[str, Any]) -> dict[str, Any]:
+def one_line(
+    robot: int, radio: str, registry: str | None, flags: Mapping[str, Any], topics: str | None = None
+) -> dict[str, Any]:
     """A link's settings, as its YAML file would have them.
 
     :param robot: 0..254; its topics are in the namespace ``/robot_N``
     :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
-    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``
+    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``, or none with ``topics``
     :param flags: value of each option of ``FLAGS`` that was given
+    :param topics: which topics of the registry, or without one of the ROS graph; None sends the whole registry
     :raises ConfigError: for an unknown radio, an option that the radio does not have, or a missing option that it needs
     :raises BackendMissingError: when software that the radio needs is not installed
     """
@@ -67,10 +71,12 @@ def one_line(robot: int, radio: str, registry: str | None, flags: Mapping[str, A
         if name not in flags and item.default is MISSING and item.default_factory is MISSING:
             raise ConfigError(f"--{name} is missing, radio {radio} needs it ({FLAGS[name].meaning})")
     chosen = {names[flag]: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
+    default = DEFAULT_REGISTRY if topics is None else ""
+    chosen_topics = {} if topics is None else {"topics": list(words_of(topics))}
     return {
         "name": f"robot_{robot}",
-        "registry": DEFAULT_REGISTRY if registry is None else registry,
-        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}"},
+        "registry": default if registry is None else registry,
+        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
         "phy": _phy(FRONT_ENDS[radio]),
         "front_end": {"name": radio, **chosen},
     }

@@ -21,6 +21,7 @@ from gr_ros2.link.freshness import TURN
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
+from gr_ros2.registry import Topic
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import offered, simulate
@@ -359,6 +360,9 @@ class _Remembering:
         self._codec = codec
         self._coded: dict[tuple[int, bytes], bytes] = {}
         self._decoded: dict[tuple[int, bytes], bytes] = {}
+
+    def add(self, topic: Topic) -> None:
+        self._codec.add(topic)
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         return self._codec.canonical(topic_id, payload)

@@ -55,6 +55,17 @@ def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypat
     assert portable_registry(settled(one_line(1, "sim", None, {}), Path())["registry"]) == "table4"
 
 
+def test_topics_of_the_graph_need_no_registry(tmp_path: Path) -> None:
+    values = settled(one_line(1, "sim", None, {}, "auto, -camera/*"), Path())
+    settings = link_from(values)
+    assert (settings.registry, settings.ros_source.topics) == ("", ("auto", "-camera/*"))
+    path = tmp_path / "saved.yaml"
+    path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
+    assert load_link(path) == settings
+    assert load_link(path, ["ros_source.topics=auto, -camera/*"]) == settings
+    assert portable_registry(settled(one_line(1, "sim", "table4", {}, "odom"), Path())["registry"]) == "table4"
+
+
 @pytest.mark.parametrize(
     ("radio", "flags", "said"),
     [
