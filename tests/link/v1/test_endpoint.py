@@ -58,6 +58,20 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert one.end.sent.air["repair"] == 0
 
 
+@pytest.mark.parametrize("half_duplex", [False, True])
+def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
+    one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
+    air = Air(one, two, loss=0.2)
+    for number in range(200):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(0.1)
+    air.run(3.0)
+    assert len(two.delivered()) == 200
+    reports, arrived = two.end.sent.air["report"], two.end.received.packets
+    assert (reports > 0.9 * arrived) != half_duplex
+    assert (reports < 0.75 * arrived) == half_duplex
+
+
 def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None:
     one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
     air = Air(one, two)
