@@ -18,12 +18,15 @@ from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.record.result import AirUse
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
 
 _SENT, _RECEIVED = "#1f5fbf", "#d62728"
 
+AIR_COLOURS = {"new": "#2a9d5c", "repair": "#1d6b3f", "report": "#e69f00", "hello": "#9db8d9"}
+"""Colours of what packets are for."""
 COLOURS = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
     *("#88ccee", "#882255", "#44aa99", "#ddcc77", "#332288", "#aa4499", "#999933", "#661100"),
@@ -137,6 +140,22 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
         figure.legend(loc="outside lower center", ncols=min(len(rows), 5), fontsize="small", frameon=False)
     else:
         axes.text(50, 0, "nothing was sent", ha="center")
+    return figure
+
+
+def air_figure(uses: Sequence[AirUse]) -> Figure:
+    """What the packets sent were for: one bar of 100 % of their airtime, with the number of packets of each kind."""
+    figure = Figure(figsize=(8.0, 1.7), layout="constrained")
+    axes = figure.add_subplot(title="What the air was used for", xlabel="share of the air used [%]", xlim=(0, 100))
+    left = 0.0
+    for use in uses:
+        width = use.share * 100
+        axes.barh([0], [width], left=left, height=0.7, color=AIR_COLOURS[use.kind], label=use.kind)
+        if width > 1.5 + 1.2 * len(str(use.packets)):  # where the number fits into the bar
+            axes.text(left + width / 2, 0, str(use.packets), ha="center", va="center", fontsize=8)
+        left += width
+    axes.set_yticks([])
+    figure.legend(loc="outside lower center", ncols=len(uses) or 1, fontsize="small", frameon=False)
     return figure
 
 
