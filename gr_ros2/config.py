@@ -170,7 +170,7 @@ class TopicOptions(Queued):
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
-        publishers' lifespan, where ``queue`` is auto too
+        publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -35,6 +37,13 @@ for name in (
     "ZENOH_SESSION_CONFIG_URI",
 ):
     os.environ.pop(name, None)
+
+# Tests start hundreds of programs. Each would compile the package, and list the fonts where a test has its own home.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+os.environ.setdefault(
+    "MPLCONFIGDIR", str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "matplotlib")
+)
 
 # Robots of tests count their starts where nobody else's do.
 _STATE = tempfile.TemporaryDirectory(prefix="gr_ros2-state-")

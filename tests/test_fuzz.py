@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import fuzz.calls
 import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
@@ -28,6 +29,7 @@ HARNESSES = {
     "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+    "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
@@ -37,6 +39,7 @@ COUNTS = {
     "wire_v1": 20_000,
     "endpoint": 400,
     "receiver": 1_500,
+    "calls": 4_000,
     "compression": 2_000,
     "control_socket": 1_000,
     "dashboard": 300,

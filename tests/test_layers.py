@@ -22,7 +22,7 @@ LAYERS = (
     {"yaml_text", "config_errors"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},
-    {"link"},
+    {"link", "calls"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path", "grc_python"},
     {"gr"},
@@ -38,7 +38,7 @@ LAYERS = (
 
 MAY_PRINT = {"cli", "ros"}
 
-PURE = {"wire", "link"}
+PURE = {"wire", "link", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
@@ -55,6 +55,7 @@ WITHOUT_BACKENDS = (
     "gr_ros2",
     "gr_ros2.wire",
     "gr_ros2.link",
+    "gr_ros2.calls",
     "gr_ros2.registry",
     "gr_ros2.config",
     "gr_ros2.compression",

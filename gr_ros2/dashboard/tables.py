@@ -13,8 +13,8 @@ from typing import get_args
 from gr_ros2.dashboard.packets import NO_COLOUR
 from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.link.events import AirKind
-from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.report.figures import COLOURS, row_colour, row_order
+from gr_ros2.link.ledger_rows import LedgerRow, row_order
+from gr_ros2.report.colours import COLOURS, row_colour
 from gr_ros2.wire import BROADCAST
 
 Number = float | int | None

@@ -74,13 +74,15 @@ def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
 def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> MessageCodec | None:
     """The codec of a link with compression; None for a link without.
 
+    :param registry: with topic options applied
+
     :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
     """
     if not config.compression:
         return None
     from gr_ros2.compression import LinkCodec  # imported here: links without compression do not need it
 
-    return LinkCodec(registry.with_options(config.topic_options), config.dictionaries)
+    return LinkCodec(registry, config.dictionaries)
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ def make_endpoint(
     codec: MessageCodec | None = None,
     rng: random.Random | None = None,
     observer: Callable[[SenderEvent], None] | None = None,
+    calls: bool = False,
 ) -> Endpoint:
     """Make one robot's end of a link, of the version in its settings.
 
@@ -121,19 +124,28 @@ def make_endpoint(
     :param sink: settings of the receiving half; None: it receives nothing
     :param start: for version 1 only
     :param codec: codec of all messages; None: made here if ``compression`` is on
+    :param calls: whether services cross the link: the last row of the endpoint's registry is for requests and replies
     :raises ConfigError: for settings that contradict each other
     """
+    if registry.services and not calls:
+        raise ConfigError(
+            f"registry: {registry.services[0].name} is a service, which needs both directions of a link and version 1; "
+            "take gr-ros2 link or RosLink"
+        )
+    rows = registry if source is None else registry.with_options(source.topic_options)
+    if calls:
+        rows = rows.with_calls()
     to_air = from_air = codec
     if codec is None:
-        to_air = None if source is None else message_codec(source, registry)
-        from_air = None if sink is None else message_codec(sink, registry)
+        to_air = None if source is None else message_codec(source, rows)
+        from_air = None if sink is None else message_codec(sink, registry.with_options(sink.topic_options))
     version = source.version if source is not None else 0 if sink is None else sink.version
     if not version:
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or Start()
     dictionaries = () if sink is None else sink.dictionaries
     return EndpointV1(
-        None if source is None or not registry else registry.with_options(source.topic_options),
+        None if source is None or not rows else rows,
         settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
@@ -152,7 +164,14 @@ def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> Me
     return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
 
 
-def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, half_duplex: bool = False) -> Start:
+def start_of(
+    config: SourceConfig | SinkConfig,
+    src_id: int,
+    *,
+    reports: bool,
+    half_duplex: bool = False,
+    any_length: bool = False,
+) -> Start:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
@@ -162,7 +181,7 @@ def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, h
     if not config.version:
         return Start()
     if not config.state and not config.key and src_id < 0:
-        return Start(int(time.time()), reports=reports, half_duplex=half_duplex)
+        return Start(int(time.time()), reports=reports, half_duplex=half_duplex, any_length=any_length)
     path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -171,7 +190,7 @@ def start_of(config: SourceConfig | SinkConfig, src_id: int, *, reports: bool, h
     file = BootFile(path, time.time())
     # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
     heard, save = (file.heard, file.save) if config.key else ({}, None)
-    return Start(file.boot, keys, heard, save, reports, half_duplex)
+    return Start(file.boot, keys, heard, save, reports, half_duplex, any_length)
 
 
 def state_folder() -> Path:
@@ -227,7 +246,7 @@ class Graph:
 def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry) -> None:
     """Refuse a sink that publishes a topic to which a source on the same graph subscribes.
 
-    :param subscribed: absolute names of the topics to which the source subscribes
+    :param subscribed: absolute names of the topics to which the source subscribes, and of the services that it offers
     :param registry: registry of the sink, with topic options applied
     :raises ConfigError: for a loop; the message names the topic
     """

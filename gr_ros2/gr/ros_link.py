@@ -1,5 +1,7 @@
 """ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
 
+With version 1, services cross the link too.
+
 Invariant: the block contains a RosSource and a RosSink that share one endpoint. So received packets can change what is
 sent.
 """
@@ -14,6 +16,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
@@ -32,6 +35,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
     :param half_duplex: whether sending and receiving share the airtime
+    :param any_length: see :class:`RosSource`
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -44,19 +48,27 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         *,
         middleware: tuple[Middleware, Middleware] | None = None,
         half_duplex: bool = False,
+        any_length: bool = False,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex)
+        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
-        self.end = LiveEnd(lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears))
+        calls = source.version != 0
+        self.end = LiveEnd(
+            lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
+        )
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
         common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
         self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0."""
+        if calls:
+            self.calls = LiveCalls(self.end, self.source, self.sink)
         for port in ("pdus", "credit"):
             self.message_port_register_hier_in(port)
         self.message_port_register_hier_out("pdus")
@@ -66,5 +78,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graphs. Idempotent."""
+        if self.calls is not None:
+            self.calls.close()
         self.source.close()
         self.sink.close()

@@ -12,8 +12,8 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
 
 from gnuradio import gr
 
@@ -22,7 +22,6 @@ from gr_ros2.errors import ConfigError, GrRos2Error, SealError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
-from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
@@ -32,7 +31,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
-from gr_ros2.phy.pdus import PDUS
+from gr_ros2.phy.pdus import PDUS, PacketPort, packets_of
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 from gr_ros2.setting import AUTO
@@ -44,6 +43,16 @@ _COUNTED = (
     *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
+
+
+class Services(Protocol):
+    """What handles the services of other robots, and the requests and replies that arrive."""
+
+    def takes(self, event: ReceiverEvent) -> bool:
+        """Handle what an event means for services; returns whether it was a request or a reply."""
+
+    def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
+        """Take over the topics and services that a robot announces now."""
 
 
 class RosSink(gr.basic_block):  # type: ignore[misc]
@@ -87,6 +96,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._end, self._work = end.endpoint, end.work
         self._announced: dict[tuple[int, int], Topic] = {}
         """Topics that senders have announced, by source id and topic id."""
+        self._calls: Services | None = None
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
@@ -115,6 +125,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         """Number of PDUs that this block has finished with, whatever the result."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._handle)
+        PacketPort.readable_by(self)
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, "gr_ros2_sink")
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
@@ -129,9 +140,18 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             raise
 
     @property
+    def graph(self) -> Graph:
+        """The ROS graph on which it publishes."""
+        return self._graph
+
+    @property
     def middleware(self) -> Middleware:
         """This block's participant on the ROS graph."""
         return self._graph.middleware
+
+    def share(self, calls: Services) -> None:
+        """Hand over what concerns services."""
+        self._calls = calls
 
     def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
         """Create the publishers of an expected sender now, so that subscribers find them before its first message.
@@ -178,8 +198,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             stats = self._end.received
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
-            topics = {key: self._topic_stats(key) for key in keys}
-            windows = {key: self._latency[key].copy() for key in keys if key in self._latency}
+            topics = {key: self._topic_stats(key) for key in keys if self._is_topic(key)}
+            windows = {key: self._latency[key].copy() for key in topics if key in self._latency}
             counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
@@ -230,24 +250,34 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             return self.registry[key[1]]
         raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
 
+    def _is_topic(self, key: tuple[int, int]) -> bool:
+        """Whether a sender's topic id means a topic: neither its table, nor its calls, nor something unknown."""
+        topic = self._announced.get(key)
+        return key[1] < len(self.registry) if topic is None else topic.is_topic
+
     def _learn(self, event: Announced) -> None:
         """Take over the topics that a sender announces. A publisher whose topic has a new name or type is closed."""
+        topics = []
         for row in event.rows:
             key = (event.src_id, row.topic_id)
             try:
                 topic = announced(row, self.config.topic_options)
                 name = topic.republished(self.config.namespace_format, event.src_id)
-                LOOP_GUARD.check_output(self._graph, name)
+                if topic.is_topic:
+                    LOOP_GUARD.check_output(self._graph, name)
                 if fault := topic_fault(name):
                     raise ConfigError(f"topic {name!r}: {fault}")
             except ConfigError as error:
                 self._tell_first("bad_announcement", f"a topic of robot {event.src_id} cannot be published", error)
                 continue
+            topics.append(topic)
             before = self._announced.get(key)
             self._announced[key] = topic
             same = before is None or (before.name, before.type_name) == (topic.name, topic.type_name)
             if key in self._publishers and not same:
                 self._publishers.pop(key).close()
+        if self._calls is not None:
+            self._calls.learn(event.src_id, topics)
 
     def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
         stats = self._end.received
@@ -264,12 +294,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             "age_s": None if delivered_at is None else self._clock() - delivered_at + latency,
         }
 
-    def _handle(self, pdu: Any) -> None:
+    def _handle(self, message: Any) -> None:
+        packets, problem = packets_of(message)
         try:
-            self._take(pdu)
+            if problem:
+                self._refuse(problem)
+            else:
+                self._take(packets)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
-        self.handled += 1
+        self.handled += max(len(packets), 1)
 
     def _failed(self, error: Exception) -> None:
         """Count an unexpected error, and log the first one."""
@@ -279,17 +313,19 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if first:
             self._log.error("ros2_sink: %s", error, exc_info=error)
 
-    def _take(self, pdu: Any) -> None:
-        data, problem = packet_of(pdu)
-        if problem:
-            with self._lock:
-                self._counters[problem] += 1
-                first = self._counters[problem] == 1
-            if first:
-                self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
-            return
+    def _refuse(self, problem: str) -> None:
+        """Count a message that is not a packet, and log the first one."""
         with self._lock:
-            events = self._end.receive(data, self._clock())
+            self._counters[problem] += 1
+            first = self._counters[problem] == 1
+        if first:
+            self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
+
+    def _take(self, packets: Iterable[bytes]) -> None:
+        events: list[ReceiverEvent] = []
+        with self._lock:
+            for data in packets:
+                events += self._end.receive(data, self._clock())
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
             if self._end.answers and not self._end.out_of_credit:
@@ -306,7 +342,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                     self._learn(event)
                 elif isinstance(event, Rejected):
                     self._warn(event)
-                result = self._publish(event) if isinstance(event, Delivered) else event
+                taken = self._calls is not None and self._calls.takes(event)
+                result = self._publish(event) if isinstance(event, Delivered) and not taken else event
                 if self._observer is not None:
                     self._guard(self._observer.receiver_event, result, self._clock())
             except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
@@ -324,14 +361,14 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
-        with self._lock:
-            self._published[key] += 1
-            self._delivered_at[key] = self._clock()
         stamped = self._stamped.get(topic.type_name)
         if stamped is None:
             stamped = self._stamped[topic.type_name] = has_header(topic.type_name)
-        if stamped:
-            self._measure(key, event.payload)
+        with self._lock:
+            self._published[key] += 1
+            self._delivered_at[key] = self._clock()
+            if stamped:
+                self._measure(key, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
         return event
@@ -366,14 +403,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return publisher
 
     def _measure(self, key: tuple[int, int], payload: bytes) -> None:
+        """Note the latency of a message; the caller holds the lock."""
         now = self._sim_time if self.config.use_sim_time else time.time()
         stamp = leading_time(payload)
         if now is not None and stamp is not None:
-            with self._lock:
-                if key not in self._latency:
-                    self._forget_the_gone()
-                    self._latency[key] = LatencyWindow()
-                self._latency[key].add(now - stamp)
+            window = self._latency.get(key)
+            if window is None:
+                self._forget_the_gone()
+                window = self._latency[key] = LatencyWindow()
+            window.add(now - stamp)
 
     def _forget_the_gone(self) -> None:
         """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""

@@ -32,7 +32,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.adapt import agreed
-from gr_ros2.phy.pdus import CREDIT, PDUS
+from gr_ros2.phy.pdus import CREDIT, PacketPort
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO, Auto
@@ -60,6 +60,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         block. An observer that raises is not called again
     :param clock: s, monotonic
     :param seed: seed of sequence number and entry ids; None: random
+    :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
+        packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -73,6 +75,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
+        any_length: bool = False,
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -83,7 +86,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False)
+            start = start_of(self.config, self.src_id, reports=False, any_length=any_length)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -92,7 +95,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._end = end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
-        self._clock = clock
+        self.clock = clock
         self._pdus = PduMaker()
         self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -110,18 +113,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
-        self.message_port_register_out(PDUS)
-        self._publish = self.message_port_pub  # stored: each look-up would pass through two proxies
+        self._port = PacketPort(self)
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
         chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
-        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen}
+        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen if topic.is_topic}
         """Topic of the registry by its absolute name on the ROS graph."""
+        self.services = {topic.on_graph(self.config.namespace): topic for topic in chosen if topic.is_service}
+        """The same for the services that other robots may call."""
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
-            LOOP_GUARD.add_source(self, self._graph, self.subscribed)
+            LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
             self._subscribe()
         except GrRos2Error:
             self.close()
@@ -158,7 +162,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def start(self) -> bool:
         shorten_switch_interval()
         self._thread_state.keep()
-        self._unread = pmt.is_null(self.message_subscribers(PDUS))
+        self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         with self._lock:
@@ -315,7 +319,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._end.submit(topic_id, whole or payload, self._clock())
+            self._end.submit(topic_id, whole or payload, self.clock())
             if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
                 self._work.notify()
 
@@ -346,21 +350,25 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                if self._end.next_packet(self._clock()) is None:
+                if self._end.next_packet(self.clock()) is None:
                     break
             if packets:
                 self._room.notify_all()
             elif self._running:
                 at = self._end.next_departure()
-                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:
-        wall = time.time()
-        for sent in packets:
-            if self.config.debug:
+        if self.config.debug:
+            for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-            self._publish(PDUS, self._pdus.pdu(sent.packet, sent.data, wall))
+        if self._port.bundles:
+            self._port.send([sent.data for sent in packets])
+        else:
+            wall = time.time()
+            for sent in packets:
+                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:
@@ -371,7 +379,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._composed.append(event)
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
-            name = self.registry[event.topic_id].name
+            name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:

@@ -1,10 +1,10 @@
 """When each packet occupies the channel: one after the other, each for its airtime; and when to ask for the next.
 
-Invariants: a packet starts at the later of its arrival and the end of the packet before; a packet leaves ``early``
-before its airtime is over, never earlier; idle time is not saved up; a credit is granted no earlier than ``lead``
-before the channel is free of all queued and all promised packets (a promised packet is an unused credit, counted as a
-longest packet), and only while there are fewer than ``OUTSTANDING`` of them. There is no IO and no clock: ``now`` is
-seconds, monotonic.
+Invariants: a packet starts at the later of its arrival and the end of the packet before; a packet leaves when its
+airtime is over, or ``ahead`` before it begins, never earlier; idle time is not saved up; a credit is granted no earlier
+than ``lead`` before the channel is free of all queued and all promised packets (a promised packet is an unused credit,
+counted as a longest packet), and only while there are fewer than ``OUTSTANDING`` of them. There is no IO and no clock:
+``now`` is seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ class AirtimeClock(Generic[T]):
 
     :param airtime: s that a packet occupies, gap included; the longest if they differ; 0 if packets take no time
     :param lead: s before the channel is free at which the next packet is requested
-    :param early: s before the end of its airtime at which a packet leaves: 0 if the following stages take no time; all
-        of its airtime and a little more if a device takes that time
-    :raises ConfigError: for a negative airtime, lead or early
+    :param ahead: s before the begin of its airtime at which a packet leaves, if a device then spends that time; None:
+        a packet leaves when its airtime is over, because the following stages take no time
+    :raises ConfigError: for a negative airtime, lead or ahead
     """
 
-    def __init__(self, airtime: float, lead: float = LEAD_S, early: float = 0.0) -> None:
+    def __init__(self, airtime: float, lead: float = LEAD_S, ahead: float | None = None) -> None:
         if not airtime >= 0:
             raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
         if not lead >= 0:
             raise ConfigError(f"lead = {lead} s: must be 0 or more")
-        if not early >= 0:
-            raise ConfigError(f"early = {early} s: must be 0 or more")
+        if ahead is not None and not ahead >= 0:
+            raise ConfigError(f"ahead = {ahead} s: must be 0 or more")
         self._airtime = airtime
         self._lead = lead
-        self._early = early
+        self._ahead = ahead
         self._free = float("-inf")
         self._queue: deque[tuple[float, T]] = deque()
         self._unused = 0
@@ -51,12 +51,13 @@ class AirtimeClock(Generic[T]):
 
         :param airtime: s that it occupies, None for the airtime of the longest packet
         """
-        self._free = max(now, self._free) + (self._airtime if airtime is None else airtime)
-        self._queue.append((self._free - self._early, packet))
+        begin = max(now, self._free)
+        self._free = begin + (self._airtime if airtime is None else airtime)
+        self._queue.append((self._free if self._ahead is None else begin - self._ahead, packet))
         self._unused = max(0, self._unused - 1)
 
     def due(self, now: float) -> list[T]:
-        """The packets that may leave: their airtime is over, or will be within ``early``; in order of arrival."""
+        """The packets that may leave, in order of arrival."""
         over: list[T] = []
         while self._queue and self._queue[0][0] <= now:
             over.append(self._queue.popleft()[1])

@@ -2,36 +2,35 @@
 
 A message is named by its source, its topic and a ``key``: a hashable value that the engine makes and only compares. A
 key may be used again, but never while the earlier message with this key can still arrive.
+
+Events are named tuples because several are made per packet: a frozen dataclass takes three times as long to make. Where
+a field hides a method of tuples that nobody calls on an event, ``type: ignore`` says so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from gr_ros2.errors import WireError
 from gr_ros2.wire import Packet, TableRow
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(NamedTuple):
     """A packet arrived: its bytes and their meaning. Events that it causes follow it."""
 
     data: bytes
     packet: Packet
 
 
-@dataclass(frozen=True, slots=True)
-class Rejected:
+class Rejected(NamedTuple):
     """Bytes from the PHY that are not a valid packet."""
 
     data: bytes
     error: WireError
 
 
-@dataclass(frozen=True, slots=True)
-class Delivered:
+class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
     packets was lost at first and recovered later."""
 
@@ -43,8 +42,7 @@ class Delivered:
     repaired: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Lost:
+class Lost(NamedTuple):
     """A message will not be delivered, although at least a part of it arrived.
 
     ``reason`` is a :class:`gr_ros2.link.ledger_rows.LedgerRow`: ``lost_fragments`` (overtaken, contradicted, or after
@@ -60,8 +58,7 @@ class Lost:
     key: Hashable = None
 
 
-@dataclass(frozen=True, slots=True)
-class Met:
+class Met(NamedTuple):
     """A robot is heard for the first time or again.
 
     ``boot`` counts its starts; ``hears``: it reports what it hears.
@@ -72,16 +69,14 @@ class Met:
     hears: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Gone:
+class Gone(NamedTuple):
     """A robot has been silent for a long time."""
 
     src_id: int
     boot: int
 
 
-@dataclass(frozen=True, slots=True)
-class Announced:
+class Announced(NamedTuple):
     """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
@@ -91,8 +86,7 @@ class Announced:
 ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
 
 
-@dataclass(frozen=True, slots=True)
-class Accepted:
+class Accepted(NamedTuple):
     """A message was submitted. ``serial`` counts the submitted messages of this sender from 0.
 
     ``expected`` is the payload that the other end should publish, where the link's codec changes the message on purpose
@@ -106,8 +100,7 @@ class Accepted:
     expected: bytes | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+class Refused(NamedTuple):
     """A submitted message will not be sent, or not completely.
 
     ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or
@@ -120,8 +113,7 @@ class Refused:
     detail: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Missed:
+class Missed(NamedTuple):
     """Messages of a topic that the source's ROS graph lost before they were submitted, as far as the graph reports
     them.
 
@@ -129,11 +121,10 @@ class Missed:
     """
 
     topic_id: int
-    count: int
+    count: int  # type: ignore[assignment]
 
 
-@dataclass(frozen=True, slots=True)
-class SentEntry:
+class SentEntry(NamedTuple):
     """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
     ``total`` is the number of fragments of the message; 0 where the number is not fixed in advance. ``repeat`` says
@@ -143,7 +134,7 @@ class SentEntry:
     serial: int
     topic_id: int
     key: Hashable
-    index: int
+    index: int  # type: ignore[assignment]
     total: int
     repeat: bool = False
 
@@ -153,8 +144,7 @@ AirKind = Literal["new", "repair", "report", "hello"]
 and requests."""
 
 
-@dataclass(frozen=True, slots=True)
-class SentPacket:
+class SentPacket(NamedTuple):
     """A packet that left the sender: its bytes, their meaning, and the messages to which its entries belong, in order.
 
     ``entries`` are those of messages that are sent for the first time; a repair has none.

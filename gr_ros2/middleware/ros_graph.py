@@ -32,6 +32,7 @@ __all__ = [
     "DiscoveryRange",
     "check_node",
     "check_topic",
+    "dds_service",
     "dds_topic",
     "dds_type",
     "discovery_options",
@@ -72,6 +73,16 @@ _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 def dds_topic(topic: str) -> str:
     """``/robot_1/odom`` as ``rt/robot_1/odom``."""
     return "rt" + topic
+
+
+def dds_service(service: str, type_name: str) -> tuple[tuple[str, str], tuple[str, str]]:
+    """Topic and type of a service's requests, and of its replies.
+
+    ``/robot_1/add`` of ``example_interfaces/srv/AddTwoInts`` has ``rq/robot_1/addRequest`` of
+    ``example_interfaces::srv::dds_::AddTwoInts_Request_``, and ``rr/robot_1/addReply`` of ``…_Response_``.
+    """
+    request, response = (dds_type(f"{type_name}_{part}") for part in ("Request", "Response"))
+    return (f"rq{service}Request", request), (f"rr{service}Reply", response)
 
 
 def ros_topic(name: str) -> str | None:

@@ -1,7 +1,7 @@
 """The gate in front of a simulated transmitter: packets pass one per airtime, and credits flow back.
 
-Invariants: no packet passes before its airtime is over, or ``early`` before that where a device spends the time
-(`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
+Invariants: no packet passes before its airtime is over, or before it is about to begin where a device spends the
+time (`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes, at most ``airtime``; None = all packets have the same
     :param lead: s before the channel is free at which a credit is given
-    :param early: s before the end of its airtime at which a packet passes, see :class:`AirtimeClock`
+    :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
     :ivar passed_at: s, monotonic, of every packet; empty if ``times`` is off
@@ -43,12 +43,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         *,
         airtime_of: Callable[[int], float] | None = None,
         lead: float = LEAD_S,
-        early: float = 0.0,
+        ahead: float | None = None,
         times: bool = False,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, early)
+        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead)
         self.passed = 0
         self.lateness = Lateness()
         self.passed_at = array("d")

@@ -19,6 +19,9 @@ from gr_ros2.config import ChannelConfig, Kernels, build
 from gr_ros2.errors import ConfigError
 
 Samples = npt.NDArray[np.complex64]
+LENGTH_TAG = "burst_len"
+"""Tag on the first sample of a burst: the number of its samples. With ``tx_sob`` and ``tx_eob`` instead,
+``uhd.usrp_sink`` would begin a burst of its own at its start. That burst can damage our first two (gnuradio#1944)."""
 
 
 class PacketTransmitter(Protocol):
@@ -100,11 +103,14 @@ class Phy(ABC):
 
     @property
     def any_length(self) -> bool:
-        """Whether packets may be shorter than ``packet_len``, and then take less airtime."""
+        """Whether packets may be shorter than ``packet_len``, and then take less airtime.
+
+        The transmitter then tags each burst with its samples, gap included (:data:`LENGTH_TAG`).
+        """
         return False
 
     def pad_all(self) -> None:  # noqa: B027 - most PHYs have nothing to do
-        """From now on :attr:`any_length` is False. Needed if packets are told apart by counting samples."""
+        """From now on :attr:`any_length` is False. Needed where all bursts must have the same length."""
 
     @abstractmethod
     def airtime_samples(self, packet_len: int | None = None) -> int:

@@ -19,12 +19,12 @@ from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
+from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
-from gr_ros2.phy.pdus import PDUS, octets, pdu_of
+from gr_ros2.phy.pdus import PDUS, PacketPort, octets, packets_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive
@@ -35,6 +35,7 @@ STOCK = "GNU Radio's blocks"
 _log = logging.getLogger(__name__)
 
 
+_LENGTH = pmt.intern(LENGTH_TAG)
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -142,16 +143,23 @@ class TakesPackets(KeptAlive):
         block: Any = self
         block.message_port_register_in(PDUS)
         block.set_msg_handler(PDUS, self._take)
+        PacketPort.readable_by(self)
 
     @abstractmethod
     def take_packet(self, packet: bytes) -> None:
         """Process a packet."""
 
     def _take(self, message: Any) -> None:
-        vector = pmt.cdr(message) if pmt.is_pair(message) else message
-        if pmt.is_u8vector(vector) and pmt.length(vector) in self._lengths:
-            self.take_packet(octets(vector))
-            return
+        packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
+        if problem:
+            self._refuse()
+        for packet in packets:
+            if len(packet) in self._lengths:
+                self.take_packet(packet)
+            else:
+                self._refuse()
+
+    def _refuse(self) -> None:
         self.refused += 1
         if self.refused == 1:
             block: Any = self
@@ -161,7 +169,7 @@ class TakesPackets(KeptAlive):
 
 
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
-    """Message port `pdus` in, samples out: each packet's burst and gap.
+    """Message port `pdus` in, samples out: each packet's burst and gap, tagged with its length if bursts differ in it.
 
     This is one block instead of a modulator before ``pdu_to_tagged_stream``: that block needs buffer space for a whole
     packet, and without it sleeps until the next message comes, or 250 ms.
@@ -170,6 +178,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     def __init__(self, phy: BurstPhy) -> None:
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
+        self._tagged = phy.any_length
         self._modem = phy.running_modem
         self._gap = phy.gap
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
@@ -189,6 +198,8 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
                 self._rest = self._whole[: len(burst) + self._gap]
                 self._rest[: len(burst)] = burst
                 self._rest[len(burst) :] = 0
+                if self._tagged:
+                    self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
             count = min(len(out) - done, len(self._rest))
             out[done : done + count] = self._rest[:count]
             self._rest = self._rest[count:]
@@ -235,7 +246,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._damaged = 0
         self._failed = False
         self._snr_db: float | None = None
-        self.message_port_register_out(PDUS)
+        self._port = PacketPort(self)
 
     @property
     def damaged(self) -> int:
@@ -252,7 +263,9 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return np.empty(0, np.complex64) if engine is None else engine.points
 
     def start(self) -> bool:
-        self._engine = ReceiverProcess(self._modem, self._publish) if self._own_process else BurstReceiver(self._modem)
+        self._port.find_readers()
+        send = self._port.send
+        self._engine = ReceiverProcess(self._modem, send) if self._own_process else BurstReceiver(self._modem)
         return super().start()
 
     def stop(self) -> bool:
@@ -260,8 +273,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        for packet in self._packets(input_items[0]):
-            self._publish(packet)
+        self._port.send(self._packets(input_items[0]))
         return len(input_items[0])
 
     def _packets(self, samples: Samples) -> list[bytes]:
@@ -280,6 +292,3 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         if isinstance(self._engine, ReceiverProcess):
             self._engine.close()
         self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
-
-    def _publish(self, packet: bytes) -> None:
-        self.message_port_pub(PDUS, pdu_of(packet))

@@ -25,7 +25,7 @@ class LoopbackLink(PacketPath, Flowgraph):
     """A flowgraph from a source's message port `pdus` to a sink's.
 
     :param phy: which physical layer
-    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
+    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``
     :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
     :param throttled: packets pass at the rate of the channel (:class:`AirtimeGate`); False lets them pass as fast as

@@ -24,7 +24,8 @@ from gr_ros2.race.measure import COLUMNS, RaceCell, by_condition, shown, winners
 from gr_ros2.race.race_settings import dump
 from gr_ros2.race.runner import Race
 from gr_ros2.record.trace import write_csv
-from gr_ros2.report.figures import COLOURS, save_figure
+from gr_ros2.report.colours import COLOURS
+from gr_ros2.report.figures import save_figure
 from gr_ros2.report.table import Grid
 
 RACE_FILE = "race.json"

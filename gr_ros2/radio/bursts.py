@@ -1,9 +1,9 @@
 """Bursts in the form that transmitting devices need: padded, at the right level, with their length in a tag. For
 devices that need it, samples received during a burst are blanked.
 
-Invariants: all bursts have the same length. So the begin and end of a burst follow from sample numbers, never from a
-tag from upstream. A burst leaves as soon as its last sample has arrived. Zeros follow the last sample, never the next
-burst.
+Invariants: bursts follow each other without a sample between them. If they all have the same length, their begins
+follow from sample numbers alone; otherwise each begins with a tag that tells its length. A burst leaves as soon as its
+last sample has arrived. Zeros follow the last sample, never the next burst.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, floor
+from typing import Any
 
 import numpy as np
 import pmt
 from gnuradio import gr
 from numpy.typing import NDArray
 
+from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.phy.threads import KeepsThreadState
 
-LENGTH_TAG = "burst_len"
-"""Tag on the first sample of a burst: the number of its samples. With ``tx_sob`` and ``tx_eob`` instead,
-``uhd.usrp_sink`` would begin a burst of its own at its start. That burst can damage our first two (gnuradio#1944)."""
 _LENGTH = pmt.intern(LENGTH_TAG)
 _REMEMBERED = 64
 """Number of bursts whose times are kept. A receiver is never that many bursts behind."""
@@ -32,11 +31,61 @@ _REMEMBERED = 64
 Samples = NDArray[np.complex64]
 
 
+class BurstCutter:
+    """Cuts the input of a block into whole bursts, also where they arrive in parts.
+
+    :param longest: samples of the longest burst
+    :param tagged: whether each burst begins with a tag :data:`LENGTH_TAG`; if not, all are as long as the longest
+    """
+
+    def __init__(self, longest: int, tagged: bool) -> None:
+        self._longest, self._tagged = longest, tagged
+        self._parts: list[Samples] = []
+        self._missing = 0
+
+    def cut(
+        self, block: Any, samples: Samples, fits: Callable[[int], bool] = lambda _: True
+    ) -> tuple[list[Samples], int]:
+        """Take samples from the start of a block's input.
+
+        :param block: the block, which has one input
+        :param samples: all samples of the input
+        :param fits: whether one more burst of that many samples may end now; asked once for each burst. The last
+            samples of a burst that does not fit are not taken
+        :return: the bursts that are complete, and the number of samples taken
+        """
+        bursts: list[Samples] = []
+        taken = 0
+        while taken < len(samples):
+            if not self._missing:
+                self._missing = self._length(block, taken)
+            part = samples[taken : taken + self._missing]
+            held = sum(map(len, self._parts))
+            if len(part) == self._missing:
+                if not fits(held + len(part)):
+                    break
+                bursts.append(np.concatenate([*self._parts, part]))
+                self._parts = []
+            else:
+                self._parts.append(part.copy())
+            taken += len(part)
+            self._missing -= len(part)
+        return bursts, taken
+
+    def _length(self, block: Any, at: int) -> int:
+        """Samples of the burst that begins at a sample of the input."""
+        if not self._tagged:
+            return self._longest
+        first = block.nitems_read(0) + at
+        (tag,) = block.get_tags_in_range(0, first, first + 1, _LENGTH)
+        return int(pmt.to_long(tag.value))
+
+
 @dataclass(frozen=True)
 class BurstLayout:
-    """One packet's burst, in samples.
+    """How a packet's burst is laid out, in samples.
 
-    :param samples: number of samples from the transmitter, above 0
+    :param samples: number of samples from the transmitter for the longest packet, above 0
     :param lead: zeros before the packet, while the amplifier settles
     :param tail: smallest number of zeros behind the packet, to push the last sample out of filters and buffers
     :param multiple: the total length is a multiple of this, so that no device waits for the rest of a transfer
@@ -49,8 +98,12 @@ class BurstLayout:
 
     @property
     def total(self) -> int:
-        """Samples of the whole burst."""
-        return -(-(self.lead + self.samples + self.tail) // self.multiple) * self.multiple
+        """Samples of the longest burst, zeros included."""
+        return self.total_of(self.samples)
+
+    def total_of(self, samples: int) -> int:
+        """Samples of a burst, zeros included, of which that many come from the transmitter."""
+        return -(-(self.lead + samples + self.tail) // self.multiple) * self.multiple
 
 
 class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
@@ -59,8 +112,9 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
     A converter would turn a sample beyond full scale into its opposite. Such a sample is reduced to full scale and
     counted.
 
-    :param layout: layout of a burst
+    :param layout: layout of the bursts
     :param scale: factor on the samples
+    :param tagged: whether bursts differ in length, see :class:`BurstCutter`
     :param sample_rate: samples/s
     :param clock: s, monotonic
     """
@@ -71,38 +125,51 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         scale: float,
         sample_rate: float,
         clock: Callable[[], float] = time.monotonic,
+        *,
+        tagged: bool = False,
     ) -> None:
         super().__init__("gr_ros2_burst_shaper", [np.complex64], [np.complex64])
         self._layout = layout
         self._scale = np.float32(scale)
-        self._burst_s = layout.total / sample_rate
+        self._cutter = BurstCutter(layout.samples, tagged)
+        self._sample_rate = sample_rate
         self._clock = clock
         self.clipped = 0
         """Number of samples that were beyond full scale."""
         self._sending: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
         self._lock = threading.Lock()
         self.set_tag_propagation_policy(gr.TPP_DONT)
-        self.set_output_multiple(layout.total)
+        self.set_output_multiple(layout.total)  # so that the longest burst always finds room
 
     def sent(self, begin: float, end: float) -> list[tuple[float, float]]:
         """Begin and end of the bursts on the air that touch an interval, s of the clock."""
         with self._lock:
             return [times for times in self._sending if times[0] <= end and begin <= times[1]]
 
-    def forecast(self, noutput_items: int, ninputs: int) -> list[int]:
-        # Whole bursts only: a device that has begun a burst must not wait for the rest of it.
-        return [noutput_items // self._layout.total * self._layout.samples] * ninputs
+    def forecast(self, noutput_items: int, ninputs: int) -> list[int]:  # noqa: ARG002 - parts of bursts are held here
+        return [1] * ninputs
 
     def general_work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
-        layout = self._layout
-        bursts = min(len(input_items[0]) // layout.samples, len(output_items[0]) // layout.total)
-        packets = input_items[0][: bursts * layout.samples].reshape(bursts, layout.samples)
-        shaped = output_items[0][: bursts * layout.total].reshape(bursts, layout.total)
-        shaped[:] = 0
-        shaped[:, layout.lead : layout.lead + layout.samples] = self._within_scale(packets * self._scale)
-        self.consume(0, packets.size)
-        self._note(bursts)
-        return self._tagged(bursts)
+        # Whole bursts only: a device that has begun a burst must not wait for the rest of it.
+        out, room = output_items[0], len(output_items[0])
+
+        def fits(samples: int) -> bool:
+            nonlocal room
+            room -= self._layout.total_of(samples)
+            return room >= 0
+
+        bursts, taken = self._cutter.cut(self, input_items[0], fits)
+        self.consume(0, taken)
+        made = 0
+        for burst in bursts:
+            total = self._layout.total_of(len(burst))
+            begin = made + self._layout.lead
+            out[made : made + total] = 0
+            out[begin : begin + len(burst)] = self._within_scale(burst * self._scale)
+            self.add_item_tag(0, self.nitems_written(0) + made, _LENGTH, pmt.from_long(total))
+            made += total
+            self._note(total)
+        return made
 
     def _within_scale(self, samples: Samples) -> Samples:
         beyond = np.abs(samples) > 1
@@ -111,18 +178,11 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
             samples[beyond] /= np.abs(samples[beyond])
         return samples
 
-    def _note(self, bursts: int) -> None:
-        """Store when these bursts are on the air: now, or directly after the bursts before them."""
+    def _note(self, total: int) -> None:
+        """Store when a burst is on the air: now, or directly after the one before it."""
         with self._lock:
-            for _ in range(bursts):
-                begin = max(self._clock(), self._sending[-1][1] if self._sending else float("-inf"))
-                self._sending.append((begin, begin + self._burst_s))
-
-    def _tagged(self, bursts: int) -> int:
-        total = self._layout.total
-        for burst in range(bursts):
-            self.add_item_tag(0, self.nitems_written(0) + burst * total, _LENGTH, pmt.from_long(total))
-        return bursts * total
+            begin = max(self._clock(), self._sending[-1][1] if self._sending else float("-inf"))
+            self._sending.append((begin, begin + total / self._sample_rate))
 
 
 class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]

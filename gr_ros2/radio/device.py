@@ -93,6 +93,7 @@ class DeviceFrontEnd(FrontEnd):
 
     Options = DeviceOptions
     has_radio = True
+    any_length = True
     example_args: ClassVar[str]
     """Example of ``args``, for error messages."""
     find_with: ClassVar[str]
@@ -103,7 +104,7 @@ class DeviceFrontEnd(FrontEnd):
         chosen = self.options
         self.layout = BurstLayout(phy.airtime_samples(), chosen.lead, chosen.tail, chosen.multiple)
         scale = chosen.level / sqrt(phy.burst_power())
-        self._shaper = BurstShaper(self.layout, scale, phy.sample_rate)
+        self._shaper = BurstShaper(self.layout, scale, phy.sample_rate, tagged=phy.any_length)
         self._blanker: Blanker | None = None
         if chosen.half_duplex:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
@@ -155,11 +156,11 @@ class DeviceFrontEnd(FrontEnd):
         """How long nothing is sent after each burst, s."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self, packet_len: int | None = None) -> float:  # noqa: ARG002 - all bursts have the same length
-        return self.layout.total / self.phy.sample_rate + self._silence()
+    def airtime(self, packet_len: int | None = None) -> float:
+        return self.layout.total_of(self.phy.airtime_samples(packet_len)) / self.phy.sample_rate + self._silence()
 
-    def early(self) -> float:
-        return self.airtime() + (0.0 if self._silence() else _LEAD_S)
+    def ahead(self) -> float:
+        return 0.0 if self._silence() else _LEAD_S
 
     def check(self, now: float) -> None:
         if self._given.still_s(self._gaps.nitems_read(0), now) > SILENT_S:

@@ -22,6 +22,7 @@ from gr_ros2.config import STRICT
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
+from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 
@@ -58,6 +59,7 @@ class FileFrontEnd(FrontEnd):
 
     name = "file"
     Options = FileOptions
+    any_length = True
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
@@ -73,7 +75,8 @@ class FileFrontEnd(FrontEnd):
             self._replay = _Replay(samples, phy, self.options)
         if self.options.write:
             about = SigmfRecording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
-            self._recorder = SigmfRecorder(Path(self.options.write), about, phy.airtime_samples(), lossless=True)
+            bursts = BurstCutter(phy.airtime_samples(), phy.any_length)
+            self._recorder = SigmfRecorder(Path(self.options.write), about, bursts, lossless=True)
 
     @property
     def sink(self) -> Any:

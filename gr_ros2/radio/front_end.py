@@ -86,9 +86,10 @@ class FrontEnd(ABC):
         """
         return self.phy.airtime(packet_len) + float(self.options.guard_s)
 
-    def early(self) -> float:
-        """How long before the end of its airtime a packet must arrive, s. It is 0 if samples take no time to pass."""
-        return 0.0
+    def ahead(self) -> float | None:
+        """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a
+        packet then arrives when its airtime is over."""
+        return None
 
     @property
     def ends(self) -> bool:

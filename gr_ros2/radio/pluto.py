@@ -1,7 +1,8 @@
 """The `pluto` front end: ADALM-Pluto through IIO.
 
 The transmitter takes whole buffers. One buffer is exactly one burst and leaves at once. Each burst ends in zeros, and
-between bursts the converter has nothing to send.
+between bursts the converter has nothing to send. All buffers of a Pluto have the same length, so all bursts have it
+too: another length would need new buffers, and the old ones would be lost while they are sent.
 
 Invariants: GNU Radio's blocks continue if the device refuses a setting, so each important setting is read back. What
 libiio writes to stderr while a device is opened is held back. It is written afterwards if the device was opened. If
@@ -68,6 +69,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
 
     name = "pluto"
     Options = PlutoOptions
+    any_length = False
     refuses = frozenset({"antenna_tx", "antenna_rx"})
     example_args = "ip:192.168.2.1 or usb:1.5.5"
     find_with = "iio_info -S"

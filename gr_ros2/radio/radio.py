@@ -65,7 +65,7 @@ class Radio(PacketPath, HierBlock):
         self._simulated = (changeable or instrumented) and not front_end.has_radio
         self._recorder: SigmfRecorder | None = None
         airtime_of = front_end.airtime if phy.any_length else None
-        self._gate = AirtimeGate(front_end.airtime(), airtime_of=airtime_of, early=front_end.early())
+        self._gate = AirtimeGate(front_end.airtime(), airtime_of=airtime_of, ahead=front_end.ahead())
         self.msg_connect(self, "pdus", self._gate, "pdus")
         self.msg_connect(self._gate, "credit", self, "credit")
         last: Any = self._gate

@@ -16,6 +16,7 @@ from typing import Any
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.gr import RosLink, RosSink, RosSource
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
@@ -79,6 +80,8 @@ class RobotLink(Flowgraph):
             self.phy, self.front_end, channel=config.channel, record=config.record, instrumented=self._instrumented
         )
         self._stack.callback(self.radio.close)
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0 and where the front end loops back."""
         graphs = self._graphs(middleware)
         if self.front_end.loops_back:
             self._two_blocks(graphs, observer)
@@ -100,11 +103,12 @@ class RobotLink(Flowgraph):
             self._sink_config(),
             middleware=graphs,
             half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            any_length=self.phy.any_length,
             observer=observer,
             clock=self._clock,
         )
         self._stack.callback(both.close)
-        self.source, self.sink = both.source, both.sink
+        self.source, self.sink, self.calls = both.source, both.sink, both.calls
         self.msg_connect(both, "pdus", self.radio, "pdus")
         self.msg_connect(self.radio, "credit", both, "credit")
         self.msg_connect(self.radio, "pdus", both, "pdus")
@@ -113,7 +117,7 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        self.source = RosSource(self.registry, middleware=graphs[0], **common, **source)
+        self.source = RosSource(self.registry, middleware=graphs[0], any_length=self.phy.any_length, **common, **source)
         self._stack.callback(self.source.close)
         self.sink = RosSink(self.registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
@@ -193,14 +197,15 @@ class RobotLink(Flowgraph):
         return [*self._observers.told(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, packets to and from the air, the PHY, the counters of the front end, and
-        :meth:`incomplete`."""
+        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
+        end, and :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             "source": self.source.stats(),
             "sink": self.sink.stats(),
+            "calls": {} if self.calls is None else self.calls.stats(),
             "packets": {
                 "out": counts.passed,
                 "backlog": counts.backlog,

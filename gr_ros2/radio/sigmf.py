@@ -24,6 +24,7 @@ from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.files import replacing
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.phy.threads import KeepsThreadState
+from gr_ros2.radio.bursts import BurstCutter
 
 VERSION = "1.0.0"
 META, DATA = ".sigmf-meta", ".sigmf-data"
@@ -128,17 +129,20 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     missing.
 
     :param path: of the recording, with or without suffix
-    :param burst: samples of a packet, to annotate each packet; 0 = a continuous stream, without annotations
+    :param bursts: cuts the samples into packets, to annotate each packet; None = a continuous stream, without
+        annotations
     :param lossless: let the flowgraph wait for a slow disk instead of losing samples
     :raises ConfigError: when the recording exists already
     :raises RadioError: when it cannot be written
     """
 
-    def __init__(self, path: Path, about: SigmfRecording, burst: int = 0, *, lossless: bool = False) -> None:
+    def __init__(
+        self, path: Path, about: SigmfRecording, bursts: BurstCutter | None = None, *, lossless: bool = False
+    ) -> None:
         super().__init__("gr_ros2_sigmf_recorder", [np.complex64], None)
         self._meta, self._data = (Path(f"{base_path(path)}{suffix}") for suffix in (META, DATA))
         self._about = about
-        self._burst = burst
+        self._bursts = bursts
         self._began = datetime.now(timezone.utc)
         self._came = self._written = 0
         self._refused = self._unwritten = 0
@@ -153,7 +157,6 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             raise RadioError(f"recording {self._data}: cannot be written ({error.strerror})") from error
         self._backlog = Backlog("gr-ros2-recording", _HELD_BYTES)
         self._hand_over = self._backlog.put if lossless else self._backlog.offer
-        self.set_output_multiple(burst or 1)
 
     @property
     def failed(self) -> int:
@@ -169,11 +172,19 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         samples = input_items[0]
+        if self._bursts is None:
+            self._record(samples)
+            return len(samples)
+        bursts, taken = self._bursts.cut(self, samples)
+        for burst in bursts:
+            self._record(burst)
+        return taken
+
+    def _record(self, samples: NDArray[np.complex64]) -> None:
         data = samples.astype(SAMPLE, copy=False).tobytes()
         if not self._hand_over(len(data), self._write, data, self._came):
             self._refused += len(samples)
         self._came += len(samples)
-        return len(samples)
 
     def stop(self) -> bool:
         # A flowgraph made by GRC calls `stop`, but not `close`.
@@ -206,10 +217,8 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._written += count
         if place != self._about.index_at(at) and len(self._about.gaps) < _MOST_GAPS:
             self._about.gaps.append((at, place))
-        if self._burst:
-            starts = range(at, at + count, self._burst)
-            room = _MOST_ANNOTATIONS - len(self._about.annotations)
-            self._about.annotations += [(start, self._burst, "packet") for start in starts[: max(0, room)]]
+        if self._bursts is not None and len(self._about.annotations) < _MOST_ANNOTATIONS:
+            self._about.annotations.append((at, count, "packet"))
 
     def _finish_meta(self) -> None:
         try:

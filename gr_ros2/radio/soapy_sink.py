@@ -24,6 +24,7 @@ from gnuradio import gr
 from numpy.typing import NDArray
 
 from gr_ros2.phy.threads import ThreadState
+from gr_ros2.radio.bursts import BurstCutter
 
 _TX, _CHANNEL = 0, 0
 _END_BURST = 1 << 1
@@ -110,9 +111,10 @@ def _call(function: str, *arguments: Any) -> Any:
 
 
 class SoapySink(gr.sync_block):  # type: ignore[misc]
-    """Takes samples, and sends them in bursts of ``burst`` samples.
+    """Takes samples, and sends them in bursts. Each burst begins with a tag, see :class:`BurstCutter`.
 
     :param args: which device
+    :param longest: samples of the longest burst
     :param sample_rate: samples/s
     :param counted: counters of bursts, by name. ``unsent``: samples that the device did not take in time. Each of the
         others appears when the device first reports it. ``bursts_out``: bursts sent completely; ``underflows``: the
@@ -121,16 +123,15 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
     :raises RuntimeError: when there is no such device, or it cannot send
     """
 
-    def __init__(self, args: str, burst: int, sample_rate: float, counted: Counter[str]) -> None:
+    def __init__(self, args: str, longest: int, sample_rate: float, counted: Counter[str]) -> None:
         super().__init__("gr_ros2_soapy_sink", [np.complex64], None)
-        self._burst = burst
-        self._patience = burst / sample_rate + _PATIENCE_S
+        self._cutter = BurstCutter(longest, tagged=True)
+        self._patience = longest / sample_rate + _PATIENCE_S
         self._stream: Any = None
         self._counted = counted
         self._tells = True
         self._asking = threading.Lock()
         self._thread_state = ThreadState()
-        self.set_output_multiple(burst)
         self.trouble = ""
         """Why the device does not begin to send. GNU Radio ignores this error."""
         self._device: Any = _call("makeStrArgs", args.encode())
@@ -226,9 +227,11 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         return result >= 0 or result in _EVENTS
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
-        self._send(input_items[0][: self._burst])
-        self.ask()
-        return self._burst
+        bursts, taken = self._cutter.cut(self, input_items[0])
+        for burst in bursts:
+            self._send(burst)
+            self.ask()
+        return taken
 
     def _send(self, burst: NDArray[np.complex64]) -> None:
         deadline = time.monotonic() + self._patience

@@ -34,6 +34,7 @@ from gr_ros2.config import STRICT
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
+from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
@@ -103,6 +104,7 @@ class ZmqFrontEnd(FrontEnd):
 
     name = "zmq"
     Options = ZmqOptions
+    any_length = True
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
@@ -190,20 +192,18 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
         self._socket = socket
         self._sample_rate = phy.sample_rate
-        self._burst = phy.airtime_samples()
+        self._cutter = BurstCutter(phy.airtime_samples(), phy.any_length)
         self._sender = int.from_bytes(os.urandom(4), "little")
         self._counters = counters
-        self.set_output_multiple(self._burst)
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
-        samples = input_items[0]
-        bursts = len(samples) // self._burst
-        for burst in samples[: bursts * self._burst].reshape(bursts, self._burst):
+        bursts, taken = self._cutter.cut(self, input_items[0])
+        for burst in bursts:
             number = self._counters["bursts_out"]
             header = HEADER.pack(MAGIC, self._sender, number, self._sample_rate)
             self._socket.send(header + burst.astype(_SAMPLE, copy=False).tobytes(), zmq.NOBLOCK)
             self._counters["bursts_out"] = number + 1
-        return bursts * self._burst
+        return taken
 
 
 class _Arrivals:

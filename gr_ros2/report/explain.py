@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from gr_ros2.link.lateness import LATE_S
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow, arrived
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow, arrived, row_order
 from gr_ros2.record.result import Result, air_uses
 from gr_ros2.record.trace import Ints, Packets, Trace
-from gr_ros2.report.figures import row_order
 from gr_ros2.report.table import milliseconds
 
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}

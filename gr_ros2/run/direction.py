@@ -47,9 +47,12 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     )
 
 
-def live_ends(ways: Sequence[Scenario], registry: Registry) -> list[LiveEnd]:
-    """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`."""
-    start = start_of_run(ways, any_length=False)
+def live_ends(ways: Sequence[Scenario], registry: Registry, *, any_length: bool) -> list[LiveEnd]:
+    """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`.
+
+    :param any_length: whether the PHY carries shorter packets in less time
+    """
+    start = start_of_run(ways, any_length=any_length)
     return [
         LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
         for halves in halves_of_ends(ways)

@@ -190,7 +190,10 @@ class _Run:
                 "stack": stack,
                 "instrumented": run_observers.instruments,
             }
-            first, second = live_ends(ways, self.registry) if scenario.version else (None, None)
+            first = second = None
+            if scenario.version:
+                any_length = all(phy.any_length for phy in phys)
+                first, second = live_ends(ways, self.registry, any_length=any_length)
             self.directions = [
                 Direction(way, self.registry, phy, ends, **common)
                 for way, phy, ends in zip(ways, phys, ((first, second), (second, first)), strict=False)

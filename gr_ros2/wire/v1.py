@@ -61,6 +61,8 @@ MAX_BACK = (1 << 21) - 1
 _SEALED, _ADDRESSED = 8, 4
 _MASKED = _CLEAR = _OLDEST = 0x80
 _CODED, _FILL = 0x20, 0x10
+_SHORT = 15
+"""Bytes of the longest payload whose length stands in the flags; a velocity command or a clock is no longer."""
 _WHOLE, _FIRST, _MIDDLE, _LAST = range(4)
 
 _header = Struct(">BBH")
@@ -261,7 +263,7 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
     """
     head = 2 + (_varint_len(back) + _varint_len(offset) if offset else 0)
     if remaining < room - head:
-        return remaining, head + 1 + remaining
+        return remaining, head + (not 0 < remaining <= _SHORT) + remaining
     most = min(room - head, remaining)
     if most < 0 or (not most and remaining):
         return -1, 0
@@ -307,9 +309,9 @@ def read_body(body: bytes, room: int) -> list[Entry]:
         flags = body[position + 1]
         position += 2
         if flags & _FILL:
-            if flags & 15 or len(body) < room:
-                raise EntryKindError(f"an entry that fills its body, with flags {flags:#x} in a body of {len(body)}")
-            length = -1
+            length = flags & 15 or -1
+            if length < 0 and len(body) < room:
+                raise EntryKindError(f"an entry that fills its body, in a body of {len(body)} of {room} bytes")
         else:
             if position >= end:
                 raise EntryBoundsError(f"the header of an entry runs past byte {end}")
@@ -351,6 +353,8 @@ def _write_part(part: Part, room: int) -> bytes:
     flags = kind << 6 | coded * _CODED
     if 2 + len(place) + size == room:
         return bytes((topic_id + 1, flags | _FILL)) + place + payload
+    if 0 < size <= _SHORT:
+        return bytes((topic_id + 1, flags | _FILL | size)) + place + payload
     if size > 0xFFF:
         raise EncodeError(f"an entry of {size} bytes")
     return bytes((topic_id + 1, flags | size >> 8, size & 255)) + place + payload

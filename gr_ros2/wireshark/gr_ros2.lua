@@ -58,7 +58,7 @@ local f = {
     tag = ProtoField.bytes("gr_ros2.tag", "Tag"),
     place = ProtoField.uint8("gr_ros2.place", "Place", base.DEC, PLACES, 0xC0),
     coded = ProtoField.bool("gr_ros2.coded", "Coded (C)", 8, nil, 0x20),
-    fills = ProtoField.bool("gr_ros2.fills", "Ends where the longest body ends (F)", 8, nil, 0x10),
+    fills = ProtoField.bool("gr_ros2.fills", "No length byte (F)", 8, nil, 0x10),
     back = ProtoField.uint32("gr_ros2.back", "Packets since the message began"),
     offset = ProtoField.uint32("gr_ros2.offset", "Offset in the message"),
     control = ProtoField.uint8("gr_ros2.control", "Control entry", base.HEX, CONTROLS),
@@ -483,7 +483,10 @@ local function dissect_part(buffer, tree, packet, at, limit)
     entry:add(f.fills, buffer(at + 1, 1))
     at = at + 2
     local length, back, offset = nil, 0, 0
-    if fills and (flags % 16 ~= 0 or packet.short) then
+    if fills and flags % 16 ~= 0 then
+        length = flags % 16
+        entry:add(f.payload_len, buffer(at - 1, 1), length)
+    elseif fills and packet.short then
         return refuse(refused.kind)
     elseif not fills then
         if at >= limit then

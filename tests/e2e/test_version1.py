@@ -114,3 +114,14 @@ def test_both_robots_report_what_they_hear_with_their_own_messages(tmp_path: Pat
     assert set(reports.sent) == set(reports.heard) == {1, 2}
     there, back_again = result.counters["source"], result.counters["back"]["source"]
     assert there["packets"] + back_again["packets"] == result.packets["sent"]
+
+
+def test_packets_take_as_much_air_as_they_need(tmp_path: Path) -> None:
+    means = {}
+    for lengths in ("any", "fixed"):
+        phy = {"name": "psk", "sample_rate": 1e5, "options": {"lengths": lengths}}
+        result, _ = run(lossy(reports={}, phy=phy), tmp_path / lengths)
+        assert result.topics[0].pdr == 1.0
+        means[lengths] = result.phy["airtime_mean_s"] / result.phy["airtime_s"]
+    assert means["fixed"] == pytest.approx(1.0)
+    assert means["any"] < 0.95

@@ -32,7 +32,7 @@ def test_packets_queue_for_the_air_and_idle_time_is_not_saved_up() -> None:
 
 
 def test_a_device_gets_packets_when_their_airtime_begins_or_a_little_before() -> None:
-    clock: AirtimeClock[str] = AirtimeClock(1.0, early=1.25)
+    clock: AirtimeClock[str] = AirtimeClock(1.0, ahead=0.25)
     clock.offer("a", 10.0)
     assert clock.due(10.0) == ["a"]
     clock.offer("b", 10.5)
@@ -41,8 +41,8 @@ def test_a_device_gets_packets_when_their_airtime_begins_or_a_little_before() ->
     assert clock.due(10.75) == ["b"]
     assert clock.grants(11.0) == 0, "the air is b's until 12"
     assert clock.grants(12.0) == 1
-    with pytest.raises(ConfigError, match="early"):
-        AirtimeClock(1.0, early=-0.1)
+    with pytest.raises(ConfigError, match="ahead"):
+        AirtimeClock(1.0, ahead=-0.1)
 
 
 def test_one_credit_at_the_start_and_the_next_just_before_the_air_is_free() -> None:

@@ -10,10 +10,13 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
+import pmt
+from gnuradio import blocks, gr
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated, pdr, record
 from gr_ros2.phy.tap import SYMBOLS_SHOWN
@@ -102,6 +105,25 @@ def test_packets_take_the_air_that_their_bytes_need(name: str, options: dict[str
     phy.pad_all()
     assert not phy.any_length
     assert phy.airtime_samples(1) == phy.airtime_samples()
+
+
+@pytest.mark.parametrize("name", WITH_SAMPLES)
+def test_bursts_that_differ_in_length_tell_it_in_a_tag(name: str) -> None:
+    phy = make(name, {})
+    assert phy.any_length
+    samples = [phy.airtime_samples(length) for length in (64, 1, 30, 64)]
+    graph, source, transmitter, sink = gr.top_block(), Probe(), phy.transmitter(), blocks.vector_sink_c()
+    graph.connect(transmitter, sink)
+    graph.msg_connect(source, "pdus", transmitter, "pdus")
+    graph.start()
+    for length in (64, 1, 30, 64):
+        source.post(bytes(length))
+    wait_for(lambda: sink.nitems_read(0) == sum(samples), "every burst")
+    graph.stop()
+    graph.wait()
+    begins = [0, *np.cumsum(samples[:-1]).tolist()]
+    tags = [(tag.offset, pmt.symbol_to_string(tag.key), pmt.to_python(tag.value)) for tag in sink.tags()]
+    assert tags == [(begin, LENGTH_TAG, count) for begin, count in zip(begins, samples, strict=True)]
 
 
 @pytest.mark.parametrize("name", WITH_SAMPLES)

@@ -69,11 +69,15 @@ class Robot:
     def say(self, *numbers: int) -> list[bytes]:
         """Publish numbered messages of several packets each, which the link has then taken; returns them."""
         said = [message(number, 200) for number in numbers]
-        before = self._taken()
         for payload in said:
-            self._chat.publish(payload)
-        wait_for(lambda: self._taken() == before + len(said), "the link to take what was said")
+            self.publish(payload)
         return said
+
+    def publish(self, payload: bytes) -> None:
+        """Publish a message, which the link has then taken."""
+        before = self._taken()
+        self._chat.publish(payload)
+        wait_for(lambda: self._taken() == before + 1, "the link to take what was said")
 
     @property
     def silent(self) -> bool:

@@ -12,7 +12,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import pmt
 from gnuradio import blocks, gr
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.radio.bursts import LENGTH_TAG, Blanker, BurstLayout, BurstShaper
@@ -60,6 +60,28 @@ def test_every_burst_is_padded_scaled_and_tagged(layout: BurstLayout, bursts: in
 def test_a_part_of_a_packet_waits_for_the_rest() -> None:
     out, _ = through(BurstShaper(BurstLayout(50), 1.0, 1e6), [1j] * 149)
     assert len(out) == 100
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(1, 700), min_size=1, max_size=40), SIZES, st.integers(1, 100))
+def test_bursts_of_different_lengths_are_told_apart_by_their_tags(lengths: list[int], lead: int, multiple: int) -> None:
+    layout = BurstLayout(700, lead, 3, multiple)
+    packets = [np.full(length, place + 1, np.complex64) for place, length in enumerate(lengths)]
+    begins = np.cumsum([0, *lengths[:-1]]).tolist()
+    tags = [
+        gr.tag_utils.python_to_tag((begin, pmt.intern(LENGTH_TAG), pmt.from_long(length), pmt.intern("x")))
+        for begin, length in zip(begins, lengths, strict=True)
+    ]
+    scale = 1 / (2 * len(lengths))
+    out, found = through(BurstShaper(layout, scale, 1e6, tagged=True), np.concatenate(packets).tolist(), tags)
+    totals = named(found, LENGTH_TAG)
+    assert list(totals.values()) == [layout.total_of(length) for length in lengths]
+    assert list(totals) == np.cumsum([0, *list(totals.values())[:-1]]).tolist()
+    assert len(out) == sum(totals.values())
+    for (begin, total), packet in zip(totals.items(), packets, strict=True):
+        burst = out[begin : begin + total]
+        assert np.allclose(burst[lead : lead + len(packet)], scale * packet)
+        assert np.count_nonzero(burst) == len(packet)
 
 
 def test_nothing_goes_beyond_full_scale() -> None:

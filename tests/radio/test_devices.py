@@ -273,8 +273,13 @@ def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyP
     padded = -(-(phy.airtime_samples() + 30) // 1000) * 1000
     assert full.airtime() == pytest.approx(padded / RATE + 0.003)
     # A packet comes before the one before it is over, but not in the silence that is to follow that.
-    assert full.early() == full.airtime()
+    assert full.ahead() == 0
     unguarded = SoapyFrontEnd(phy, **{**common, "guard_s": 0.0})
-    assert unguarded.early() > unguarded.airtime() == pytest.approx(padded / RATE)
+    assert unguarded.ahead() > 0
+    assert unguarded.airtime() == pytest.approx(padded / RATE)
     half_duplex = SoapyFrontEnd(phy, half_duplex=True, turnaround_s=0.01, **common)
-    assert half_duplex.early() == half_duplex.airtime() == pytest.approx(full.airtime() + 0.01)
+    assert half_duplex.ahead() == 0
+    assert half_duplex.airtime() == pytest.approx(full.airtime() + 0.01)
+    short = -(-(phy.airtime_samples(14) + 30) // 1000) * 1000
+    assert full.airtime(14) == pytest.approx(short / RATE + 0.003)
+    assert short < padded

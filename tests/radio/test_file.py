@@ -12,6 +12,8 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from tests.radio.robots import RATE, Robot, config
@@ -27,6 +29,23 @@ def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]
         wait_for(lambda: robot.link.front_end.sink.nitems_read(0) == samples, "all to be written")
     assert Path(f"{path}.sigmf-data").stat().st_size == 8 * samples
     return said
+
+
+class Sent:
+    """The bytes of each packet that left, and which of them is the first with a message of the registry."""
+
+    def __init__(self) -> None:
+        self.lengths: list[int] = []
+        self.command: int | None = None
+
+    def sender_event(self, _src_id: int, event: SenderEvent) -> None:
+        if isinstance(event, SentPacket):
+            if self.command is None and any(entry.topic_id == 0 for entry in event.entries):
+                self.command = len(self.lengths)
+            self.lengths.append(len(event.data))
+
+    def receiver_event(self, _event: ReceiverEvent, _at: float) -> None:
+        """Nothing is received."""
 
 
 def metadata(path: Path) -> dict[str, Any]:
@@ -59,6 +78,31 @@ def test_a_recording_is_sigmf(tmp_path: Path) -> None:
     assert [entry["core:sample_start"] for entry in annotations] == list(range(0, len(samples), burst))
 
 
+def test_version_1_sends_a_command_in_the_air_that_it_needs(tmp_path: Path) -> None:
+    """Issue: a command of 13 B takes at most 45 % of the air of 64 B with `lora` at factor 9."""
+    sent = Sent()
+    phy = {"name": "lora", "sample_rate": RATE, "options": {"spreading_factor": 9}}
+    settings: dict[str, Any] = {"version": 1, "state": str(tmp_path / "state"), "phy": phy}
+    source = {"repair": "off", "compression": False}
+    front_end = {"name": "file", "write": str(tmp_path / "sent")}
+    with Robot(1, front_end, observer=sent, ros_source=source, **settings) as robot:
+        wait_for(lambda: robot.silent and len(sent.lengths) >= 2, "the robot to have announced its topics")
+        robot.publish(bytes([0, 1, 0, 0, *range(9)]))
+        wait_for(lambda: sent.command is not None, "the command to leave")
+        airtime = robot.link.phy.airtime_samples
+        longest = airtime()
+        # A burst is annotated when it is written, which is later than it is sent.
+        wait_for(
+            lambda: robot.link.front_end.sink.nitems_read(0) == sum(map(airtime, list(sent.lengths))),
+            "all to be written",
+        )
+    bursts = [entry["core:sample_count"] for entry in metadata(tmp_path / "sent")["annotations"]]
+    assert sent.command is not None
+    assert bursts == list(map(airtime, sent.lengths))[: len(bursts)]
+    assert bursts[sent.command] <= 0.45 * longest
+    assert robot.link.front_end.airtime(sent.lengths[sent.command]) * RATE == bursts[sent.command]
+
+
 def test_any_link_can_record_what_it_receives(tmp_path: Path) -> None:
     with Robot(1, {"name": "sim"}, hears=(1,), record=str(tmp_path / "heard")) as robot:
         said = robot.say(*range(5))
@@ -82,7 +126,7 @@ def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
 
 
 def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
-    recorder = SigmfRecorder(tmp_path / "cut", SigmfRecording(RATE, 433e6), 4)
+    recorder = SigmfRecorder(tmp_path / "cut", SigmfRecording(RATE, 433e6), BurstCutter(4, tagged=False))
     recorder.work([np.arange(8, dtype=np.complex64)], [])
     recorder.stop()
     with Path(tmp_path / "cut.sigmf-data").open("ab") as data:

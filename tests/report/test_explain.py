@@ -22,8 +22,8 @@ def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     outcome, capacity, packets, fragments, in_flight, trend = explanation(run.result, run.trace)
     assert outcome == (
-        "Of 49 messages sent: 33 (67%) delivered, 8 (16%) lost for want of a fragment, 2 (4%) too large for the packet "
-        "length, 6 (12%) still in flight at the end."
+        "Of 49 messages sent: 33 (67%) delivered, 8 (16%) lost because a fragment did not arrive, "
+        "2 (4%) too large for the packet length, 6 (12%) still in flight at the end."
     )
     assert "10.0 ms of air, so the link carries at most 100.0 packets/s" in capacity
     # 38 messages of two fragments and 9 of one share packets as those did that left: 83 entries in 74 packets

@@ -115,8 +115,10 @@ def read_body(body: bytes, room: int) -> list[dict[str, object]]:
         at += 2
         fills = flags & 0x10
         length = 0
-        if fills:
-            if flags & 15 or len(body) < room:
+        if fills and flags & 15:
+            fills, length = 0, flags & 15
+        elif fills:
+            if len(body) < room:
                 raise Refused("entry_kind")
         else:
             if at >= end:

@@ -67,13 +67,15 @@ def packets(draw: st.DrawFn) -> tuple[Packet, int, bool]:
     standing = draw(standings(control=True)) if kind == "control" else None
     inside = draw(entries)
     used = len(v1.write_body(inside, 1 << 20))
-    room = used - draw(st.integers(0, 1)) if _last_is_part(inside) else used  # without its length byte, it just fits
+    room = (
+        used - draw(st.integers(0, 1)) if _last_says_its_length(inside) else used
+    )  # without its length byte, it just fits
     packet_len = max(room + draw(st.just(0) | st.integers(0, 20)), 2) + header.size + v1.STANDING_LEN + v1.CRC_LEN
     return Packet(header, inside, standing), packet_len, fixed
 
 
-def _last_is_part(inside: tuple[v1.Entry, ...]) -> bool:
-    return bool(inside) and isinstance(inside[-1], Part)
+def _last_says_its_length(inside: tuple[v1.Entry, ...]) -> bool:
+    return bool(inside) and isinstance(inside[-1], Part) and not 0 < len(inside[-1].payload) <= 15
 
 
 @given(packets(), U32, U32)
@@ -155,6 +157,19 @@ def test_the_overhead_of_a_whole_message_is_that_of_version_0(sealed: bool, over
     message = bytes(64 - overhead)
     assert v1.fit(room, len(message), 0, 0) == (len(message), room)
     assert v1.fit(room, len(message) + 1, 0, 0) == (len(message) + 1, room)  # one more: the length goes unsaid
+
+
+@pytest.mark.parametrize(("size", "packet_len"), [(0, 11), (1, 11), (13, 23), (15, 25), (16, 27)])
+def test_short_messages_have_no_length_byte(size: int, packet_len: int) -> None:
+    packet = Packet(Header(0, False, 1, 1), (Part(0, bytes(size)),))
+    data = encode(packet, 64, BOOT, fixed=False)
+    assert len(data) == packet_len
+    assert decode(data, 64, BOOT) == packet
+    assert v1.fit(v1.body_room(64), size, 0, 0) == (size, packet_len - v1.HEADER_LEN - v1.CRC_LEN)
+
+
+def test_a_length_byte_is_taken_where_none_is_needed() -> None:
+    assert v1.read_body(bytes.fromhex("010002aabb"), 40) == v1.read_body(bytes.fromhex("0112aabb"), 40)
 
 
 def test_an_odometry_message_takes_as_many_packets_as_in_version_0() -> None:

@@ -123,6 +123,8 @@ class Endpoint:
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
         sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
+        self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
+        """Byte of a packet up to which its body is padded."""
         self._trailer = self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
         self.window = RepairWindow(
@@ -163,12 +165,21 @@ class Endpoint:
         mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a serialized message."""
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a serialized message.
+
+        :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline
+        """
         if self.topics is None or not 0 <= topic_id < len(self.topics):
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
-        self.outbox.submit(topic_id, payload, now)
+        self.outbox.submit(topic_id, payload, now, lifespan_s)
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Announce a service to the other robots, or no longer. At the start, services are not announced."""
+        if self.outbox.offer(topic_id, offered=offered):
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
@@ -292,7 +303,7 @@ class Endpoint:
         for gone in self.neighbours.silent(now - self.settings.give_up_s):
             self.window.forget(gone.src_id)
             self._report_all([Gone(gone.src_id, gone.boot)])
-        self.outbox.reported = bool(self.window.receivers())
+        self.outbox.reported = self.window.reported
         events, self._events = self._events, []
         return events
 
@@ -324,25 +335,25 @@ class Endpoint:
     def _compose(self, now: float) -> bytes | None:
         if not self._started:
             self._start(now)
-        idle, latency, heard = self.outbox.idle, self.outbox.urgent, bool(self.window.receivers())
-        if self._talk.urgent(now, idle=idle, latency=latency, heard=heard):
+        outbox, talk = self.outbox, self._talk
+        if now >= talk.due and talk.urgent(now, idle=outbox.idle, latency=outbox.urgent, heard=self.window.reported):
             return self._hello(now)
         if now >= self._repeat_at:
             self._repeat_at = now + self.settings.repeat_s
-            if not self.window.receivers():
-                self.outbox.announce(now)
-        self.outbox.expire(now, self.interval)
+            if not self.window.reported:
+                outbox.announce(now)
+        outbox.expire(now, self.interval)
         due: Sequence[Neighbour] = ()
         if self.settings.hears:
             due = [n for n in self.neighbours if n.inbox.unreported and n.inbox.report_due(now) <= now]
         if due and self._unheard >= FORCED:
             return self._say(due, now)
-        filling = self.outbox.fill(self.window.newest + 1, self._room, now)
+        filling = outbox.fill(self.window.newest + 1, self._room, now)
         if filling is not None:
             return self._new(filling, due, now)
         if due:
             return self._say(due, now)
-        asks = self._talk.asks(self.neighbours, now)
+        asks = talk.asks(self.neighbours, now)
         if asks:
             return self._control(asks, "hello", now)
         if self._pace.known:
@@ -375,9 +386,8 @@ class Endpoint:
         self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentEntry, ...], now: float
     ) -> bytes:
         number = self.window.newest + 1
-        settings = self.settings
         body = write_body(entries, self._room)
-        header = Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
+        header = self._header(qos, number)
         clear = write_header(header)
         data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
         self.window.sent(number, body, data, lives, now)
@@ -386,8 +396,7 @@ class Endpoint:
     def _standing(
         self, standing: Standing, number: int, body: bytes, entries: Sequence[Entry], *, kind: AirKind, now: float
     ) -> bytes:
-        settings = self.settings
-        header = Header(QOS_STANDING, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, self._hop)
+        header = self._header(QOS_STANDING, number)
         clear = write_header(header) + write_standing(standing)
         body = self._padded(body, clear)
         data = self._trailer.close(clear, body, number, standing.row, plain=standing.clear)
@@ -416,7 +425,7 @@ class Endpoint:
         return self._source([], lives, 0, (), now) if lives else None
 
     def _hello(self, now: float) -> bytes:
-        quiet = self.window.newest == self._hello_number and not self.window.receivers()
+        quiet = self.window.newest == self._hello_number and not self.window.reported
         if quiet and self.keys.sealed:
             self._hello_number = -1
             return self._source(
@@ -424,7 +433,7 @@ class Endpoint:
             )  # a receiver that restarts takes nothing below the number that it had stored
         self._hello_number = self.window.newest
         outbox = self.outbox
-        if self._talk.starting and not self.window.receivers():
+        if self._talk.starting and not self.window.reported:
             outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
         entries = self._talk.hello(self._room, turns, outbox.digest, marks, now)
@@ -455,18 +464,17 @@ class Endpoint:
         return data
 
     def _padded(self, body: bytes, clear: bytes) -> bytes:
-        if not self.settings.fixed:
-            return body
-        return body.ljust(self.settings.packet_len - len(clear) - self.keys.trailer_len, b"\0")
+        return body.ljust(self._end_of_body - len(clear), b"\0")
 
-    @property
-    def _hop(self) -> int:
-        return self.settings.hop if self.settings.dst_id != BROADCAST else 0
+    def _header(self, qos: int, number: int) -> Header:
+        settings = self.settings
+        hop = settings.hop if settings.dst_id != BROADCAST else 0
+        return Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
 
     def _mode(self) -> RepairMode:
         if self.settings.repair != AUTO:
             return self.settings.repair
-        return "thrifty" if self.window.receivers() else "idle"
+        return "thrifty" if self.window.reported else "idle"
 
     # ---- what arrives
 

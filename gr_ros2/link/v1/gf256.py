@@ -58,10 +58,10 @@ def combine(bodies: Iterable[tuple[int, bytes]], row: int) -> bytes:
     :param bodies: (number, body) of each
     :param row: row of the repair
     """
-    shifted = _HALF | row % _HALF
+    shifted, as_integer = _HALF | row % _HALF, int.from_bytes
     total = longest = 0
     for number, body in bodies:
-        total ^= int.from_bytes(body.translate(CAUCHY[shifted ^ number % _HALF]), "little")
+        total ^= as_integer(body.translate(CAUCHY[shifted ^ number & _HALF - 1]), "little")
         if len(body) > longest:  # noqa: PLR1730 - max() would take a third of this loop's time
             longest = len(body)
     return total.to_bytes(longest, "little")

@@ -138,14 +138,32 @@ class Outbox:
         """Whether receivers report, so that it is known when a message is over."""
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
         self._ordered: dict[int, bool] = {}
+        self._hidden = {topic.topic_id for topic in topics or () if not topic.is_topic}
+        """Topics that the table leaves out: services whose server is not there."""
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
             self._queues[TABLE_TOPIC] = TopicQueue("latest")
             self._tabulate()
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a message. It may be refused, or cause other messages of its topic to be dropped."""
+    def offer(self, topic_id: int, *, offered: bool) -> bool:
+        """Announce a service, or no longer.
+
+        :return: whether the table of topics has changed
+        """
+        if offered:
+            self._hidden.discard(topic_id)
+        else:
+            self._hidden.add(topic_id)
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a message. It may be refused, or cause other messages of its topic to be dropped.
+
+        :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
+        """
         assert self._topics is not None
         topic = self._topics[topic_id]
         serial = self._serial
@@ -164,7 +182,10 @@ class Outbox:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
             kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
         qos = QOS_NAMES.index(topic.options.qos)
-        self._admit(Message(serial, topic_id, payload, qos, now, topic.options.weight, coded=codec is not None))
+        weight = topic.options.weight
+        self._admit(
+            Message(serial, topic_id, payload, qos, now, weight, coded=codec is not None, lifespan_s=lifespan_s)
+        )
 
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
@@ -298,6 +319,8 @@ class Outbox:
         """Make the table of topics."""
         rows = []
         for topic in self._topics or ():
+            if topic.topic_id in self._hidden:
+                continue
             options = topic.options
             reliable = options.reliability
             ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
@@ -307,6 +330,8 @@ class Outbox:
             qos = QOS_NAMES.index(options.qos)
             name, kind = topic.name, topic.type_name
             rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, topic.latched, min(depth, 255), codec))
+        if not rows and not self.digest:
+            return
         table = write_table(rows)
         self.digest = crc32(table)
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
@@ -348,32 +373,31 @@ class Outbox:
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
         parts: list[Part] = []
         sent: list[SentEntry] = []
+        lives: dict[Life, None] = {}
+        qos = picks[0][0].qos
         for place, (message, taken) in enumerate(picks):
-            queue = self._queues[message.topic_id]
-            if not message.started:
+            topic_id, offset = message.topic_id, message.offset
+            queue = self._queues[topic_id]
+            if not message.index:
                 message.begin, message.place = number, place
                 message.life.expires = message.expires
                 queue.started(now)
-            offset = message.offset
-            payload = message.payload[offset : offset + taken]
-            message.index += 1
-            message.offset += taken
+            payload = message.take(taken)
             last = not message.remaining
-            back = number - message.begin if offset else 0
-            parts.append(Part(message.topic_id, payload, back, offset, last, message.coded))
-            key = Key(self._boot, message.begin, message.place)
+            begin = message.begin
+            parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
+            key = Key(self._boot, begin, message.place)
             total = message.index if last else 0
-            sent.append(SentEntry(message.serial, message.topic_id, key, message.index - 1, total, message.repeat))
+            sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
+            lives[message.life] = None
+            qos = min(qos, message.qos, key=RANK.__getitem__)
+            self.stats.payload_bytes += taken
             if last:
                 queue.popleft()
                 self._left(message, queue, now)
         self._turns.sent(self._holder)
         self.stats.entries += len(picks)
-        self.stats.payload_bytes += sum([taken for _, taken in picks])
-        lives = tuple({id(message.life): message.life for message, _ in picks}.values())
-        ranks = [message.qos for message, _ in picks]
-        qos = min(ranks, key=lambda qos: RANK[qos])
-        return Filling(parts, sent, lives, qos, used)
+        return Filling(parts, sent, tuple(lives), qos, used)
 
     def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""

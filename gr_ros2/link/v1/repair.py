@@ -135,7 +135,7 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """All packets from the oldest live one on, by number."""
+        """All packets from the oldest live one on, by number and in this order."""
         self._oldest = 0
         """No older packet is recorded."""
         self.newest = 0
@@ -229,9 +229,10 @@ class RepairWindow:
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
-    def receivers(self) -> dict[int, tuple[float, float]]:
-        """The receivers that report: when each was last heard, and the share of packets that it lost."""
-        return {name: (peer.heard, peer.loss) for name, peer in self._receivers.items()}
+    @property
+    def reported(self) -> bool:
+        """Whether any receiver reports."""
+        return bool(self._receivers)
 
     def take_row(self, number: int) -> int | None:
         """A row that no standing packet at this number has used; None if all are used."""
@@ -298,11 +299,10 @@ class RepairWindow:
         """The packets to combine, newest first."""
         found: list[Sent] = []
         everybody = self._everybody
-        for number in range(self.newest, max(self._oldest, self.newest - self._span) - 1, -1):
-            record = self._records.get(number)
-            if record is None or (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
+        for record in reversed(self._records.values()):
+            if (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
                 continue
-            if found and found[0].number - number >= MAX_WINDOW:
+            if found and found[0].number - record.number >= MAX_WINDOW:
                 break
             found.append(record)
             if len(found) == GROUP:

@@ -9,6 +9,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, read_header
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 
@@ -287,3 +288,51 @@ def test_settings_out_of_range_are_refused() -> None:
         with pytest.raises(ConfigError):
             Settings(**{"src_id": 1, **wrong})
     assert body_room(Settings(1, packet_len=40).packet_len, sealed=True) >= 20
+
+
+def test_a_service_is_announced_while_it_is_offered() -> None:
+    rows = Registry.from_rows({"odom": "nav_msgs/Odometry", "add": "example_interfaces/srv/AddTwoInts"})
+    one, two = Robot(1, rows.with_calls()), Robot(2)
+    air = Air(one, two, loss=0.2)
+
+    def known() -> list[str]:
+        return [row.name for row in two.end.rows(1).values()]
+
+    air.run(3.0)
+    assert known() == ["odom"]
+    for _ in range(3):
+        one.end.offer(1, offered=True)
+        air.run(5.0, lambda: known() == ["odom", "add"])
+        assert known() == ["odom", "add"]
+        one.end.offer(1, offered=False)
+        air.run(5.0, lambda: known() == ["odom"])
+        assert known() == ["odom"]
+
+
+def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_then_also_that_it_is_over() -> None:
+    one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
+    air = Air(one, two)
+    air.run(2.0)
+    assert one.end.outbox.digest == 0
+    one.end.offer(0, offered=True)
+    air.run(1.0)
+    assert [row.name for row in two.end.rows(1).values()] == ["_calls"]
+    one.end.offer(0, offered=False)
+    air.run(1.0)
+    assert not two.end.rows(1)
+
+
+def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
+    one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
+    air = Air(one, two)
+    one.end.offer(0, offered=True)
+    air.run(1.0)
+    lose = [True]
+    air.lost = lambda *_: lose[0]
+    brief, long = text(1, 51), text(2, 51)  # a packet each: what shares one is repaired together
+    one.end.submit(0, brief, air.now, 0.5)
+    one.end.submit(0, long, air.now, 5.0)
+    air.run(1.0)
+    lose[0] = False
+    air.run(3.0)
+    assert two.delivered() == [long]

@@ -217,7 +217,7 @@ def test_a_report_of_what_was_never_sent_confirms_nothing() -> None:
     sender = window(count=3)
     sender.report(9, 4, (1 << 64) - 1, settled=True, loss=0.0, now=0.1)
     assert sender.unconfirmed(0.1)
-    assert not sender.receivers()
+    assert not sender.reported
 
 
 def test_a_thrifty_sender_is_silent_without_losses_and_without_doubt() -> None:
