@@ -21,7 +21,7 @@ from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.base import MessageCallback, Reliability
 from gr_ros2.race.contenders import ADDRESSES, Contender, cyclone_uri, zenoh_config
-from gr_ros2.race.links import DEPTH, SINK_DOMAIN, SOURCE_DOMAIN
+from gr_ros2.race.links import DEPTH, DOMAINS
 from gr_ros2.race.tun import INTERFACE
 
 _ROS_DEPTH = 10
@@ -142,7 +142,7 @@ def join(contender: Contender, receiving: bool) -> Network:
         config = zenoh_config(contender.settings["transport"], receiving)
         return ZenohNetwork(config, contender.reliable, contender.settings["congestion"])
     if contender.stack == "gr-ros2":  # the local graphs lose nothing; the radio is between them
-        return DdsNetwork(SINK_DOMAIN if receiving else SOURCE_DOMAIN, True, Qos("reliable", "volatile", DEPTH))
+        return DdsNetwork(DOMAINS[receiving], True, Qos("reliable", "volatile", DEPTH))
     os.environ["CYCLONEDDS_URI"] = cyclone_uri(ADDRESSES[not receiving], INTERFACE)
     reliability: Reliability = "reliable" if contender.reliable else "best_effort"
     return DdsNetwork(_DOMAIN, False, Qos(reliability, "volatile", _ROS_DEPTH))

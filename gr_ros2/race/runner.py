@@ -22,7 +22,6 @@ from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
     PHY_NAME,
-    PHY_OPTIONS,
     Condition,
     RaceRecording,
     RaceSettings,
@@ -94,7 +93,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
 
 
 def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
-    radio = RaceRadio(PHY_NAME, PHY_OPTIONS, condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)

@@ -23,6 +23,7 @@ from gr_ros2.link.freshness import TURN
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
+from gr_ros2.registry import Topic
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import Simulated, offered, simulate
@@ -185,7 +186,7 @@ class Planner:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        if not PHY.load(scenario.phy.name).has_samples:
+        if not PHY.load(scenario.phy.name).has_airtime:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
         if not scenario.simulated:
             # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
@@ -361,6 +362,9 @@ class _Remembering:
         self._codec = codec
         self._coded: dict[tuple[int, bytes], bytes] = {}
         self._decoded: dict[tuple[int, bytes], bytes] = {}
+
+    def add(self, topic: Topic) -> None:
+        self._codec.add(topic)
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         return self._codec.canonical(topic_id, payload)
