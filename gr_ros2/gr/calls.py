@@ -161,7 +161,7 @@ class LiveCalls:
             self._change(event.src_id, here=True)
 
     def _change(self, src_id: int, *, services: dict[int, Topic] | None = None, here: bool | None = None) -> None:
-        """A robot is heard or not any more, or announces other services: make and close servers accordingly."""
+        """Make and close servers after a robot was heard, has become silent, or has announced other services."""
         with self._changing:
             robot = self._robots.get(src_id)
             if robot is None or self._closed:

@@ -30,7 +30,7 @@ from gr_ros2.middleware.services import (
 )
 
 SERVICE_QOS = Qos("reliable", "volatile", 1000)
-"""As ROS has it, but for the depth (10 there), so that a burst of calls passes."""
+"""The QoS of services in ROS, except for the depth, which is 10 there. So a burst of calls passes."""
 ENCAPSULATION, HEADER = 4, 16
 _NAME = 8
 """Bytes that name a client."""

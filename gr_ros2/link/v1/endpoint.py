@@ -74,7 +74,7 @@ from gr_ros2.wire.v1 import (
 )
 
 FORCED = 20
-"""New packets after which a report that found no room is sent in a packet of its own: 5 % of the slots."""
+"""Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
 _POLL_S = 0.02
@@ -122,7 +122,7 @@ class Endpoint:
         sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
-        """Byte of a packet up to which its body is padded."""
+        """Number of bytes to which the packet with its padded body extends."""
         self._trailer = self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
         self.window = RepairWindow(
@@ -178,7 +178,7 @@ class Endpoint:
         self.outbox.submit(topic_id, payload, now, lifespan_s)
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
-        """Announce a service to the other robots, or no longer. At the start, services are not announced."""
+        """Start or stop announcing a service to the other robots. At the start, services are not announced."""
         if self.outbox.offer(topic_id, offered=offered):
             self.outbox.ask(TABLE_TOPIC, self._now)
             self._talk.hurry(self._now)

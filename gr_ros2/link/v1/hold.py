@@ -22,15 +22,15 @@ from dataclasses import dataclass
 from math import inf
 
 OVERLAP = 1 / 4
-"""Part of a packet's airtime by which a repair may delay a message: a repair fits if it almost fits."""
+"""Part of a packet's airtime by which a repair may delay a message."""
 HEADROOM = 1.5
-"""Repairs that are owed, over the number of packets that are expected to be lost."""
+"""Number of repairs that are owed, divided by the number of packets that are expected to be lost."""
 WAITED = 1 / 16
-"""Repairs owed per wait, whatever the losses."""
+"""Number of repairs owed per wait, independent of the losses."""
 _MOST_LOSS = 0.5
 _SMOOTHING = 1 / 8
 _STEADY = 1 / 4
-"""A topic is periodic if its intervals deviate by at most this part of their mean."""
+"""A topic is periodic if its intervals deviate from their mean by at most this part of it."""
 _FEW = 3
 """Number of intervals from which on a topic may be called periodic."""
 _MOST_SKIPPED = 1024
@@ -90,12 +90,12 @@ class Hold:
         """End of the first repair that was held back since the last packet left."""
         self._airtime = 0.0
         self._skipped = 0
-        """Repairs in a row that were let go because waiting does not help."""
+        """Number of consecutive repairs that left without waiting, because waiting does not help."""
         self._skip = 0
-        """Number of repairs to let go so before the next one waits."""
+        """Number of repairs that leave without waiting before the next one waits."""
 
     def submitted(self, topic_id: int, now: float) -> None:
-        """A message of a topic comes."""
+        """Note that a message of a topic has come."""
         period = self._periods.get(topic_id)
         if period is None:
             self._periods[topic_id] = Period(now)
@@ -104,7 +104,7 @@ class Hold:
         self._soonest = None
 
     def left(self, now: float, loss: float) -> None:
-        """A new packet leaves.
+        """Note that a new packet leaves.
 
         :param loss: share of packets lost, as far as it is known or expected
         """
@@ -123,7 +123,7 @@ class Hold:
             self._ended(0.0)
 
     def until(self, now: float, end: float, airtime: float) -> float:
-        """Until when a repair waits that could leave now; ``now`` if it need not wait.
+        """Time until which a repair waits that could leave now; ``now`` if it does not have to wait.
 
         :param end: when it would be over
         :param airtime: of a packet, 0 if unknown
@@ -142,7 +142,7 @@ class Hold:
         return max(now, min(until, self._would_end + airtime))
 
     def _ended(self, gained: float) -> None:
-        """A wait is over. It gained this many s for a message."""
+        """Note that a wait is over, and how many s a message gained by it."""
         self._would_end = inf
         self._skipped = 0
         self._skip = 0 if gained > _GAIN * self._airtime else min(4 * self._skip + 4, _MOST_SKIPPED)

@@ -112,7 +112,7 @@ class Repair(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Receiver:
-    """What the reports of one receiver have told."""
+    """What is known from the reports of one receiver."""
 
     bit: int
     heard: float
@@ -120,7 +120,7 @@ class Receiver:
     newest: int = -1
     interval: float = 0.0
     waits: bool = False
-    """Whether it waits for a packet that is not alive any more. A repair tells it so."""
+    """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     """Times in s from the departure of packets that were sent once to the report that covers them."""
@@ -173,7 +173,7 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """All packets from the oldest live one on, by number and in this order."""
+        """All packets from the oldest one that can still be repaired, by number and in this order."""
         self._oldest = 0
         """No older packet is recorded."""
         self.newest = 0

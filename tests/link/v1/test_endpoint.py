@@ -374,3 +374,20 @@ def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
     lose[0] = False
     air.run(3.0)
     assert two.delivered() == [long]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
+    air = Air(one, two)
+    for number in range(20):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(4.0, lambda: text(number) in two.delivered())  # noqa: B023 - called at once
+        two.start()  # before it has reported
+        air.run(0.5)
+    delivered = two.delivered()
+    assert delivered == sorted(set(delivered), key=lambda payload: int(payload.split()[1]))
+    one.end.submit(ODOM, text(20), air.now)
+    air.run(1.0)
+    assert two.delivered()[-1] == text(20)
+    assert len(delivered) >= 15
