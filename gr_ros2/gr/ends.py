@@ -186,9 +186,7 @@ def start_of(
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
     file = BootFile(path, time.time())
-    # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
-    heard, save = (file.heard, file.save) if config.key else ({}, None)
-    return Start(file.boot, keys, heard, save, reports, half_duplex, any_length)
+    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length)
 
 
 def state_folder() -> Path:

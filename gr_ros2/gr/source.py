@@ -122,14 +122,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         namespace, words = self.config.namespace, self.config.topics
         chosen = self.registry.chosen(words) if self.registry else []
         self.subscribed = {topic.on_graph(namespace): topic for topic in chosen if topic.is_topic}
-        """Topic by its absolute name on the ROS graph; replaced as a whole when a topic is added."""
+        """Topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic is added."""
         self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
         """The same for the services that other robots may call."""
         self.choice = TopicChoice(() if self.registry else words, namespace)
         """The topics that are looked for on the ROS graph."""
         self._left_out: set[str] = set()
         self._full = False
-        """Whether a topic was not sent because there are too many. This is said of the first one only."""
+        """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)

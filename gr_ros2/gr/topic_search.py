@@ -1,4 +1,4 @@
-"""Looks at the topics of a ROS graph again and again, for a source that sends topics which no registry names.
+"""Looks at the topics of a ROS graph periodically, for a source that sends topics which no registry names.
 
 Invariant: one thread, which ends when it is closed, when its graph is closed, or with the process.
 """
@@ -17,12 +17,12 @@ LOOK_S = 0.2
 """s between two looks, at least. Messages that are published before the next look are missed, unless their publisher
 keeps them."""
 _SHARE = 0.05
-"""Largest share of time spent looking: rclpy asks for every topic separately."""
+"""Largest share of time that may be spent looking. rclpy asks for every topic separately."""
 _log = logging.getLogger(__name__)
 
 
 class TopicSearch:
-    """Calls back with the topics of a graph, at once and then every ``LOOK_S``.
+    """Calls a function with the topics of a graph, at once and then every ``LOOK_S`` seconds.
 
     :param found: called with all topics that are there, without those of this participant; must not raise
     """
@@ -35,7 +35,7 @@ class TopicSearch:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking. No call back begins after this has returned."""
+        """Stop looking. No callback begins after this has returned."""
         self._closed.set()
         if self._thread is not threading.current_thread():
             self._thread.join()

@@ -1,4 +1,4 @@
-"""Topics that a link waits for because nobody publishes them, and the topics that are published instead.
+"""Topics that a link waits for because there is no publisher, and the topics that are published instead.
 
 Invariant: a line is returned only if it has changed. A look changes nothing on the graph.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 ALL_THERE = "every topic has a publisher"
 _SHOWN = 6
-"""Largest number of topics that a line names. Of further topics it tells only the number."""
+"""Largest number of topics that a line names. Further topics are only counted."""
 
 
 class Waiting:

@@ -122,8 +122,6 @@ class Direwolves:
                         cwd=home,
                     )
                 )
-        for port in self.kiss:
-            wait_for(lambda: self._listens(port), f"direwolf at port {port}: {self.log()}")  # noqa: B023
 
     def log(self) -> str:
         return "\n".join(path.read_text(errors="replace") for path in self._logs)
@@ -146,11 +144,21 @@ class Direwolves:
         os.close(descriptor)
 
     def __enter__(self) -> Direwolves:
+        try:
+            for port in self.kiss:
+                wait_for(lambda: self._listens(port), f"direwolf at port {port}")  # noqa: B023 - called at once
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End both, and the audio between them."""
         for program in self._programs:
             program.terminate()
         for program in self._programs:

@@ -229,7 +229,7 @@ class Inbox:
 
     @property
     def report_helps(self) -> bool:
-        """Whether a report that is not due yet is worth a slot that nothing else needs: losses are noticed sooner."""
+        """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
         return self._unreported > 0 and self.loss >= PROMPT and not self._settings.half_duplex
 
     def report(self, now: float) -> Report:

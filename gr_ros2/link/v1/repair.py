@@ -27,7 +27,7 @@ coefficients; no live packet is more than ``span`` numbers old.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
@@ -112,7 +112,7 @@ class Repair(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Receiver:
-    """What the reports of one receiver have told."""
+    """What is known from the reports of one receiver."""
 
     bit: int
     heard: float
@@ -120,7 +120,7 @@ class Receiver:
     newest: int = -1
     interval: float = 0.0
     waits: bool = False
-    """Whether it waits for a packet that is not alive any more. A repair tells it so."""
+    """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     """Times in s from the departure of packets that were sent once to the report that covers them."""
@@ -152,6 +152,10 @@ class Receiver:
         return 1 / (2 - self.loss) if self.prompt else max(self.loss, 0.5)
 
 
+def _never(_now: float) -> bool:
+    return False
+
+
 class RepairWindow:
     """The source packets of one sender that are still worth repairing.
 
@@ -169,13 +173,15 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """All packets from the oldest live one on, by number and in this order."""
+        """All packets from the oldest one that can still be repaired, by number and in this order."""
         self._oldest = 0
         """No older packet is recorded."""
         self.newest = 0
         """Number of the last source packet; 0 before the first."""
         self._receivers: dict[int, Receiver] = {}
         self._everybody = 0
+        self.loss = expected_loss
+        """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
         """Negated numbers of the packets that the only receiver lacks."""
         self._rows: dict[int, int] = {}
@@ -221,6 +227,7 @@ class RepairWindow:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
             peer = self._receivers[receiver] = Receiver(1 << free, now)
             self._everybody |= peer.bit
+            self.loss = self._worst()
         return peer
 
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
@@ -237,6 +244,7 @@ class RepairWindow:
         gap = now - peer.heard
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
+        self.loss = self._worst()
         sent_at = self._times.get(number)
         if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
@@ -271,6 +279,7 @@ class RepairWindow:
         peer = self._receivers.pop(receiver, None)
         if peer is not None:
             self._everybody &= ~peer.bit
+            self.loss = self._worst()
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
@@ -299,8 +308,15 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def next(self, now: float) -> Sent | Repair | None:
-        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing."""
+    def _worst(self) -> float:
+        return max((peer.loss for peer in self._receivers.values()), default=self._expected)
+
+    def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
+        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
+
+        :param held: whether a combination has to wait, at this time in s; only asked if there is one. One that has a
+            packet in it that is known to be lost does not wait
+        """
         slots = self._slots
         slots[0] *= _DECAY
         slots[1] = slots[1] * _DECAY + 1
@@ -315,7 +331,14 @@ class RepairWindow:
         window = self._window(now)
         if not window or (self.mode == "thrifty" and not self._worth(window, now)):
             return None
+        if held(now) and not self._named(window):
+            slots[1] -= 1  # repair cannot use this slot
+            return None
         return self._combination(window, now)
+
+    def _named(self, window: list[Sent]) -> bool:
+        """Whether a report names a packet of this window that is lost."""
+        return any(record.number in peer.lost for peer in self._receivers.values() if peer.lost for record in window)
 
     def next_doubt(self, now: float) -> float:
         """When a report about one of the newest packets, or about a repair, is overdue next (thrifty), s; inf if none
@@ -380,7 +403,7 @@ class RepairWindow:
 
     def _shrunk(self, window: list[Sent]) -> list[Sent]:
         """The window, or a part of it if idle slots cannot make up for the losses."""
-        loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+        loss = self.loss
         new, idle = self._slots
         need = loss / (1 - loss) * new if loss < 1 else inf
         if need <= idle:

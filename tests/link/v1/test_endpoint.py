@@ -360,6 +360,15 @@ def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_
     assert not two.end.rows(1)
 
 
+def test_a_service_that_is_there_from_the_start_is_announced_though_packets_are_lost() -> None:
+    for seed in range(5):
+        one, two = Robot(1, Registry.from_rows({"add": "example_interfaces/srv/AddTwoInts"}).with_calls()), Robot(2)
+        one.end.offer(0, offered=True)
+        air = Air(one, two, loss=0.5, seed=seed)
+        air.run(10.0, lambda: bool(two.end.rows(1)))  # noqa: B023 - called at once
+        assert [row.name for row in two.end.rows(1).values()] == ["add"]
+
+
 def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
     one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
     air = Air(one, two)
@@ -374,3 +383,20 @@ def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
     lose[0] = False
     air.run(3.0)
     assert two.delivered() == [long]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
+    air = Air(one, two)
+    for number in range(20):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(4.0, lambda: text(number) in two.delivered())  # noqa: B023 - called at once
+        two.start()  # before it has reported
+        air.run(0.5)
+    delivered = two.delivered()
+    assert delivered == sorted(set(delivered), key=lambda payload: int(payload.split()[1]))
+    one.end.submit(ODOM, text(20), air.now)
+    air.run(1.0)
+    assert two.delivered()[-1] == text(20)
+    assert len(delivered) >= 15
