@@ -21,6 +21,7 @@ from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
 from gr_ros2.old_names import new_name
 from gr_ros2.setting import AUTO
+from gr_ros2.topic_choice import TopicChoice
 from gr_ros2.wire import FORMATS, TableRow
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
@@ -127,6 +128,12 @@ class Topic:
         return is_service(self.type_name)
 
     @property
+    def of_node(self) -> bool:
+        """Whether this row names a service that nodes have, below the name of its node."""
+        word = self.name.rpartition("/")[2]
+        return any(services.get(word) == self.type_name for services in _OF_NODES.values())
+
+    @property
     def is_topic(self) -> bool:
         """Whether this row names a topic: neither a service nor the row of requests and replies."""
         return self.type_name != CALLS_TYPE and not self.is_service
@@ -214,6 +221,19 @@ class Registry(Sequence[Topic]):
                 f"topic {name!r} is not in the registry; it has {', '.join(topic.name for topic in self)}"
             ) from None
 
+    def chosen(self, words: Sequence[str]) -> list[Topic]:
+        """The rows that the setting ``topics`` chooses, with or without leading slash; all rows if there is no word.
+
+        :raises ConfigError: for a name that is not in the registry
+        """
+        if not words:
+            return list(self)
+        choice = TopicChoice([word.replace("/", "", word.startswith(("/", "-/"))) for word in words], "")
+        for name in choice.named.values():
+            self.named(name)
+        taken = set(choice.of(topic.name.lstrip("/") for topic in self))
+        return [topic for topic in self if topic.name.lstrip("/") in taken]
+
     def with_options(self, options: Mapping[str, TopicOptions]) -> Registry:
         """The same rows, with configured options instead of the registry's own. Only settings that differ from the
         default replace the registry's.
@@ -259,15 +279,17 @@ def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
     """
     if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
         raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
-    known = {name.lstrip("/"): value for name, value in options.items()}.get(row.name.lstrip("/"), DEFAULT_OPTIONS)
-    said = {
-        "durability": "transient_local" if row.latched else "volatile",
-        "depth": row.depth or None,
-    }
-    chosen = {name: value for name, value in said.items() if getattr(known, name) is None}
+    known = options_of(row.name, options)
+    said = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
+    chosen = {name: value for name, value in said.items() if getattr(known, name) == AUTO}
     merged = build(TopicOptions, {**asdict(known), **chosen})
     special = row.type_name == CALLS_TYPE or is_service(row.type_name)
     return Topic(row.topic_id, row.name, row.type_name if special else normalize_type(row.type_name), merged)
+
+
+def options_of(name: str, options: Mapping[str, TopicOptions]) -> TopicOptions:
+    """The configured options of a topic that is in no registry, with or without leading slash."""
+    return {other.lstrip("/"): value for other, value in options.items()}.get(name.lstrip("/"), DEFAULT_OPTIONS)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:

@@ -21,6 +21,7 @@ from fuzz.loop import Harness, inputs, run, within
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+import fuzz.framing
 import fuzz.kernels
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +33,7 @@ HARNESSES = {
     "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
+    "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
 }
 COUNTS = {
@@ -43,6 +45,7 @@ COUNTS = {
     "compression": 2_000,
     "control_socket": 1_000,
     "dashboard": 300,
+    "framing": 1_000,
     "kernels": 400,
 }
 if find_spec("bokeh") is not None:

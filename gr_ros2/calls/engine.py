@@ -58,7 +58,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """A frame to be sent. It is of no use after ``lifespan_s``; infinite without limit."""
+    """A frame to be sent. It is useless after ``lifespan_s`` seconds; infinity means that there is no limit."""
 
     data: bytes
     lifespan_s: float
@@ -158,7 +158,7 @@ class Calls:
         return Outgoing(write_frame(frame), deadline_s or inf)
 
     def withdrawn(self, robot: int, service_ids: Iterable[int]) -> None:
-        """Services of a robot are there no more: no call of them will be answered."""
+        """A robot no longer has these services. Calls of them will not be answered."""
         gone = frozenset(service_ids)
         self._give_up(lambda service: service.robot == robot and service.service_id in gone)
 
@@ -200,7 +200,7 @@ class Calls:
         return self._request(sender, frame, offers, now) if frame.is_request else self._answer(sender, frame)
 
     def started(self, robot: int, boot: int) -> None:
-        """A start of a robot is heard: its earlier starts neither answer nor wait for an answer."""
+        """Note that a robot has started. Its earlier starts neither answer nor wait for an answer."""
         self._give_up(lambda service: service.robot == robot and service.boot != boot)
         for ticket in [key for key, call in self._served.items() if call.robot == robot and call.boot != boot]:
             self.counters[f"caller_gone:{self._served.pop(ticket).name}"] += 1

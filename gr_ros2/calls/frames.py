@@ -11,7 +11,7 @@ from struct import Struct
 from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError
 
 NO_DEADLINE = 0.0
-"""s; of a call that waits for its reply without limit."""
+"""Deadline, in s, of a call that waits for its reply without limit."""
 MAX_DEADLINE_S = 6553.5
 """The longest deadline that a request can carry."""
 

@@ -161,7 +161,7 @@ class LiveCalls:
             self._change(event.src_id, here=True)
 
     def _change(self, src_id: int, *, services: dict[int, Topic] | None = None, here: bool | None = None) -> None:
-        """A robot is heard or not any more, or announces other services: make and close servers accordingly."""
+        """Make and close servers after a robot was heard, has become silent, or has announced other services."""
         with self._changing:
             robot = self._robots.get(src_id)
             if robot is None or self._closed:
@@ -188,11 +188,12 @@ class LiveCalls:
         """Make a server of ours for a service of another robot."""
         name = self._name(src_id, topic)
         try:
-            LOOP_GUARD.check_output(self._sink.graph, name)
+            LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
             graph = _with_services(self._sink.middleware, name)
-            self._servers[src_id, topic.topic_id] = graph.serve(
-                name, topic.type_name, partial(self._request, src_id, topic)
-            )
+            taker = partial(self._request, src_id, topic)
+            # ros2 param and ros2 lifecycle look for the node before they call its services.
+            node = name.rpartition("/")[0] if topic.of_node else ""
+            self._servers[src_id, topic.topic_id] = graph.serve(name, topic.type_name, taker, node)
         except GrRos2Error as error:
             self._tell_first(f"not_served:{name}", error)
 

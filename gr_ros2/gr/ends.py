@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from math import inf
 from pathlib import Path
@@ -31,7 +32,7 @@ from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import Auto
-from gr_ros2.wire import BROADCAST, TableRow
+from gr_ros2.wire import BROADCAST
 
 _T = TypeVar("_T")
 
@@ -148,24 +149,21 @@ def make_endpoint(
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or Start()
     dictionaries = () if sink is None else sink.dictionaries
+    if codec is None:
+        from gr_ros2.compression import LinkCodec
+
+        known = LinkCodec((), dictionaries)
     return EndpointV1(
         None if source is None or not rows else rows,
         settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
-        decoder_for=lambda rows: codec or announced_codec(rows, dictionaries),
+        decoder_for=lambda rows: codec or known.of(Topic(row.topic_id, row.name, row.type_name) for row in rows),
         heard=start.heard,
         save=start.save,
         observer=observer,
     )
-
-
-def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> MessageCodec:
-    """The codec that decodes the messages of a robot that announced these topics."""
-    from gr_ros2.compression import LinkCodec
-
-    return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
 
 
 def start_of(
@@ -192,9 +190,7 @@ def start_of(
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
     file = BootFile(path, time.time())
-    # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
-    heard, save = (file.heard, file.save) if config.key else ({}, None)
-    return Start(file.boot, keys, heard, save, reports, half_duplex, any_length)
+    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length)
 
 
 def state_folder() -> Path:
@@ -297,6 +293,8 @@ class LoopGuard:
         self._lock = threading.Lock()
         self._sources: weakref.WeakKeyDictionary[Any, tuple[Graph, frozenset[str]]] = weakref.WeakKeyDictionary()
         self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
+        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Graph, set[str]]] = weakref.WeakKeyDictionary()
+        """Topics that senders have announced, under the names that sinks give them."""
 
     def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
         """:raises ConfigError: for a loop with an existing sink"""
@@ -315,10 +313,10 @@ class LoopGuard:
                     check_loop(names, config, registry)
             self._sinks[block] = (graph, config, registry)
 
-    def check_output(self, graph: Graph, name: str) -> None:
-        """Refuse a topic that a sink is about to publish, if a source on the same graph subscribes to it.
+    def add_output(self, block: Any, graph: Graph, name: str) -> None:
+        """Note a topic that a sink is about to publish because a sender has announced it.
 
-        :raises ConfigError: for a loop
+        :raises ConfigError: for a loop: a source on the same graph subscribes to it
         """
         with self._lock:
             for other, names in self._sources.values():
@@ -327,12 +325,37 @@ class LoopGuard:
                         f"loop: the sink would publish {name}, which a source on the same graph subscribes; change "
                         "namespace_format, publish_as or domain_id"
                     )
+            self._outputs.setdefault(block, (graph, set()))[1].add(name)
+
+    def returns(self, graph: Graph, name: str) -> bool:
+        """Whether a topic of a graph has come by radio: a sink publishes it, or one of another process may do so."""
+        with self._lock:
+            sinks = [(config, registry) for other, config, registry in self._sinks.values() if graph.same_as(other)]
+            if any(name in names for other, names in self._outputs.values() if graph.same_as(other)):
+                return True
+        formats = {config.namespace_format for config, _ in sinks} | {SinkConfig().namespace_format}
+        if any(_made_by(form, name) for form in formats):
+            return True
+        try:
+            for config, registry in sinks:
+                check_loop((name,), config, registry)
+        except ConfigError:
+            return True
+        return False
 
     def remove(self, block: Any) -> None:
         """Remove a block that has left its graph."""
         with self._lock:
             self._sources.pop(block, None)
             self._sinks.pop(block, None)
+            self._outputs.pop(block, None)
+
+
+def _made_by(namespace_format: str, name: str) -> bool:
+    """Whether a topic is in the namespace that a sink gives to some sender. A format that all senders share does not
+    tell."""
+    parts = [re.escape(part) for part in namespace_format.strip("/").split("{src_id}")]
+    return len(parts) > 1 and re.match(f"/{'[0-9]+'.join(parts)}/", name) is not None
 
 
 LOOP_GUARD = LoopGuard()

@@ -339,7 +339,7 @@ class DiscoveredEndpoint:
 
 
 def _discovered(data: Any) -> DiscoveredEndpoint:
-    """What a ``_BuiltinEndpoint`` says."""
+    """The content of a ``_BuiltinEndpoint``."""
     key = bytes(data.key)
     topic, type_name = data.topic_name.decode(errors="replace"), data.type_name.decode(errors="replace")
     qos, user_data = _read_qos(data.qos, key), _read_user_data(data.qos)

@@ -56,7 +56,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         phy.check_channel(self.channel)
         self._throttled = throttled
         last = source
-        if phy.has_samples and throttled:
+        if throttled and phy.has_airtime:
             airtime_of = phy.airtime if phy.any_length else None
             self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)

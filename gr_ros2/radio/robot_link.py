@@ -27,6 +27,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.radio import Radio
+from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO, Auto
 
 _log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class RobotLink(Flowgraph):
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
-        self.registry = config.load_registry()
+        self._registry = config.load_registry()
         self._clock = clock
         self._started: float | None = None
         self._instrumented = instrumented
@@ -98,7 +99,7 @@ class RobotLink(Flowgraph):
     def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
         """Both directions share one endpoint, so that received packets can change what is sent."""
         both = RosLink(
-            self.registry,
+            self._registry,
             self.config.ros_source,
             self._sink_config(),
             middleware=graphs,
@@ -117,9 +118,10 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        self.source = RosSource(self.registry, middleware=graphs[0], any_length=self.phy.any_length, **common, **source)
+        any_length = self.phy.any_length
+        self.source = RosSource(self._registry, middleware=graphs[0], any_length=any_length, **common, **source)
         self._stack.callback(self.source.close)
-        self.sink = RosSink(self.registry, middleware=graphs[1], **common, **sink)
+        self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
         self.msg_connect(self.source, "pdus", self.radio, "pdus")
         self.msg_connect(self.radio, "credit", self.source, "credit")
@@ -129,6 +131,11 @@ class RobotLink(Flowgraph):
     def node_name(self) -> str:
         """The node name that ``ros2 node list`` shows."""
         return f"gr_ros2_link_{self.config.ros_source.src_id()}"
+
+    @property
+    def registry(self) -> Registry:
+        """The topics that are sent; it grows if they are looked for on the ROS graph."""
+        return self.source.registry
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
         """The participants of source and sink: one for both if they are on the same graph."""

@@ -96,6 +96,11 @@ class Packet(NamedTuple):
     compressed: bool = False
     encrypted: bool = False
 
+    @property
+    def numbered(self) -> bool:
+        """Every packet has a number of its own."""
+        return True
+
 
 def crc16(data: bytes) -> int:
     """CRC-16 of section 5.2: polynomial 0x1021, init 0, not reflected, no final xor."""
@@ -160,8 +165,8 @@ class FormatV0:
         """Bytes of header, topic ids, entries and CRC. L_pad of section 5.3 is ``packet_len`` minus this number."""
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
-    def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """The fields of a packet, in the order of its bytes."""
+    def layout(self, packet: Packet, packet_len: int, size: int | None = None) -> list[Span]:  # noqa: ARG002
+        """The fields of a packet, in the order of its bytes. All packets have ``packet_len`` bytes."""
         entries = packet.entries
         pad = packet_len - self.packed_len([len(entry.payload) for entry in entries])
         return [
@@ -192,19 +197,14 @@ class FormatV0:
         flags = packet.qos << _QOS_SHIFT | packet.compressed << 1 | packet.encrypted
         try:
             header = _header.pack(flags, packet.src_id, packet.dst_id, packet.seq, packet.hop << 4 | count)
-            parts = [header, b""]
-            topic_ids = 0
+            parts = [header, _pack_topic_ids(entries)]
             for entry in entries:
                 if not 0 <= entry.index < entry.total <= _MAX_TOTAL:
                     raise EncodeError(f"index {entry.index} of total {entry.total}; index < total <= {_MAX_TOTAL}")
-                if not 0 <= entry.topic_id <= 15:
-                    raise EncodeError(f"topic id {entry.topic_id} is not in 0..15")
-                topic_ids = topic_ids << 4 | entry.topic_id
                 parts.append(_entry_header.pack(entry.entry_id, entry.index, entry.total, len(entry.payload)))
                 parts.append(entry.payload)
         except struct_error as error:
             raise EncodeError(f"a field of {packet} is out of range ({error})") from error
-        parts[1] = (topic_ids << 4 * (count & 1)).to_bytes((count + 1) // 2, "big")
         body = b"".join(parts)
         room = packet_len - _CRC_LEN
         if len(body) > room:
@@ -266,3 +266,12 @@ class FormatV0:
 
 
 V0 = FormatV0()
+
+
+def _pack_topic_ids(entries: tuple[Entry, ...]) -> bytes:
+    ids = [entry.topic_id for entry in entries]
+    if min(ids) < 0 or max(ids) > 15:
+        raise EncodeError(f"topic ids {ids} are not all in 0..15")
+    if len(ids) % 2:
+        ids.append(0)
+    return bytes([high << 4 | low for high, low in zip(ids[::2], ids[1::2], strict=True)])

@@ -40,7 +40,7 @@ SWEEP: dict[str, Any] = {
     "list": [{"phy.name": "ofdm", "phy.options": {}}, {"phy.name": "gfsk", "phy.options": {}}],
 }
 
-OTHERS = {"rviz2", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
+OTHERS = {"rviz2", "direwolf", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
@@ -58,6 +58,14 @@ ONLY_PARSED = {
     ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
     ("docs/tutorial.md", "gr-ros2 registry from-graph --namespace /robot_1 --out topics.csv"): "needs a robot",
     ("docs/tutorial.md", "gr-ros2 registry check topics.csv"): "the same",
+    (
+        "docs/how-to/radios.md",
+        "gr-ros2 link --robot 1 --radio kiss --device tcp://localhost:8001 --set front_end.callsign=N0CALL-1",
+    ): "direwolf is not running",
+    (
+        "docs/how-to/radios.md",
+        "gr-ros2 link --robot 1 --radio serial --device /dev/ttyUSB0 --set phy.options.bit_rate=64000",
+    ): "no such device",
 }
 """Commands that a test cannot run as they stand: why. They are parsed like the others."""
 SHORTER = {

@@ -101,7 +101,7 @@ class Program:
     @property
     def there(self) -> bool:
         """Whether a client has found a server."""
-        return self.heard("server")[-1:] == [[1]]
+        return self.heard("servers")[-1:] not in ([], [[0]])
 
     def call(self, number: int) -> None:
         """Have a client ask for ``number`` + 1000."""

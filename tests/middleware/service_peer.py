@@ -3,8 +3,8 @@
 Laid out as rmw_cyclonedds has it, by the typed Python API of Cyclone DDS, which shares no code with ours: 8 bytes of
 client and a number before the message, ``serviceid=`` and ``clientid=`` in the user data.
 
-A server says ``took A`` of each request and replies A + B. A client says ``server 1`` or ``server 0`` when that
-changes, takes lines ``A B``, and says ``got NUMBER SUM``. Both say ``ready`` and end with their input.
+A server says ``took A`` of each request and replies A + B. A client says ``servers N`` when their number has
+changed, takes lines ``A B``, and says ``got NUMBER SUM``. Both say ``ready`` and end with their input.
 """
 
 from __future__ import annotations
@@ -76,15 +76,15 @@ def main(domain: str, service: str, role: str) -> None:
     own = uuid.uuid4().int >> 64
 
     def look() -> None:
-        there = False
+        there = 0
         while not over.wait(PERIOD_S):
             if role == "server":
                 serve(reader, writer)
                 continue
-            now = bool(reader.get_matched_publications() and writer.get_matched_subscriptions())
+            now = min(len(reader.get_matched_publications()), len(writer.get_matched_subscriptions()))
             if now != there:
                 there = now
-                say("server", int(there))
+                say("servers", there)
             for reply in reader.take(100):
                 if isinstance(reply, AddReply) and reply.guid == own:
                     say("got", f"{reply.seq} {reply.sum}")

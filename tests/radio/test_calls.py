@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,55 +18,16 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.registry import Registry
-from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller
+from tests.radio.calling_robots import Robots
 from tests.waiting import wait_for
 
 NEAR, FAR = "/rx_robot_2/add", "/robot_2/add"
 
 
-class Robots:
-    """Two robots; the second has a service. ``graphs`` are those of their programs."""
-
-    def __init__(self, folder: Path, **channel: Any) -> None:
-        self._folder, self._channel = folder, channel
-        self._domains = free_domains(2)
-        (folder / "services.csv").write_text(f"add,{ADD}\n")
-        self.stack = ExitStack()
-        self.graphs = [self.stack.enter_context(MemoryMiddleware(domain_id=domain)) for domain in self._domains]
-        self.links: dict[int, RobotLink] = {}
-        for number in (1, 2):
-            self.start(number)
-        self.stack.callback(lambda: [link.stop() for link in self.links.values()])
-
-    def start(self, number: int, **values: Any) -> None:
-        own, other = (f"ipc://{self._folder}/{robot}" for robot in (number, 3 - number))
-        graph = {"middleware": "memory", "domain_id": self._domains[number - 1]}
-        settings: dict[str, Any] = {
-            "registry": str(self._folder / "services.csv") if number == 2 else "",
-            "packet_len": 64,
-            "phy": {"name": "ofdm", "sample_rate": 4e5},
-            "front_end": {"name": "zmq", "bind": own, "connect": [other]},
-            "channel": {"seed": number, **self._channel},
-            "state": str(self._folder / f"state-{number}"),
-            "ros_source": {"namespace": f"/robot_{number}", **graph},
-            "ros_sink": graph,
-        }
-        link = self.links[number] = RobotLink(link_from({**settings, **values}))
-        link.start()
-
-    def restart(self, number: int) -> None:
-        self.links[number].stop()
-        self.start(number)
-
-    def counted(self, number: int) -> dict[str, int]:
-        found: dict[str, int] = self.links[number].stats()["calls"]["counters"]
-        return found
-
-
 @pytest.fixture
 def robots(tmp_path: Path) -> Iterator[Robots]:
-    robots = Robots(tmp_path, packet_loss=0.2)
+    robots = Robots(tmp_path, f"add,{ADD}", packet_loss=0.2)
     with robots.stack:
         yield robots
 
@@ -142,6 +102,24 @@ def test_calls_that_the_server_leaves_open_end_by_name(robots: Robots) -> None:
     wait_for(lambda: robots.counted(1).get(f"timed_out:{NEAR}"), "the call to time out")
     wait_for(lambda: robots.counted(2).get(f"unanswered:{FAR}"), "the other end to give it up")
     assert len(taken) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_the_parameters_of_a_node_are_set_across_the_link(tmp_path: Path) -> None:
+    robots = Robots(tmp_path, "planner,parameters", packet_loss=0.2)
+    asked, answers = b"\0\1\0\0a request of SetParameters", []
+    with robots.stack:
+        near, far = "/rx_robot_2/planner/set_parameters", "/robot_2/planner/set_parameters"
+        kind = "rcl_interfaces/srv/SetParameters"
+        there: list[bool] = []
+        server = robots.graphs[1].serve(far, kind, lambda client, data: server.reply(client, data + b" and its reply"))
+        client = robots.graphs[0].client(near, kind, lambda *answer: answers.append(answer), there.append)
+        wait_for(lambda: there, "the service to appear")
+        assert robots.links[1].stats()["calls"]["reached"] == [near]  # the other five have no server
+        client.call(3, asked)
+        wait_for(lambda: answers, "the reply")
+        assert answers == [(3, asked + b" and its reply")]
 
 
 def _memory(robots: Robots, number: int) -> dict[str, Any]:
