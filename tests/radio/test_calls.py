@@ -104,6 +104,24 @@ def test_calls_that_the_server_leaves_open_end_by_name(robots: Robots) -> None:
     assert len(taken) == 2
 
 
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_the_parameters_of_a_node_are_set_across_the_link(tmp_path: Path) -> None:
+    robots = Robots(tmp_path, "planner,parameters", packet_loss=0.2)
+    asked, answers = b"\0\1\0\0a request of SetParameters", []
+    with robots.stack:
+        near, far = "/rx_robot_2/planner/set_parameters", "/robot_2/planner/set_parameters"
+        kind = "rcl_interfaces/srv/SetParameters"
+        there: list[bool] = []
+        server = robots.graphs[1].serve(far, kind, lambda client, data: server.reply(client, data + b" and its reply"))
+        client = robots.graphs[0].client(near, kind, lambda *answer: answers.append(answer), there.append)
+        wait_for(lambda: there, "the service to appear")
+        assert robots.links[1].stats()["calls"]["reached"] == [near]  # the other five have no server
+        client.call(3, asked)
+        wait_for(lambda: answers, "the reply")
+        assert answers == [(3, asked + b" and its reply")]
+
+
 def _memory(robots: Robots, number: int) -> dict[str, Any]:
     return {"middleware": "memory", "domain_id": robots.graphs[number - 1].domain_id}
 

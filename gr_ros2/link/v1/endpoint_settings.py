@@ -65,7 +65,7 @@ class Settings:
     flush_timeout_s: float = 0.0
     packet_rate: float | Auto = AUTO
     queue_depth: int = 100
-    depth: int = 16
+    depth: int = 48
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:

@@ -360,6 +360,15 @@ def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_
     assert not two.end.rows(1)
 
 
+def test_a_service_that_is_there_from_the_start_is_announced_though_packets_are_lost() -> None:
+    for seed in range(5):
+        one, two = Robot(1, Registry.from_rows({"add": "example_interfaces/srv/AddTwoInts"}).with_calls()), Robot(2)
+        one.end.offer(0, offered=True)
+        air = Air(one, two, loss=0.5, seed=seed)
+        air.run(10.0, lambda: bool(two.end.rows(1)))  # noqa: B023 - called at once
+        assert [row.name for row in two.end.rows(1).values()] == ["add"]
+
+
 def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
     one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
     air = Air(one, two)
