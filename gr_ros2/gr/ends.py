@@ -23,6 +23,7 @@ from gr_ros2.keys import read_key_file
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.rate import Rung
 from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.neighbours import Save
@@ -94,6 +95,7 @@ class Start:
     :param reports: whether the robots from which it receives can also receive from it
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
+    :param ladder: the rungs of an adaptive rate, see :attr:`gr_ros2.phy.Phy.ladder`; () for a fixed rate
     """
 
     boot: int = 1
@@ -103,6 +105,7 @@ class Start:
     reports: bool = False
     half_duplex: bool = False
     any_length: bool = False
+    ladder: Sequence[Rung] = ()
 
 
 def make_endpoint(
@@ -142,6 +145,7 @@ def make_endpoint(
         heard=start.heard,
         save=start.save,
         observer=observer,
+        ladder=start.ladder,
     )
 
 

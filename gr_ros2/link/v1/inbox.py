@@ -27,7 +27,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, SPAN
-from gr_ros2.wire.control import Control, Report
+from gr_ros2.wire.control import REPORT_LEN, Control, Report, reportable
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table
 from gr_ros2.wire.v1 import TABLE_TOPIC, Entry, Part, read_body
@@ -40,6 +40,8 @@ _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
 _REPORT_S = 0.1
 """s after which a report is due, even about a single packet."""
+_SNR_SMOOTHING = 0.5
+"""Share of a new packet in the reported SNR. A fading channel changes from packet to packet."""
 _WAITING = 256
 """Number of messages of unknown topics that are kept until the table arrives."""
 
@@ -89,6 +91,8 @@ class Inbox:
         """CRC-32 of the table of topics that is known."""
         self.loss = 0.0
         """Recent share of lost packets."""
+        self.snr_db: float | None = None
+        """SNR of the newest packets, dB; None where it is not measured."""
         self._settings = settings
         self._room = room
         self._control = control
@@ -245,7 +249,17 @@ class Inbox:
                 arrived |= 1 << back
         settled = self._wanted > base - MAP
         loss = min(round(self.loss * 128), 127)
-        return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss)
+        snr_db = None if self.snr_db is None else reportable(self.snr_db)
+        return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss, snr_db)
+
+    @property
+    def report_len(self) -> int:
+        """Bytes of a report."""
+        return REPORT_LEN + (self.snr_db is not None)
+
+    def measured(self, snr_db: float) -> None:
+        """Note the SNR of a packet, dB."""
+        self.snr_db = snr_db if self.snr_db is None else self.snr_db + _SNR_SMOOTHING * (snr_db - self.snr_db)
 
     @property
     def unreported(self) -> int:
