@@ -7,8 +7,8 @@ channel a report is late).
 
 Invariants: a packet for several robots is sent with a rung that suits the weakest of them; a packet for nobody who is
 known, and one for a robot that has fallen silent, is sent with the most robust rung. A rung is left for a faster one
-only if that promises clearly more, only one rung at a time, and only some reports after the last change; more reports
-each time that the faster one is soon left again. There is no clock here: ``now`` is seconds, monotonic.
+only if that promises clearly more, and only some reports after the last change: more of them each time that the faster
+one is soon left again. There is no clock here: ``now`` is seconds, monotonic.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from math import exp, inf
 
 from gr_ros2.errors import ConfigError
 
-GAIN = 1.05
-"""Expected goodput of another rung over that of the present one from which on the rung changes."""
-SETTLED = 4
+GAIN_UP, GAIN_DOWN = 1.1, 1.03
+"""How many times the present rung's goodput a faster rung, and a slower one, must promise to be taken."""
+SETTLED = 2
 """Reports after a change before a faster rung is tried. A slower one is taken at once."""
-_HASTY, _MOST_PATIENCE = 16, 128
-"""A faster rung that is left after so few reports was taken because of an error of measurement: each time the next one
-is tried half as soon, up to so many reports."""
+_HASTY, _MOST_PATIENCE = 4, 128
+"""A faster rung that is left within this many times the reports that were waited for before it, was taken because of an
+error of measurement: the next one is tried after twice as many reports, up to the second number. Otherwise after half
+as many."""
 MOST_SILENT_S = 1.0
 """s after which the SNR of a report is not trusted any more."""
 _LEAST_SILENT_S = 0.05
@@ -35,7 +36,8 @@ _GAPS = 4.0
 _UNANSWERED = 12
 """Packets to a robot since its last report, from which on its silence means something."""
 _LONGEST_GAP_S = 0.2
-_SMOOTHING = 0.25
+_SMOOTHING, _FOLLOWING = 0.25, 0.5
+"""Shares of a new report in the two averages of the SNR."""
 _STEP_DB = 1.5
 """Change of the SNR from one report to the next that is believed at once, dB."""
 _CORRECTION_DB = 0.5
@@ -76,7 +78,9 @@ class _Robot:
     """What is known of a receiver."""
 
     rung: int = 0
-    snr_db: float = -inf
+    steady_db: float = -inf
+    recent_db: float = -inf
+    """SNR, averaged over many reports and over few."""
     correction_db: float = 0.0
     heard: float = -inf
     gap_s: float = _LONGEST_GAP_S
@@ -87,6 +91,11 @@ class _Robot:
     """Reports after a change before a faster rung is tried."""
     climbed: bool = False
     """Whether the last change was to a faster rung."""
+
+    @property
+    def snr_db(self) -> float:
+        """The SNR to count on: a rise is believed late, a fall at once."""
+        return min(self.steady_db, self.recent_db) - self.correction_db
 
 
 class RateController:
@@ -112,11 +121,13 @@ class RateController:
         gap = min(max(now - known.heard, 0.0), _LONGEST_GAP_S)
         known.gap_s += _SMOOTHING * (gap - known.gap_s)
         known.heard, known.unanswered = now, 0
-        change = snr_db - known.snr_db
         # A small difference is an error of measurement, a large one a change of the channel.
-        known.snr_db = snr_db if abs(change) > _STEP_DB else known.snr_db + _SMOOTHING * change
+        if abs(snr_db - known.steady_db) > _STEP_DB:
+            known.steady_db = known.recent_db = snr_db
+        known.steady_db += _SMOOTHING * (snr_db - known.steady_db)
+        known.recent_db += _FOLLOWING * (snr_db - known.recent_db)
         known.reports += 1
-        surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db - known.correction_db))
+        surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db))
         correction = _FADE * known.correction_db + _CORRECTION_DB * surplus
         known.correction_db = min(max(correction, -_MOST_CORRECTION_DB), _MOST_CORRECTION_DB)
         self._choose(known)
@@ -137,7 +148,8 @@ class RateController:
     def _next(self, known: _Robot, now: float) -> int:
         known.unanswered += 1
         if self._silent(known, now):
-            known.rung, known.reports, known.climbed = 0, 0, False
+            # Once it is heard again, its SNR decides at once.
+            known.rung, known.reports, known.climbed = 0, known.patience, False
         return known.rung
 
     def _silent(self, known: _Robot, now: float) -> bool:
@@ -146,19 +158,16 @@ class RateController:
         return waited > MOST_SILENT_S or (known.unanswered >= _UNANSWERED and waited > usual)
 
     def _choose(self, known: _Robot) -> None:
-        snr_db = known.snr_db - known.correction_db
-        worth = [rung.goodput(snr_db) for rung in self.ladder]
+        worth = [rung.goodput(known.snr_db) for rung in self.ladder]
         best = max(range(len(worth)), key=worth.__getitem__)
-        if best == known.rung or worth[best] < GAIN * worth[known.rung]:
+        gain = GAIN_UP if best > known.rung else GAIN_DOWN
+        if best == known.rung or worth[best] < gain * worth[known.rung]:
             return
         if best > known.rung:
             if known.reports < known.patience:
                 return
-            best = known.rung + 1
-            if worth[best] < GAIN * worth[known.rung]:  # the rungs between may be worth less than this one
-                return
         elif known.climbed:
-            hasty = known.reports <= _HASTY
-            known.patience = min(2 * known.patience, _MOST_PATIENCE) if hasty else SETTLED
+            hasty = known.reports <= _HASTY * known.patience
+            known.patience = min(2 * known.patience, _MOST_PATIENCE) if hasty else max(known.patience // 2, SETTLED)
         known.climbed = best > known.rung
         known.rung, known.reports = best, 0

@@ -43,8 +43,8 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
-        self._lengths: Counter[int] = Counter()
-        """Number of packets sent, by their length in bytes."""
+        self._packets_sent: Counter[tuple[int, int]] = Counter()
+        """Number of packets sent, by their length in bytes and their rung."""
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -61,7 +61,7 @@ class Recorder:
         """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
-            self._lengths[len(event.data)] += 1
+            self._packets_sent[len(event.data), event.rung] += 1
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
@@ -102,20 +102,20 @@ class Recorder:
         self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
         return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
 
-    def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, float | None]:
+    def airtime(self, of_packet: Callable[[int | None, int], float] | None) -> dict[str, float | None]:
         """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
         per byte delivered.
 
         To be called after :meth:`finish`.
 
-        :param of_length: s that a packet of this many bytes takes, or the longest packet for None; None stands for a
-            PHY without samples
+        :param of_packet: s that a packet of this many bytes, sent with this rung, takes, or the longest packet for
+            None; None stands for a PHY without samples
         """
         longest = total = mean = None
-        if of_length is not None:
-            longest = of_length(None)
-            total = sum(of_length(length) * count for length, count in self._lengths.items())
-            mean = total / self._lengths.total() if total else longest
+        if of_packet is not None:
+            longest = of_packet(None, 0)
+            total = sum(of_packet(*packet) * count for packet, count in self._packets_sent.items())
+            mean = total / self._packets_sent.total() if total else longest
         return {
             "airtime_s": longest,
             "airtime_mean_s": mean,

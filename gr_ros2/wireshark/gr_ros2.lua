@@ -294,6 +294,7 @@ end
 
 local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
 local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 13, 5, 14, 5
+local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
 local CRC32_TABLE = {}
@@ -395,6 +396,10 @@ local function dissect_control(buffer, tree, at, limit)
         item:add(f.report_settled, buffer(start + 13, 1))
         item:add(f.report_loss, buffer(start + 13, 1))
         if size > REPORT_LEN then
+            if buffer(start + 14, 1):uint() > MAX_SNR then
+                item:add_proto_expert_info(refused.kind)
+                return nil
+            end
             item:add(f.report_snr, buffer(start + 14, 1), buffer(start + 14, 1):uint() / 2 - 40)
         end
     elseif name == "heard" then

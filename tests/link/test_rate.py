@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.rate import MOST_SILENT_S, SETTLED, RateController, Rung
+from gr_ros2.link.rate import MOST_SILENT_S, RateController, Rung
 
 LADDER = tuple(
     Rung(name, airtime_s, half_db, 0.4)
@@ -47,11 +47,9 @@ def test_the_rung_is_nearly_the_best_at_every_snr(snr_db: float) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-5, 35), st.integers(0, 10_000))
 def test_at_an_edge_the_rung_hardly_changes_though_the_snr_is_measured_with_errors(snr_db: float, seed: int) -> None:
-    rungs = settled(snr_db, noise_db=0.3, reports=400, seed=seed)
-    climb = len(LADDER) * (SETTLED + 1)
-    changes = sum(one != two for one, two in pairwise(rungs[climb:]))
-    assert changes <= 20
-    assert max(rungs[climb:]) - min(rungs[climb:]) <= 1
+    later = settled(snr_db, noise_db=0.3, reports=1000, seed=seed)[500:]
+    assert sum(one != two for one, two in pairwise(later)) <= 16
+    assert max(later) - min(later) <= 1
 
 
 def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
@@ -93,7 +91,7 @@ def test_a_robot_that_falls_silent_gets_the_most_robust_rung() -> None:
         rate.sent(7, now + MOST_SILENT_S / 2)
     assert rate.sent(7, now + MOST_SILENT_S / 2) == 0
     rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
-    assert rate.sent(7, now + MOST_SILENT_S / 2) <= 1, "it climbs again rung by rung"
+    assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "it is heard again"
     assert rate.sent(7, now + 2 * MOST_SILENT_S) == 0
 
 

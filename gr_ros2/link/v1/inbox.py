@@ -42,6 +42,8 @@ _REPORT_S = 0.1
 """s after which a report is due, even about a single packet."""
 _SNR_SMOOTHING = 0.5
 """Share of a new packet in the reported SNR. A fading channel changes from packet to packet."""
+_SNR_CHANGE_DB = 1.5
+"""Change of the SNR that is reported at once."""
 _WAITING = 256
 """Number of messages of unknown topics that are kept until the table arrives."""
 
@@ -93,6 +95,7 @@ class Inbox:
         """Recent share of lost packets."""
         self.snr_db: float | None = None
         """SNR of the newest packets, dB; None where it is not measured."""
+        self._reported_db: float | None = None
         self._settings = settings
         self._room = room
         self._control = control
@@ -227,7 +230,9 @@ class Inbox:
     def report_due(self, now: float) -> float:
         """When the next report is due, as long as there are packets since the last one."""
         half = self._settings.half_duplex
-        if (self._missed and not half) or self._unreported >= self._settings.report_every * (4 if half else 1):
+        if ((self._missed or self._snr_changed) and not half) or self._unreported >= self._settings.report_every * (
+            4 if half else 1
+        ):
             return now
         return self._reported_at + _REPORT_S
 
@@ -249,13 +254,20 @@ class Inbox:
                 arrived |= 1 << back
         settled = self._wanted > base - MAP
         loss = min(round(self.loss * 128), 127)
-        snr_db = None if self.snr_db is None else reportable(self.snr_db)
+        snr_db = self._reported_db = None if self.snr_db is None else reportable(self.snr_db)
         return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss, snr_db)
 
     @property
     def report_len(self) -> int:
         """Bytes of a report."""
         return REPORT_LEN + (self.snr_db is not None)
+
+    @property
+    def _snr_changed(self) -> bool:
+        """Whether the SNR differs so much from the last one reported that the sender should know."""
+        if self.snr_db is None:
+            return False
+        return self._reported_db is None or abs(self.snr_db - self._reported_db) > _SNR_CHANGE_DB
 
     def measured(self, snr_db: float) -> None:
         """Note the SNR of a packet, dB."""
