@@ -133,6 +133,7 @@ setup(
         "pydantic>=2.10,<3",
         "pyyaml>=6,<7",
         "rich>=14",
+        "pyserial>=3.5,<4",
         "rosbags>=0.11,<0.12",
     ],
     extras_require={

@@ -13,7 +13,16 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.config_errors import explain
@@ -26,6 +35,7 @@ from gr_ros2.names import (
     checked_topic_form,
 )
 from gr_ros2.setting import AUTO, Auto
+from gr_ros2.topic_choice import checked_words, words_of
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
 from gr_ros2.yaml_bounds import read_bounded
 from gr_ros2.yaml_text import parse_yaml
@@ -170,7 +180,7 @@ class TopicOptions(Queued):
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
-        publishers' lifespan, where ``queue`` is auto too
+        publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
@@ -226,7 +236,9 @@ class EndConfig(Agreed):
 class SourceConfig(Queued, EndConfig):
     """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
 
-    :param topics: subset of the registry, with or without leading slash; [] = all
+    :param topics: which topics are sent: names, in which * and ? stand for others; auto = every topic of the namespace;
+        -NAME leaves out. Of the registry, where there is one ([] = all); otherwise, with version 1, of the ROS graph,
+        which says type and QoS ([] = none)
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
     :param dst_id: destination id, 255 broadcast
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
@@ -248,7 +260,11 @@ class SourceConfig(Queued, EndConfig):
     :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
     """
 
-    topics: tuple[str, ...] = ()
+    topics: Annotated[
+        tuple[str, ...],
+        BeforeValidator(lambda given: words_of(given) if isinstance(given, str) else given),
+        AfterValidator(checked_words),
+    ] = ()
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
     min_fragment: Annotated[int, Field(ge=1, title="Smallest fragment (bytes)")] = 16

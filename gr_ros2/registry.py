@@ -1,5 +1,8 @@
 """The registry: which topics cross the link, and the number of each (the paper, section 4.3).
 
+A row may also name a service, an action, or the parameters or the lifecycle of a node. Such a row stands for several
+rows: an action is three services and two topics in ROS 2.
+
 Invariant: row order is topic id order; both ends use the same file, and equal ``digest`` values confirm that.
 """
 
@@ -18,27 +21,69 @@ from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
 from gr_ros2.old_names import new_name
 from gr_ros2.setting import AUTO
+from gr_ros2.topic_choice import TopicChoice
 from gr_ros2.wire import FORMATS, TableRow
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
 
+CALLS_TYPE = "gr_ros2/calls/Frame"
+"""Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
+
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
+_FEEDBACK = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*_FeedbackMessage")
+_SERVICE = re.compile(
+    r"[A-Za-z][A-Za-z0-9_]*/(srv/[A-Za-z][A-Za-z0-9_]*|action/[A-Za-z][A-Za-z0-9]*_(SendGoal|GetResult))"
+)
+_ACTION = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*")
+_OF_NODES = {
+    "parameters": {
+        "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
+        "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
+        "get_parameters": "rcl_interfaces/srv/GetParameters",
+        "list_parameters": "rcl_interfaces/srv/ListParameters",
+        "set_parameters": "rcl_interfaces/srv/SetParameters",
+        "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
+    },
+    "lifecycle": {
+        "change_state": "lifecycle_msgs/srv/ChangeState",
+        "get_available_states": "lifecycle_msgs/srv/GetAvailableStates",
+        "get_available_transitions": "lifecycle_msgs/srv/GetAvailableTransitions",
+        "get_state": "lifecycle_msgs/srv/GetState",
+        "get_transition_graph": "lifecycle_msgs/srv/GetAvailableTransitions",
+    },
+}
+"""The services of a node, by a word that stands in place of a type."""
+STATUS = "_action/status"
+"""End of the name of an action's latched topic."""
 _LATCHED = frozenset({"tf_static", "map", "robot_description"})
 """Topics that ROS programs publish transient-local by convention."""
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 _LONGEST_ID = 255
+_CALLS_LAST_S = 3600.0
+"""s after which a request or a reply is not sent any more, whatever its own deadline."""
+_CALLS_WAITING = 256
+"""Requests and replies that may wait to be sent."""
 
 
 def normalize_type(text: str) -> str:
     """``nav_msgs/Odometry`` or ``nav_msgs/msg/Odometry`` as ``nav_msgs/msg/Odometry``.
 
-    :raises ConfigError: when it has neither form
+    The type of an action's feedback, ``nav2_msgs/action/NavigateToPose_FeedbackMessage``, is returned unchanged.
+
+    :raises ConfigError: when it has none of these forms
     """
+    if _FEEDBACK.fullmatch(text):
+        return text
     match = _TYPE.fullmatch(text)
     if match is None:
         raise ConfigError(f"malformed type {text!r}; write package/Type or package/msg/Type")
     return f"{match[1]}/msg/{match[2]}"
+
+
+def is_service(type_name: str) -> bool:
+    """Whether this is the type of a service: ``package/srv/Type``, or one of those that make an action."""
+    return _SERVICE.fullmatch(type_name) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +92,7 @@ class Topic:
 
     :param topic_id: its number on the wire
     :param name: as registered, relative to the robot's namespace or absolute with leading slash
-    :param type_name: ``package/msg/Type``
+    :param type_name: ``package/msg/Type``; ``package/srv/Type`` in the row of a service
     """
 
     topic_id: int
@@ -75,7 +120,23 @@ class Topic:
         """Whether late joiners get the last message: because the registry says so, or by ROS convention."""
         if self.options.durability != AUTO:
             return self.options.durability == "transient_local"
-        return self.name.rsplit("/", 1)[-1] in _LATCHED
+        return self.name.rsplit("/", 1)[-1] in _LATCHED or self.name.endswith(f"/{STATUS}")
+
+    @property
+    def is_service(self) -> bool:
+        """Whether this row names a service."""
+        return is_service(self.type_name)
+
+    @property
+    def of_node(self) -> bool:
+        """Whether this row names a service that nodes have, below the name of its node."""
+        word = self.name.rpartition("/")[2]
+        return any(services.get(word) == self.type_name for services in _OF_NODES.values())
+
+    @property
+    def is_topic(self) -> bool:
+        """Whether this row names a topic: neither a service nor the row of requests and replies."""
+        return self.type_name != CALLS_TYPE and not self.is_service
 
 
 class Registry(Sequence[Topic]):
@@ -109,7 +170,8 @@ class Registry(Sequence[Topic]):
         """A registry written in code: ``Registry.from_rows({"odom": "nav_msgs/Odometry"})``."""
         pairs = list(rows.items()) if isinstance(rows, Mapping) else list(rows)
         try:
-            return cls([_topic(number, name, kind, {}) for number, (name, kind) in enumerate(pairs)])
+            parts = [part for name, kind in pairs for part in _parts(name, kind, {})]
+            return cls([_topic(number, *part) for number, part in enumerate(parts)])
         except RegistryError:
             raise
         except ConfigError as error:
@@ -159,6 +221,19 @@ class Registry(Sequence[Topic]):
                 f"topic {name!r} is not in the registry; it has {', '.join(topic.name for topic in self)}"
             ) from None
 
+    def chosen(self, words: Sequence[str]) -> list[Topic]:
+        """The rows that the setting ``topics`` chooses, with or without leading slash; all rows if there is no word.
+
+        :raises ConfigError: for a name that is not in the registry
+        """
+        if not words:
+            return list(self)
+        choice = TopicChoice([word.replace("/", "", word.startswith(("/", "-/"))) for word in words], "")
+        for name in choice.named.values():
+            self.named(name)
+        taken = set(choice.of(topic.name.lstrip("/") for topic in self))
+        return [topic for topic in self if topic.name.lstrip("/") in taken]
+
     def with_options(self, options: Mapping[str, TopicOptions]) -> Registry:
         """The same rows, with configured options instead of the registry's own. Only settings that differ from the
         default replace the registry's.
@@ -176,6 +251,19 @@ class Registry(Sequence[Topic]):
             topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
         return Registry(topics)
 
+    def with_calls(self) -> Registry:
+        """The same rows, and one more in which requests and replies are sent.
+
+        :raises RegistryError: when there is no room for one more
+        """
+        options = TopicOptions(queue="deadline", deadline_s=_CALLS_LAST_S, queue_depth=_CALLS_WAITING)
+        return Registry([*self._topics, Topic(len(self), "_calls", CALLS_TYPE, options)])
+
+    @property
+    def services(self) -> tuple[Topic, ...]:
+        """The rows that name services."""
+        return tuple(topic for topic in self if topic.is_service)
+
     @property
     def digest(self) -> str:
         """16 hex digits over what both ends must agree on: ids, names and types."""
@@ -191,14 +279,17 @@ def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
     """
     if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
         raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
-    known = {name.lstrip("/"): value for name, value in options.items()}.get(row.name.lstrip("/"), DEFAULT_OPTIONS)
-    said = {
-        "durability": "transient_local" if row.latched else "volatile",
-        "depth": row.depth or None,
-    }
-    chosen = {name: value for name, value in said.items() if getattr(known, name) is None}
+    known = options_of(row.name, options)
+    said = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
+    chosen = {name: value for name, value in said.items() if getattr(known, name) == AUTO}
     merged = build(TopicOptions, {**asdict(known), **chosen})
-    return Topic(row.topic_id, row.name, normalize_type(row.type_name), merged)
+    special = row.type_name == CALLS_TYPE or is_service(row.type_name)
+    return Topic(row.topic_id, row.name, row.type_name if special else normalize_type(row.type_name), merged)
+
+
+def options_of(name: str, options: Mapping[str, TopicOptions]) -> TopicOptions:
+    """The configured options of a topic that is in no registry, with or without leading slash."""
+    return {other.lstrip("/"): value for other, value in options.items()}.get(name.lstrip("/"), DEFAULT_OPTIONS)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:
@@ -236,19 +327,22 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
         first = False
         if len(row) > len(columns) or len(row) < 2:
             raise RegistryError(f"{len(row)} columns where {len(columns)} were expected: {','.join(row)!r}", path, line)
-        if topic_id >= MAX_TOPICS:
-            raise RegistryError(f"topic {MAX_TOPICS + 1}, {row[0]!r}: a link carries at most {MAX_TOPICS}", path, line)
         if row[0].lstrip("/") in seen:
             raise RegistryError(
                 f"duplicate topic {row[0]!r}; it stands first in line {seen[row[0].lstrip('/')]}", path, line
             )
         seen[row[0].lstrip("/")] = line
         options = {key: cell for key, cell in zip(columns[2:], row[2:], strict=False) if cell}
-        try:
-            yield _topic(topic_id, row[0], row[1], options)
-        except ConfigError as error:
-            raise RegistryError(str(error), path, line) from error
-        topic_id += 1
+        for part in _parts(row[0], row[1], options):
+            if topic_id >= MAX_TOPICS:
+                raise RegistryError(
+                    f"topic {MAX_TOPICS + 1}, {part[0]!r}: a link carries at most {MAX_TOPICS}", path, line
+                )
+            try:
+                yield _topic(topic_id, *part)
+            except ConfigError as error:
+                raise RegistryError(str(error), path, line) from error
+            topic_id += 1
 
 
 def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
@@ -262,11 +356,32 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
             raise RegistryError(f"column {column!r} stands twice", path, line)
 
 
+def _parts(name: str, kind: str, options: Mapping[str, str]) -> Iterator[tuple[str, str, Mapping[str, str]]]:
+    """Name, type and options of the topics and services for which a row stands."""
+    if kind in _OF_NODES:
+        parts = {f"/{service}": type_name for service, type_name in _OF_NODES[kind].items()}
+    elif _ACTION.fullmatch(kind):
+        parts = {
+            "/_action/send_goal": f"{kind}_SendGoal",
+            "/_action/cancel_goal": "action_msgs/srv/CancelGoal",
+            "/_action/get_result": f"{kind}_GetResult",
+            "/_action/feedback": f"{kind}_FeedbackMessage",
+            f"/{STATUS}": "action_msgs/msg/GoalStatusArray",
+        }
+    else:
+        parts = {"": kind}
+    for end, type_name in parts.items():
+        own = dict(options)
+        if end and "publish_as" in own:
+            own["publish_as"] += end
+        yield name + end, type_name, own
+
+
 def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:
     if fault := topic_fault(name if name.startswith("/") else f"/{name}"):
         raise ConfigError(f"malformed topic name {name!r}: {fault}")
     try:
-        type_name = normalize_type(kind)
+        type_name = kind if is_service(kind) else normalize_type(kind)
         topic_options = build(TopicOptions, options)
     except ConfigError as error:
         raise ConfigError(f"topic {name!r}: {error}") from error

@@ -85,8 +85,12 @@ def with_shared(values: Mapping[str, Any], shared: Mapping[str, Any], prefix: st
 def find_registry(name: str, directory: Path) -> str:
     """The absolute path of a registry: a file seen from a directory, or else a built-in one, with or without `.csv`.
 
+    '' stands for no registry, and stays.
+
     :raises ConfigError: when there is neither
     """
+    if not name:
+        return name
     path = Path(name).expanduser()
     for candidate in (directory / path, BUILTIN_DIR / path, BUILTIN_DIR / f"{name}.csv"):
         if candidate.is_file():
@@ -96,7 +100,9 @@ def find_registry(name: str, directory: Path) -> str:
 
 
 def portable_registry(path: str) -> str:
-    """How a file anywhere names a registry: a built-in one by its name, another one by its absolute path."""
+    """How a file anywhere names a registry: a built-in one by its name, another by its absolute path; '' is none."""
+    if not path:
+        return path
     found = Path(path).resolve()
     return found.stem if found.parent == BUILTIN_DIR else str(found)
 

@@ -165,7 +165,7 @@ def test_several_errors_are_all_named() -> None:
 @pytest.mark.parametrize(
     ("cls", "values", "says"),
     [
-        (SourceConfig, {"topics": "odom"}, "topics = 'odom': must be a list (subset of the registry, "),
+        (SourceConfig, {"topics": 5}, "topics = 5: must be a list (which topics are sent: "),
         (SourceConfig, {"greedy": "perhaps"}, "greedy = 'perhaps': must be true or false (several entries"),
         (SourceConfig, {"hop": 1.5}, "hop = 1.5: must be a whole number (initial hop"),
         (SourceConfig, {"hop": 16}, "hop = 16: must be less than or equal to 15"),

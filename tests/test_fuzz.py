@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import fuzz.calls
 import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
@@ -20,6 +21,7 @@ from fuzz.loop import Harness, inputs, run, within
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+import fuzz.framing
 import fuzz.kernels
 
 ROOT = Path(__file__).parents[1]
@@ -28,8 +30,10 @@ HARNESSES = {
     "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+    "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
+    "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
 }
 COUNTS = {
@@ -37,9 +41,11 @@ COUNTS = {
     "wire_v1": 20_000,
     "endpoint": 400,
     "receiver": 1_500,
+    "calls": 4_000,
     "compression": 2_000,
     "control_socket": 1_000,
     "dashboard": 300,
+    "framing": 1_000,
     "kernels": 400,
 }
 if find_spec("bokeh") is not None:

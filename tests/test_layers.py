@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,15 +15,15 @@ import gr_ros2
 import gr_ros2.wire
 
 ROOT = Path(gr_ros2.__file__).resolve().parent
-MODULES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
+MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py"))]
 
 LAYERS = (
     {"errors"},
     {"wire", "names", "yaml_bounds", "old_names", "setting", "files"},
-    {"yaml_text", "config_errors"},
+    {"yaml_text", "config_errors", "topic_choice"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},
-    {"link"},
+    {"link", "calls"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path", "grc_python"},
     {"gr"},
@@ -38,7 +39,7 @@ LAYERS = (
 
 MAY_PRINT = {"cli", "ros"}
 
-PURE = {"wire", "link"}
+PURE = {"wire", "link", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
@@ -55,6 +56,7 @@ WITHOUT_BACKENDS = (
     "gr_ros2",
     "gr_ros2.wire",
     "gr_ros2.link",
+    "gr_ros2.calls",
     "gr_ros2.registry",
     "gr_ros2.config",
     "gr_ros2.compression",
@@ -90,6 +92,11 @@ _GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequen
 """What makes a generator of one's own; anything else of ``random`` and ``numpy.random`` is the global one."""
 _STATE = {"get_state", "set_state"}
 """Put back what GNU Radio's stock blocks do to the global generator; draw nothing."""
+
+
+@functools.cache
+def parsed(module: str) -> ast.Module:
+    return ast.parse((ROOT / module).read_text("utf-8"))
 
 
 def part(module: str) -> str:
@@ -132,7 +139,7 @@ def calls_and_uses(tree: ast.Module) -> Iterator[str]:
 
 def ours(module: str) -> list[str]:
     """The parts of gr_ros2 that a module imports."""
-    names = [name.split(".") for name in imports(MODULES[module])]
+    names = [name.split(".") for name in imports(parsed(module))]
     return [name[1] for name in names if name[0] == "gr_ros2" and len(name) > 1 and name[1] != "__version__"]
 
 
@@ -152,7 +159,7 @@ def test_no_modules_import_each_other() -> None:
 
     def imported(module: str) -> set[str]:
         found = set()
-        for name in imports(MODULES[module]):
+        for name in imports(parsed(module)):
             inner = name.removeprefix("gr_ros2.")
             known = inner if inner in names else inner.rpartition(".")[0]
             if name.startswith("gr_ros2.") and known in names:
@@ -167,14 +174,14 @@ def test_no_modules_import_each_other() -> None:
 
 @pytest.mark.parametrize("module", [module for module in MODULES if part(module) in PURE])
 def test_wire_and_link_are_pure(module: str) -> None:
-    outside = {name.split(".")[0] for name in imports(MODULES[module])} - {"gr_ros2"}
+    outside = {name.split(".")[0] for name in imports(parsed(module))} - {"gr_ros2"}
     assert outside - set(sys.stdlib_module_names) <= PURE_CODECS
     assert not outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_nothing_but_its_engines_knows_a_version_of_the_wire_format(module: str) -> None:
-    inside = [name for name in imports(MODULES[module]) if name.startswith("gr_ros2.wire.")]
+    inside = [name for name in imports(parsed(module)) if name.startswith("gr_ros2.wire.")]
     public = {f"gr_ros2.wire.{name}" for name in gr_ros2.wire.__all__}
     known = module.startswith(KNOW_THEIR_VERSION) or module in COMPARES_WITH_VERSION_0
     assert known or set(inside) <= public
@@ -187,7 +194,7 @@ def test_no_width_of_a_field_stands_outside_of_the_wire(module: str) -> None:
     """``x & 255``, ``x % 256``, ``randrange(256)``, ``x << 4``: written by who knows that a field has 8 or 4 bits."""
     widths = {15, 16, 255, 256, 0xFFFF, 1 << 16}
     found = []
-    for node in ast.walk(MODULES[module]):
+    for node in ast.walk(parsed(module)):
         if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.BitAnd, ast.Mod, ast.LShift, ast.RShift)):
             operands = [side.value for side in (node.left, node.right) if isinstance(side, ast.Constant)]
             if any(isinstance(value, int) and (value in widths or value in (4, 8)) for value in operands):
@@ -199,7 +206,7 @@ def test_no_width_of_a_field_stands_outside_of_the_wire(module: str) -> None:
 
 @pytest.mark.parametrize("package", CONFINED)
 def test_back_end_packages_are_imported_in_their_adapters_only(package: str) -> None:
-    users = [module for module, tree in MODULES.items() if package in {name.split(".")[0] for name in imports(tree)}]
+    users = [module for module in MODULES if package in {name.split(".")[0] for name in imports(parsed(module))}]
     assert users, f"nothing imports {package}"
     assert [module for module in users if not module.startswith(CONFINED[package])] == []
 
@@ -207,22 +214,22 @@ def test_back_end_packages_are_imported_in_their_adapters_only(package: str) -> 
 @pytest.mark.parametrize("module", [module for module in MODULES if part(module) not in MAY_PRINT])
 def test_library_code_never_prints_asks_exits_or_reads_argv(module: str) -> None:
     forbidden = {"print", "input", "exit", "quit", "breakpoint", "sys.exit", "sys.argv", "os._exit"}
-    assert forbidden & set(calls_and_uses(MODULES[module])) == set()
+    assert forbidden & set(calls_and_uses(parsed(module))) == set()
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_draws_from_a_global_generator(module: str) -> None:
-    uses = [use.split(".") for use in calls_and_uses(MODULES[module])]
+    uses = [use.split(".") for use in calls_and_uses(parsed(module))]
     drawn = [use for use in uses if use[0] == "random" or use[:2] in (["np", "random"], ["numpy", "random"])]
     names = {use[-1] for use in drawn} - {"random"}
     assert names <= _GENERATORS | _STATE
-    from_random = {name for name in imports(MODULES[module]) if name.startswith(("random.", "numpy.random."))}
+    from_random = {name for name in imports(parsed(module)) if name.startswith(("random.", "numpy.random."))}
     assert {name.rsplit(".", 1)[1] for name in from_random} <= _GENERATORS
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_every_module_says_what_it_is(module: str) -> None:
-    tree = MODULES[module]
+    tree = parsed(module)
     assert not tree.body or ast.get_docstring(tree)
 
 

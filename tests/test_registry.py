@@ -90,7 +90,9 @@ def test_a_duplicate_says_both_lines(tmp_path: Path, again: str) -> None:
     "kind",
     [
         "Odometry",
-        "nav_msgs/srv/Odometry",
+        "nav_msgs/svc/Odometry",
+        "nav_msgs/srv/",
+        "nav_msgs/action/Go_Somewhere",
         "nav_msgs/msg/",
         "/Odometry",
         "nav msgs/Odometry",
@@ -265,3 +267,48 @@ def test_a_registry_is_a_sequence() -> None:
     assert list(registry) == [registry[0], registry[1]]
     assert registry[0:2] == (registry[0], registry[1])
     assert registry[0] in registry
+
+
+def test_a_row_may_name_a_service(tmp_path: Path) -> None:
+    registry = read(tmp_path, "add,example_interfaces/srv/AddTwoInts\nodom,nav_msgs/Odometry\n")
+    assert [(topic.type_name, topic.is_service, topic.is_topic) for topic in registry] == [
+        ("example_interfaces/srv/AddTwoInts", True, False),
+        (ODOM, False, True),
+    ]
+    assert [topic.name for topic in registry.services] == ["add"]
+
+
+def test_an_action_is_three_services_and_two_topics(tmp_path: Path) -> None:
+    registry = read(tmp_path, "topic,type,publish_as\ngo,nav2_msgs/action/NavigateToPose,drive\nscan,a_msgs/B\n")
+    rows = [(topic.name, topic.type_name, topic.is_service, topic.latched) for topic in registry]
+    assert rows == [
+        ("go/_action/send_goal", "nav2_msgs/action/NavigateToPose_SendGoal", True, False),
+        ("go/_action/cancel_goal", "action_msgs/srv/CancelGoal", True, False),
+        ("go/_action/get_result", "nav2_msgs/action/NavigateToPose_GetResult", True, False),
+        ("go/_action/feedback", "nav2_msgs/action/NavigateToPose_FeedbackMessage", False, False),
+        ("go/_action/status", "action_msgs/msg/GoalStatusArray", False, True),
+        ("scan", "a_msgs/msg/B", False, False),
+    ]
+    assert registry[3].republished("/rx_robot_{src_id}", 2) == "/drive/_action/feedback"
+    assert [topic.topic_id for topic in registry] == list(range(6))
+
+
+@pytest.mark.parametrize(
+    ("word", "count", "service", "kind"),
+    [("parameters", 6, "set_parameters", "SetParameters"), ("lifecycle", 5, "change_state", "ChangeState")],
+)
+def test_a_row_may_name_what_nodes_have(tmp_path: Path, word: str, count: int, service: str, kind: str) -> None:
+    registry = read(tmp_path, f"planner,{word}\n")
+    assert len(registry) == len(registry.services) == count
+    assert registry.named(f"planner/{service}").type_name.endswith(
+        f"_{'interfaces' if count == 6 else 'msgs'}/srv/{kind}"
+    )
+
+
+def test_calls_have_a_row_of_their_own_behind_the_others(tmp_path: Path) -> None:
+    registry = read(tmp_path, "add,example_interfaces/srv/AddTwoInts\n")
+    row = registry.with_calls()[-1]
+    assert (row.topic_id, row.is_topic, row.is_service) == (1, False, False)
+    full = Registry.from_rows({f"t{number}": "std_msgs/String" for number in range(MAX_TOPICS)})
+    with pytest.raises(RegistryError, match="241 topics"):
+        full.with_calls()

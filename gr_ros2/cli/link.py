@@ -50,6 +50,9 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @_flag("frequency", type=float, metavar="HZ")
 @_flag("frequency-rx", type=float, metavar="HZ")
 @click.option("--registry", metavar="CSV", help="Without CONFIG: which topics; default the built-in table4.")
+@click.option(
+    "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
+)
 @click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @set_option(LinkConfig)
@@ -61,6 +64,7 @@ def link(
     robot: int | None,
     radio: str | None,
     registry: str | None,
+    topics: str | None,
     save: Path | None,
     duration: float | None,
     overrides: tuple[str, ...],
@@ -76,7 +80,7 @@ def link(
     if config is not None:
         unused = [
             f"--{name}"
-            for name, value in {"robot": robot, "radio": radio, "registry": registry}.items()
+            for name, value in {"robot": robot, "radio": radio, "registry": registry, "topics": topics}.items()
             if value is not None
         ]
         unused += ["--save"] if save is not None else []
@@ -88,7 +92,7 @@ def link(
         raise click.UsageError("give a YAML file, or --robot and --radio")
     else:
         with uninterrupted():  # GNU Radio may be loaded
-            values = one_line(robot, radio, registry, given)
+            values = one_line(robot, radio, registry, given, topics)
         settings = _in_one_line(values, overrides, save)
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
@@ -200,6 +204,6 @@ def status_line(stats: Mapping[str, Any]) -> str:
     if sink["publish_failed"]:
         parts.append(f"{sink['publish_failed']} messages not published")
     troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
-    quiet = ("name", "bursts_in", "bursts_out")
+    quiet = ("name", "bursts_in", "bursts_out", "frames_in", "frames_out", "foreign")
     parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
     return "; ".join(parts)

@@ -32,8 +32,10 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
     if not console.is_terminal:
         console = Console(highlight=False, width=_WIDTH)
     forecast = planner.forecast()
+    phy = planner.phy
+    rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     console.print(
-        f"{planner.phy.name} at {planner.phy.sample_rate:,.0f} samples/s: a packet of {forecast.packet_len} B takes "
+        f"{phy.name}{rate}: a packet of {forecast.packet_len} B takes "
         f"{forecast.airtime_s * 1e3:.2f} ms, {forecast.capacity:.1f} packets/s\n",
         soft_wrap=True,
     )

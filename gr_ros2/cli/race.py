@@ -23,14 +23,14 @@ _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
 @click.command()
 @click.option("--short", is_flag=True, help="5 s a contender, at load 200 % and loss 5 % unless told otherwise.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
-@click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20.")
+@click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40.")
 @click.option("--load", metavar="PERCENT,...", help="Of the link's capacity by the messages as they are; 50,200.")
 @click.option("--sample-rate", type=OrAuto(click.FLOAT), help="Samples/s instead of --load.")
 @click.option("--peers", metavar="NAME,...", help="Who races; default all.")
 @click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
 @click.option("--topic", "bag_topic", help="Of the bag, where it has several.")
 @click.option("--duration", "duration_s", type=float, help="Seconds of the recording; default 15.")
-@click.option("--packet-len", type=int, help="Bytes of gr-ros2's packets; default 64.")
+@click.option("--packet-len", type=int, help="Bytes of gr-ros2's longest packets; default 64.")
 @click.option("--seed", type=int, help="Of robot, losses and sender.")
 def race(
     short: bool, out: Path | None, loss: str | None, load: str | None, peers: str | None, **options: object

@@ -129,7 +129,8 @@ def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:
         if len(names) > 1:
             reasons[topic] = f"it has several types, {' and '.join(sorted(names))}"
         elif kind in _NO_MESSAGES or "/_action/" in topic:
-            reasons[topic] = f"it belongs to {_NO_MESSAGES.get(kind, 'an action')}, and a link carries topics alone"
+            owner = _NO_MESSAGES.get(kind, "an action")
+            reasons[topic] = f"it belongs to {owner}, whose row this command does not write (docs/how-to/services.md)"
         elif kind != "msg":
             reasons[topic] = f"{names[0]!r} is no message type of ROS"
         elif fault := topic_fault(topic):

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
@@ -23,7 +24,6 @@ from gr_ros2.cli.terminal import path_text
 from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2.record.result import Result
 from gr_ros2.report.explain import explanation
-from gr_ros2.report.page import Run, read_runs, write_report
 from gr_ros2.report.repetitions import repetition_grid
 from gr_ros2.report.table import as_table, ledger_table, notes, paper_grid, summary_table
 from gr_ros2.run import runner
@@ -37,6 +37,7 @@ _options = [
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
+    click.option("--no-report", is_flag=True, help="No report, no figures; `gr-ros2 report FOLDER` makes them later."),
     set_option(Scenario),
     dashboard_option,
     pcap_option,
@@ -58,10 +59,12 @@ def run(scenario: str, **options: Any) -> int:
 
 
 @click.command()
+@click.option("--version", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
 @_with_options
-def demo(**options: Any) -> int:
-    """Two simulated robots: the topics of one cross an OFDM link and come out at the other."""
-    return _run("demo", **options)
+def demo(version: str, overrides: tuple[str, ...], **options: Any) -> int:
+    """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other."""
+    older = () if version == "1" else ("version=0", "reports=null")
+    return _run("demo", overrides=(*older, *overrides), **options)
 
 
 def _run(
@@ -71,6 +74,7 @@ def _run(
     seed: int | None,
     repetitions: int | None,
     duration: float | None,
+    no_report: bool,
     overrides: tuple[str, ...],
     dashboard: str | None,
     pcap: Path | None,
@@ -88,10 +92,10 @@ def _run(
             turns = (f"{scenario.name} {k} of {scenario.repetitions}" for k in count(1))
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
     if scenario.repetitions == 1:
-        _report_run(console, scenario, outcome, out)
+        _report_run(console, scenario, outcome, out, no_report)
         results = [outcome.result]
     else:
-        _report_repetitions(console, scenario, results, out)
+        _report_repetitions(console, scenario, results, out, no_report)
     return FAILED if any(result.incomplete for result in results) else 0
 
 
@@ -117,18 +121,22 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
     return advance
 
 
-def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path) -> None:
+def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, no_report: bool) -> None:
     _print(console, scenario, outcome)
     kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
-    if outcome.result.interrupted:
+    if no_report or outcome.result.interrupted:
         # After Ctrl-C the prompt returns at once, without a second of drawing.
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
         return
+    with uninterrupted():  # matplotlib is loaded only when there is something to draw
+        from gr_ros2.report.page import Run, write_report
     written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]
     console.print(f"\nWritten to {out}: {written[0]}, {kept}, {', '.join(written[1:])}", soft_wrap=True)
 
 
-def _report_repetitions(console: Console, scenario: Scenario, results: Sequence[Result], out: Path) -> None:
+def _report_repetitions(
+    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, no_report: bool
+) -> None:
     if len(results) < scenario.repetitions:
         console.print(f"stopped after {len(results)} of {scenario.repetitions} runs")
     if not results:
@@ -138,9 +146,11 @@ def _report_repetitions(console: Console, scenario: Scenario, results: Sequence[
         for line in result.incomplete:
             console.print(f"rep-{number}: {line}", soft_wrap=True)
     kept = f"{REPETITIONS_FILE}, the runs in rep-0 to {repetition_folder(out, len(results) - 1).name}"
-    if len(results) < scenario.repetitions:
+    if no_report or len(results) < scenario.repetitions:
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
         return
+    with uninterrupted():
+        from gr_ros2.report.page import read_runs, write_report
     report, *_ = write_report(read_runs([out]), out)
     console.print(f"\nWritten to {out}: {report.name}, {kept}", soft_wrap=True)
 

@@ -13,6 +13,7 @@ different dictionary is an UnknownDictionaryError.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 
 from gr_ros2.compression import bounds
@@ -58,8 +59,28 @@ class LinkCodec:
             other = by_id.setdefault(item.prefix, item)
             if other is not item and other.digest != item.digest:
                 raise ConfigError(f"dictionaries {other.name!r} and {item.name!r} share the id {item.prefix.hex()}")
-        sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
-        self._topics = {topic.topic_id: TopicCodec(topic, sets, max_size) for topic in topics}
+        self._sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
+        self._max_size = max_size
+        self._made: dict[tuple[str, str, str], TopicCodec] = {}
+        """Codecs by type, ``codec`` and ``quantize``: topics that have these in common share one."""
+        self._topics: dict[int, TopicCodec] = {}
+        for topic in topics:
+            self.add(topic)
+
+    def add(self, topic: Topic) -> None:
+        """See MessageCodec."""
+        key = (topic.type_name, topic.options.codec, topic.options.quantize)
+        if key not in self._made:
+            self._made[key] = TopicCodec(topic, self._sets, self._max_size)
+        self._topics[topic.topic_id] = self._made[key]
+
+    def of(self, topics: Iterable[Topic]) -> LinkCodec:
+        """A codec of other topics, which shares dictionaries and everything made so far with this one."""
+        made = copy(self)
+        made._topics = {}
+        for topic in topics:
+            made.add(topic)
+        return made
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The message that the other end gets: alignment gaps are zero, quantised fields are rounded, the rest is

@@ -69,7 +69,7 @@ def programs() -> Iterator[Finding]:
             front_end = FRONT_ENDS.load(name)
         except BackendMissingError:
             continue  # reported by the checks of what is installed
-        if front_end.has_radio:
+        if front_end.find_with:
             yield _asked(name, front_end.find_with)
 
 

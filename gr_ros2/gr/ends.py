@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import threading
 import time
 import weakref
@@ -31,7 +32,7 @@ from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import Auto
-from gr_ros2.wire import BROADCAST, TableRow
+from gr_ros2.wire import BROADCAST
 
 _T = TypeVar("_T")
 
@@ -75,13 +76,15 @@ def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
 def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> MessageCodec | None:
     """The codec of a link with compression; None for a link without.
 
+    :param registry: with topic options applied
+
     :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
     """
     if not config.compression:
         return None
     from gr_ros2.compression import LinkCodec  # imported here: links without compression do not need it
 
-    return LinkCodec(registry.with_options(config.topic_options), config.dictionaries)
+    return LinkCodec(registry, config.dictionaries)
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ def make_endpoint(
     codec: MessageCodec | None = None,
     rng: random.Random | None = None,
     observer: Callable[[SenderEvent], None] | None = None,
+    calls: bool = False,
 ) -> Endpoint:
     """Make one robot's end of a link, of the version in its settings.
 
@@ -124,36 +128,42 @@ def make_endpoint(
     :param sink: settings of the receiving half; None: it receives nothing
     :param start: for version 1 only
     :param codec: codec of all messages; None: made here if ``compression`` is on
+    :param calls: whether services cross the link: the last row of the endpoint's registry is for requests and replies
     :raises ConfigError: for settings that contradict each other
     """
+    if registry.services and not calls:
+        raise ConfigError(
+            f"registry: {registry.services[0].name} is a service, which needs both directions of a link and version 1; "
+            "take gr-ros2 link or RosLink"
+        )
+    rows = registry if source is None else registry.with_options(source.topic_options)
+    if calls:
+        rows = rows.with_calls()
     to_air = from_air = codec
     if codec is None:
-        to_air = None if source is None else message_codec(source, registry)
-        from_air = None if sink is None else message_codec(sink, registry)
+        to_air = None if source is None else message_codec(source, rows)
+        from_air = None if sink is None else message_codec(sink, registry.with_options(sink.topic_options))
     version = source.version if source is not None else 0 if sink is None else sink.version
     if not version:
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or Start()
     dictionaries = () if sink is None else sink.dictionaries
+    if codec is None:
+        from gr_ros2.compression import LinkCodec
+
+        known = LinkCodec((), dictionaries)
     return EndpointV1(
-        None if source is None or not registry else registry.with_options(source.topic_options),
+        None if source is None or not rows else rows,
         settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
-        decoder_for=lambda rows: codec or announced_codec(rows, dictionaries),
+        decoder_for=lambda rows: codec or known.of(Topic(row.topic_id, row.name, row.type_name) for row in rows),
         heard=start.heard,
         save=start.save,
         observer=observer,
         ladder=start.ladder,
     )
-
-
-def announced_codec(rows: Iterable[TableRow], dictionaries: Sequence[str]) -> MessageCodec:
-    """The codec that decodes the messages of a robot that announced these topics."""
-    from gr_ros2.compression import LinkCodec
-
-    return LinkCodec([Topic(row.topic_id, row.name, row.type_name) for row in rows], dictionaries)
 
 
 def start_of(
@@ -180,9 +190,7 @@ def start_of(
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
     file = BootFile(path, time.time())
-    # Without sealing, nobody can distinguish a replay from the original packet. So nothing is remembered.
-    heard, save = (file.heard, file.save) if config.key else ({}, None)
-    return Start(file.boot, keys, heard, save, reports, half_duplex, any_length)
+    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length)
 
 
 def state_folder() -> Path:
@@ -238,7 +246,7 @@ class Graph:
 def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry) -> None:
     """Refuse a sink that publishes a topic to which a source on the same graph subscribes.
 
-    :param subscribed: absolute names of the topics to which the source subscribes
+    :param subscribed: absolute names of the topics to which the source subscribes, and of the services that it offers
     :param registry: registry of the sink, with topic options applied
     :raises ConfigError: for a loop; the message names the topic
     """
@@ -266,6 +274,8 @@ class LoopGuard:
         self._lock = threading.Lock()
         self._sources: weakref.WeakKeyDictionary[Any, tuple[Graph, frozenset[str]]] = weakref.WeakKeyDictionary()
         self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
+        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Graph, set[str]]] = weakref.WeakKeyDictionary()
+        """Topics that senders have announced, under the names that sinks give them."""
 
     def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
         """:raises ConfigError: for a loop with an existing sink"""
@@ -284,10 +294,10 @@ class LoopGuard:
                     check_loop(names, config, registry)
             self._sinks[block] = (graph, config, registry)
 
-    def check_output(self, graph: Graph, name: str) -> None:
-        """Refuse a topic that a sink is about to publish, if a source on the same graph subscribes to it.
+    def add_output(self, block: Any, graph: Graph, name: str) -> None:
+        """Note a topic that a sink is about to publish because a sender has announced it.
 
-        :raises ConfigError: for a loop
+        :raises ConfigError: for a loop: a source on the same graph subscribes to it
         """
         with self._lock:
             for other, names in self._sources.values():
@@ -296,12 +306,37 @@ class LoopGuard:
                         f"loop: the sink would publish {name}, which a source on the same graph subscribes; change "
                         "namespace_format, publish_as or domain_id"
                     )
+            self._outputs.setdefault(block, (graph, set()))[1].add(name)
+
+    def returns(self, graph: Graph, name: str) -> bool:
+        """Whether a topic of a graph has come by radio: a sink publishes it, or one of another process may do so."""
+        with self._lock:
+            sinks = [(config, registry) for other, config, registry in self._sinks.values() if graph.same_as(other)]
+            if any(name in names for other, names in self._outputs.values() if graph.same_as(other)):
+                return True
+        formats = {config.namespace_format for config, _ in sinks} | {SinkConfig().namespace_format}
+        if any(_made_by(form, name) for form in formats):
+            return True
+        try:
+            for config, registry in sinks:
+                check_loop((name,), config, registry)
+        except ConfigError:
+            return True
+        return False
 
     def remove(self, block: Any) -> None:
         """Remove a block that has left its graph."""
         with self._lock:
             self._sources.pop(block, None)
             self._sinks.pop(block, None)
+            self._outputs.pop(block, None)
+
+
+def _made_by(namespace_format: str, name: str) -> bool:
+    """Whether a topic is in the namespace that a sink gives to some sender. A format that all senders share does not
+    tell."""
+    parts = [re.escape(part) for part in namespace_format.strip("/").split("{src_id}")]
+    return len(parts) > 1 and re.match(f"/{'[0-9]+'.join(parts)}/", name) is not None
 
 
 LOOP_GUARD = LoopGuard()

@@ -18,8 +18,9 @@ from gr_ros2.link.ledger_rows import LedgerRow
 
 Stats = Mapping[str, Any]
 
-_NO_LOSS = {"bursts_in", "bursts_out", "blanked"}
-"""Counters of a front end that are not losses: what passed, and samples that half duplex loses by design."""
+_NO_LOSS = {"bursts_in", "bursts_out", "frames_in", "frames_out", "foreign", "blanked"}
+"""Counters of a front end that are not losses: what passed, what others sent, and samples that half duplex
+loses by design."""
 _LOCKED = {
     "no_key": "sealed, and no key is configured here",
     "not_sealed": "not sealed, where a key is configured",

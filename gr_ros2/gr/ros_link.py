@@ -1,5 +1,7 @@
 """ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
 
+With version 1, services cross the link too.
+
 Invariant: the block contains a RosSource and a RosSink that share one endpoint. So received packets can change what is
 sent.
 """
@@ -9,17 +11,21 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import SinkConfig, SourceConfig, build
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.registry import Registry
+from gr_ros2.setting import AUTO
 
 
 class RosLink(gr.hier_block2):  # type: ignore[misc]
@@ -54,11 +60,18 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         rows = read_registry(registry, needed=not source.version)
         start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
-        self.end = LiveEnd(lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears))
+        calls = source.version != 0
+        self.end = LiveEnd(
+            lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
+        )
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
         common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
         self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0."""
+        if calls:
+            self.calls = LiveCalls(self.end, self.source, self.sink)
         for port in ("pdus", "credit"):
             self.message_port_register_hier_in(port)
         self.message_port_register_hier_out("pdus")
@@ -68,5 +81,29 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graphs. Idempotent."""
+        if self.calls is not None:
+            self.calls.close()
         self.source.close()
         self.sink.close()
+
+
+def make_link(*, half_duplex: bool = False, **values: Any) -> RosLink:
+    """Make a link from the settings of both halves in one list, as GRC does.
+
+    :param half_duplex: whether sending and receiving share the airtime
+    :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
+    :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
+    """
+    halves: list[Any] = []
+    known: set[str] = set()
+    for cls in (SourceConfig, SinkConfig):
+        names = {field.name for field in fields(cls)}
+        known |= names
+        halves.append(build(cls, {name: value for name, value in values.items() if name in names}))
+    unknown = sorted(values.keys() - known)
+    if unknown:
+        raise ConfigError(f"unknown key {unknown[0]}; known are {', '.join(sorted(known))}")
+    source, sink = halves
+    if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
+        sink = replace(sink, robot_id=source.src_id())
+    return RosLink(source.registry, source, sink, half_duplex=half_duplex)

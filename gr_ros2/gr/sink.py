@@ -12,8 +12,8 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
 
 from gnuradio import gr
 
@@ -44,6 +44,16 @@ _COUNTED = (
     *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
+
+
+class Services(Protocol):
+    """What handles the services of other robots, and the requests and replies that arrive."""
+
+    def takes(self, event: ReceiverEvent) -> bool:
+        """Handle what an event means for services; returns whether it was a request or a reply."""
+
+    def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
+        """Take over the topics and services that a robot announces now."""
 
 
 class RosSink(gr.basic_block):  # type: ignore[misc]
@@ -87,6 +97,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._end, self._work = end.endpoint, end.work
         self._announced: dict[tuple[int, int], Topic] = {}
         """Topics that senders have announced, by source id and topic id."""
+        self._calls: Services | None = None
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
@@ -129,9 +140,23 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             raise
 
     @property
+    def graph(self) -> Graph:
+        """The ROS graph on which it publishes."""
+        return self._graph
+
+    @property
     def middleware(self) -> Middleware:
         """This block's participant on the ROS graph."""
         return self._graph.middleware
+
+    def share(self, calls: Services) -> None:
+        """Hand over what concerns services."""
+        self._calls = calls
+
+    @property
+    def matched(self) -> bool:
+        """Whether every publisher has found a subscription."""
+        return all(publisher.matched() for publisher in list(self._publishers.values()))
 
     def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
         """Create the publishers of an expected sender now, so that subscribers find them before its first message.
@@ -178,8 +203,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             stats = self._end.received
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
-            topics = {key: self._topic_stats(key) for key in keys}
-            windows = {key: self._latency[key].copy() for key in keys if key in self._latency}
+            topics = {key: self._topic_stats(key) for key in keys if self._is_topic(key)}
+            windows = {key: self._latency[key].copy() for key in topics if key in self._latency}
             counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
@@ -230,24 +255,34 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             return self.registry[key[1]]
         raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
 
+    def _is_topic(self, key: tuple[int, int]) -> bool:
+        """Whether a sender's topic id means a topic: neither its table, nor its calls, nor something unknown."""
+        topic = self._announced.get(key)
+        return key[1] < len(self.registry) if topic is None else topic.is_topic
+
     def _learn(self, event: Announced) -> None:
         """Take over the topics that a sender announces. A publisher whose topic has a new name or type is closed."""
+        topics = []
         for row in event.rows:
             key = (event.src_id, row.topic_id)
             try:
                 topic = announced(row, self.config.topic_options)
                 name = topic.republished(self.config.namespace_format, event.src_id)
-                LOOP_GUARD.check_output(self._graph, name)
+                if topic.is_topic:
+                    LOOP_GUARD.add_output(self, self._graph, name)
                 if fault := topic_fault(name):
                     raise ConfigError(f"topic {name!r}: {fault}")
             except ConfigError as error:
                 self._tell_first("bad_announcement", f"a topic of robot {event.src_id} cannot be published", error)
                 continue
+            topics.append(topic)
             before = self._announced.get(key)
             self._announced[key] = topic
             same = before is None or (before.name, before.type_name) == (topic.name, topic.type_name)
             if key in self._publishers and not same:
                 self._publishers.pop(key).close()
+        if self._calls is not None:
+            self._calls.learn(event.src_id, topics)
 
     def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
         stats = self._end.received
@@ -306,7 +341,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                     self._learn(event)
                 elif isinstance(event, Rejected):
                     self._warn(event)
-                result = self._publish(event) if isinstance(event, Delivered) else event
+                taken = self._calls is not None and self._calls.takes(event)
+                result = self._publish(event) if isinstance(event, Delivered) and not taken else event
                 if self._observer is not None:
                     self._guard(self._observer.receiver_event, result, self._clock())
             except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread

@@ -26,16 +26,18 @@ from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_regi
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.middleware import Middleware, Qos, Subscription
+from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PDUS
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
 from gr_ros2.setting import AUTO, Auto
+from gr_ros2.topic_choice import TopicChoice
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 16
@@ -95,7 +97,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._end = end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
-        self._clock = clock
+        self.clock = clock
         self._pdus = PduMaker()
         self._composed: list[SentPacket] = []
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
@@ -117,14 +119,23 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._publish = self.message_port_pub  # stored: each look-up would pass through two proxies
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
-        chosen = [self.registry.named(name) for name in self.config.topics] or list(self.registry)
-        self.subscribed = {topic.on_graph(self.config.namespace): topic for topic in chosen}
-        """Topic of the registry by its absolute name on the ROS graph."""
+        namespace, words = self.config.namespace, self.config.topics
+        chosen = self.registry.chosen(words) if self.registry else []
+        self.subscribed = {topic.on_graph(namespace): topic for topic in chosen if topic.is_topic}
+        """Topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic is added."""
+        self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
+        """The same for the services that other robots may call."""
+        self.choice = TopicChoice(() if self.registry else words, namespace)
+        """The topics that are looked for on the ROS graph."""
+        self._left_out: set[str] = set()
+        self._full = False
+        """Whether a topic was not sent because there are too many. Only the first one is logged."""
+        self._search: TopicSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
-            LOOP_GUARD.add_source(self, self._graph, self.subscribed)
+            LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
             self._subscribe()
         except GrRos2Error:
             self.close()
@@ -149,9 +160,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def unmatched(self) -> list[str]:
         """Names, on the ROS graph, of the topics that nobody publishes yet."""
-        subscriptions = dict(self._subscriptions)
-        names = {topic.topic_id: name for name, topic in self.subscribed.items()}
-        return [names[number] for number, subscription in subscriptions.items() if not subscription.matched()]
+        subscriptions, subscribed = self._subscriptions, self.subscribed
+        unseen = [name for name in self.choice.named if name not in subscribed]
+        waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
+        return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -168,9 +180,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._running = True
         self._thread = threading.Thread(target=self._pump, name=f"gr-ros2-source-{self.src_id}", daemon=True)
         self._thread.start()
+        if self.choice:
+            self._search = TopicSearch(self.middleware, self._found)
         return True
 
     def stop(self) -> bool:
+        self._stop_search()
         with self._lock:
             self._running = False
             self._take_losses()
@@ -183,6 +198,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. A callback held back by ``backpressure`` returns without submitting. Idempotent."""
+        self._stop_search()
         with self._lock:
             self._closed = True
             self._room.notify_all()
@@ -275,31 +291,80 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def _subscribe(self) -> None:
         for name, topic in self.subscribed.items():
-            options = topic.options
-            depth = self.config.subscriber_depth if options.depth == AUTO else options.depth
-            if topic.topic_id in self._static and depth:
-                depth = max(depth, STATIC_DEPTH)
-            reliability = None if options.reliability == AUTO else options.reliability
-            durability = None if options.durability == AUTO else options.durability
-            qos = Qos(reliability, durability, depth)
-            callback = partial(self._take, topic.topic_id)
-            subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
-            self._subscriptions[topic.topic_id] = subscription
-            subscription.follow(partial(self._follow, topic))
+            self._subscribe_to(name, topic)
         if self._graph.owned:
             self.middleware.start()
 
+    def _subscribe_to(self, name: str, topic: Topic) -> None:
+        options = topic.options
+        depth = self.config.subscriber_depth if options.depth == AUTO else options.depth
+        if topic.topic_id in self._static and depth:
+            depth = max(depth, STATIC_DEPTH)
+        reliability = None if options.reliability == AUTO else options.reliability
+        durability = None if options.durability == AUTO else options.durability
+        qos = Qos(reliability, durability, depth)
+        callback = partial(self._take, topic.topic_id)
+        subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
+        self._subscriptions = {**self._subscriptions, topic.topic_id: subscription}
+        subscription.follow(partial(self._follow, topic))
+
+    def _stop_search(self) -> None:
+        if self._search is not None:
+            self._search.close()
+            self._search = None
+
+    def _found(self, infos: Sequence[TopicInfo]) -> None:
+        """Send the topics of the graph that are chosen and not sent yet."""
+        for info in infos:
+            row_name = (
+                self.choice.row_name(info.topic) if info.publishers and info.topic not in self.subscribed else None
+            )
+            if row_name is None or info.topic in self._left_out or LOOP_GUARD.returns(self._graph, info.topic):
+                continue
+            try:
+                self._add(row_name, info)
+            except GrRos2Error as error:
+                self._left_out.add(info.topic)
+                full = len(self.registry) == MAX_TOPICS
+                level = logging.DEBUG if full and self._full else logging.WARNING
+                self._full = full
+                self._log.log(level, "topic %s is not sent: %s", info.topic, error)
+
+    def _add(self, row_name: str, info: TopicInfo) -> None:
+        """Announce a topic of the graph, and subscribe it.
+
+        :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
+        """
+        options = options_of(row_name, self.config.topic_options)
+        with self._lock:
+            self.registry = self._end.add(row_name, normalize_type(info.type_name), options)
+            topic = self.registry[-1]
+            subscribed = {**self.subscribed, info.topic: topic}
+            self._adapt(topic, info.publishers)
+            if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
+                self._static[topic.topic_id] = StaticTransforms(self._counters)
+            self.subscribed = subscribed
+            self._work.notify()
+        LOOP_GUARD.add_source(self, self._graph, subscribed)
+        self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
+        self._subscribe_to(info.topic, topic)
+
+    def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
+        """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
+        qos = agreed(offers)
+        return self._end.follow(
+            topic.topic_id,
+            reliable=qos.reliability != "best_effort",
+            latched=all(offer.durability == "transient_local" for offer in offers),
+            depth=qos.depth,
+            lifespan_s=qos.lifespan_s,
+            period_s=qos.deadline_s,
+        )
+
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
-        qos = agreed(offers)
         with self._lock:
-            changed = self._end.follow(
-                topic.topic_id,
-                reliable=qos.reliability != "best_effort",
-                depth=qos.depth,
-                lifespan_s=qos.lifespan_s,
-                period_s=qos.deadline_s,
-            )
+            changed = self._adapt(topic, offers)
             policy, deadline_s = self._end.queue(topic.topic_id)
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
@@ -318,7 +383,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._end.submit(topic_id, whole or payload, self._clock())
+            self._end.submit(topic_id, whole or payload, self.clock())
             if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
                 self._work.notify()
 
@@ -349,13 +414,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             packets = self._composed = []
             while self._running and len(packets) < _BATCH:
-                if self._end.next_packet(self._clock()) is None:
+                if self._end.next_packet(self.clock()) is None:
                     break
             if packets:
                 self._room.notify_all()
             elif self._running:
                 at = self._end.next_departure()
-                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:
@@ -374,7 +439,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._composed.append(event)
         elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
-            name = self.registry[event.topic_id].name
+            name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:

@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
+from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
@@ -66,12 +66,27 @@ class Endpoint(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
+    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:
+        """Send one more topic, from now on.
+
+        :return: everything that is sent; the new topic is the last one
+        :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
     def follow(
-        self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+        self,
+        topic_id: int,
+        *,
+        reliable: bool = True,
+        latched: bool = False,
+        depth: int = 0,
+        lifespan_s: float = 0.0,
+        period_s: float = 0.0,
     ) -> bool:
         """Adapt a topic to the QoS of its publishers, where the configuration leaves it open.
 
         :param reliable: whether all publishers are reliable
+        :param latched: whether all publishers keep messages for late joiners (transient-local)
         :param depth: depth of their history, 0 for unbounded or unknown
         :param lifespan_s: s after which a message is useless, 0 without limit
         :param period_s: s within which they promise a message, 0 for no promise
@@ -193,11 +208,16 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         self._half().missed(topic_id, total)
 
+    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:  # noqa: ARG002
+        """See :class:`Endpoint`."""
+        raise ConfigError(f"version 0 cannot announce {name!r}: give both ends the same registry")
+
     def follow(
         self,
         topic_id: int,
         *,
         reliable: bool = True,  # noqa: ARG002 - version 0 delivers as it comes
+        latched: bool = False,  # noqa: ARG002 - the registry says it at both ends
         depth: int = 0,
         lifespan_s: float = 0.0,
         period_s: float = 0.0,

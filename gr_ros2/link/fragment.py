@@ -36,6 +36,7 @@ class Outgoing:
     :param qos: QoS class of its entries
     :param submitted: time of submission, s
     :param weight: weight of its age relative to other topics
+    :param lifespan_s: s after which the message is useless, where its queue's deadline is later
     :param expires: time after which the message is useless, s
     :param repeat: the message was sent before, and is sent again for robots that join late (transient-local topics)
     :param entry_id: its number on the wire, -1 until its first fragment leaves
@@ -50,6 +51,7 @@ class Outgoing:
     qos: int
     submitted: float
     weight: float = 1.0
+    lifespan_s: float = float("inf")
     expires: float = float("inf")
     repeat: bool = False
     entry_id: int = -1

@@ -6,7 +6,7 @@ that text.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 
 
@@ -27,9 +27,9 @@ class LedgerRow(str, Enum):
     STALE = "stale", "source", "#e7cf4f", "dropped at the source after their deadline"
     CANNOT_COMPLETE = "cannot_complete", "source", "#661100", "not begun, since they would have missed their deadline"
     ABANDONED = "abandoned", "source", "#332288", "given up half sent, since they would have missed their deadline"
-    LOST_FRAGMENTS = "lost_fragments", "link", "#d62728", "lost for want of a fragment"
+    LOST_FRAGMENTS = "lost_fragments", "link", "#d62728", "lost because a fragment did not arrive"
     GIVEN_UP = "given_up", "link", "#aa3377", "given up, since repair did not bring back what was lost in time"
-    OVERTAKEN = "overtaken", "sink", "#ccbb44", "complete only after a newer one of a topic that wants the newest"
+    OVERTAKEN = "overtaken", "sink", "#ccbb44", "complete only after a newer one of their topic was delivered"
     EXPIRED = "expired", "sink", "#b565a7", "given up incomplete after the reassembly timeout"
     MEMORY = "memory", "sink", "#7f7f7f", "given up incomplete when the sink's memory was full"
     UNSUPPORTED = "unsupported", "sink", "#17becf", "coded or encrypted in a way the sink cannot undo"
@@ -66,3 +66,11 @@ def arrived(rows: Mapping[str, int]) -> int:
 
 ROWS = {row.value: row for row in LedgerRow}
 """The rows by name. Results of another version may have rows that are not here."""
+
+
+def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
+    """The ledger rows that occurred: delivered and repaired first, then the others by name, in_flight last."""
+    found = {row for ledger in ledgers for row, count in ledger.items() if count}
+    return sorted(
+        found, key=lambda row: (row != LedgerRow.DELIVERED, row != LedgerRow.REPAIRED, row == LedgerRow.IN_FLIGHT, row)
+    )

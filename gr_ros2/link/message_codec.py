@@ -7,10 +7,18 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from gr_ros2.registry import Topic
+
 
 class MessageCodec(Protocol):
     """Codes the messages of one link; on such a link every packet carries C = 1 and every message begins with one
     byte that names codec and dictionary, 0 = stored as it is."""
+
+    def add(self, topic: Topic) -> None:
+        """Code the messages of one more topic, or of a topic id that now means another topic.
+
+        :raises ConfigError: for a wrong option of the topic
+        """
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The result of ``decode`` for the coded message: the payload itself, except for bytes without information and

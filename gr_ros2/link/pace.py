@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
+from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.setting import AUTO, Auto
 
 _INTERVALS = 15
@@ -25,7 +26,15 @@ class Pace:
         self._credits: int | None = None
         self._busy_since = inf
         """When the last packet left, if another was waiting for a credit then."""
+        self._credited = -inf
+        """When a credit came for which a packet was waiting."""
+        self._steady = False
+        """Whether the last packet left as soon as its credit came, so that the PHY is busy without a pause."""
+        self._rough = True
+        """Whether no interval of a PHY that was busy without a pause has been measured."""
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._median = 0.0
+        self._free = -inf
         self.change(packet_rate)
 
     def change(self, packet_rate: float | Auto) -> None:
@@ -60,20 +69,39 @@ class Pace:
 
         0 if neither is known.
         """
-        if self._rate:
-            return 1 / self._rate
-        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else 0.0
+        return 1 / self._rate if self._rate else self._median
+
+    def free(self, now: float) -> float:
+        """When the air is free of all packets that have left, as far as it can be estimated; not before ``now``."""
+        return max(now, self._free)
+
+    def may_leave(self, now: float) -> bool:
+        """Whether a packet may leave. While packets wait for their credits, the interval of the credits is measured."""
+        if self.out_of_credit or now < self.slot:
+            return False
+        if self._busy_since < inf:
+            if self._steady and self._rough:
+                # The first credits after a pause come earlier by the time that a source needs for composing.
+                self._rough = False
+                self._intervals.clear()
+            if self._steady or self._rough:
+                self._intervals.append(now - self._busy_since)
+                self._median = sorted(self._intervals)[len(self._intervals) // 2]
+            self._busy_since = inf
+            self._credited = now
+            self._free = min(self._free, now + LEAD_S)
+        return True
 
     def left(self, now: float, *, waiting: bool) -> None:
-        """A packet left. While packets wait for their credits, the interval of the credits is measured.
+        """A packet left.
 
         :param waiting: whether more is waiting
         """
+        self._free = self.free(now) + self.interval
         if self._credits is not None and not self._unpaced:
-            if self._busy_since < inf:
-                self._intervals.append(now - self._busy_since)
             self._credits -= 1
             self._busy_since = now if not self._credits and waiting else inf
+            self._steady = now == self._credited
         if self._rate:
             interval = 1 / self._rate
             # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.

@@ -40,6 +40,8 @@ class TopicQueue(deque[Outgoing]):
         super().__init__()
         self.policy = policy
         self.deadline_s = deadline_s
+        self._in_order = True
+        """Whether no message becomes useless before an earlier one."""
         self._interval = 1 / max_rate if max_rate else 0.0
         self._opens = float("-inf")
         self.since = inf
@@ -72,6 +74,7 @@ class TopicQueue(deque[Outgoing]):
                 self.remove(victim)
                 dropped.append(Dropped(victim, LedgerRow.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
+        self._in_order = self._in_order and message.lifespan_s >= self.deadline_s
         self.append(message)
         return dropped
 
@@ -88,7 +91,9 @@ class TopicQueue(deque[Outgoing]):
             packets = max(-(-message.remaining // payload), 1)
             late = now + packets * interval + lead * bool(interval) > message.expires
             if not late and now < message.expires:
-                return  # the following messages are younger, and wait for this one
+                if self._in_order:
+                    return  # the following messages are younger, and wait for this one
+                continue
             self.remove(message)
             yield Dropped(message, *self._reason(message, now, packets * interval))
 
@@ -110,10 +115,10 @@ class TopicQueue(deque[Outgoing]):
         return self._opens if self and now < self._opens and not self[0].started else inf
 
     def _expiry(self, message: Outgoing) -> float:
-        return message.submitted + self.deadline_s if self.deadline_s else inf
+        return message.submitted + min(self.deadline_s, message.lifespan_s) if self.deadline_s else inf
 
     def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[LedgerRow, str]:
-        limit = f"{self.deadline_s * 1e3:g} ms"
+        limit = f"{min(self.deadline_s, message.lifespan_s) * 1e3:g} ms"
         if message.started:
             return LedgerRow.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:

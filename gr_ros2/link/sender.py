@@ -127,7 +127,7 @@ class Sender:
 
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
-        if self._pace.out_of_credit or now < self._pace.slot:
+        if not self._pace.may_leave(now):
             return None
         if self._repeat_at:
             self._repeat(now)

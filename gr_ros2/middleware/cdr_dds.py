@@ -36,8 +36,11 @@ _PUBLICATIONS, _SUBSCRIPTIONS = 0x7FFF0003, 0x7FFF0004
 _BLOCK_NS = 1_000_000_000
 """A reliable write waits this long for a subscriber that does not keep up."""
 _OFFERED_INCOMPATIBLE, _REQUESTED_INCOMPATIBLE, _SAMPLE_LOST = 1 << 3, 1 << 4, 1 << 5
+_PUBLICATION_MATCHED, _SUBSCRIPTION_MATCHED = 1 << 11, 1 << 12
+_MOST_MATCHES = 256
+"""Endpoints matched by one endpoint that are looked at."""
 
-_TELLS_HISTORY = bytes((1, 16))
+_CYCLONE = bytes((1, 16))
 """Vendor id of Cyclone DDS. In the standard, history is not part of a publisher's discovery data (Fast DDS does not
 send it, and would be read as KeepLast 1); Cyclone DDS sends it."""
 
@@ -179,6 +182,14 @@ _serdata_from = _function("ddsi_serdata_from_ser_iov", _ptr, _ptr, c.c_int, _siz
 _serdata_size = _function("ddsi_serdata_size", _u32, _ptr)
 _serdata_to = _function("ddsi_serdata_to_ser", None, _ptr, _size, _size, _ptr)
 _serdata_unref = _function("ddsi_serdata_unref", None, _ptr)
+_matched_endpoints = {
+    name: (
+        _function(f"dds_get_matched_{name}s", _i32, _i32, c.POINTER(c.c_uint64), _size),
+        _function(f"dds_get_matched_{name}_data", c.POINTER(_BuiltinEndpoint), _i32, c.c_uint64),
+    )
+    for name in ("publication", "subscription")
+}  # handles, and what discovery says of one
+_free_endpoint = _function("dds_builtintopic_free_endpoint", None, c.POINTER(_BuiltinEndpoint))
 _create_qos = _function("dds_create_qos", _ptr)
 _delete_qos = _function("dds_delete_qos", None, _ptr)
 _set_userdata = _function("dds_qset_userdata", None, _ptr, c.c_char_p, _size)  # enclave and type hash of ROS
@@ -296,7 +307,7 @@ def _read_qos(pointer: int, key: bytes) -> Qos:
     return Qos(
         "reliable" if reliable else "best_effort",
         "transient_local" if latched else "volatile",
-        (0 if kind.value == 1 else depth.value) if key.startswith(_TELLS_HISTORY) else Qos().depth,
+        (0 if kind.value == 1 else depth.value) if key.startswith(_CYCLONE) else Qos().depth,
         lifespan_s,
         finite(nanoseconds.value * 1e-9),
     )
@@ -310,11 +321,38 @@ def _read_user_data(pointer: int) -> bytes:
     return data
 
 
+@dataclass(frozen=True)
+class DiscoveredEndpoint:
+    """A publisher or subscriber of the graph, with names as on DDS."""
+
+    key: bytes
+    participant: bytes
+    topic: str
+    type_name: str
+    qos: Qos
+    user_data: bytes = b""
+
+    @property
+    def is_cyclone(self) -> bool:
+        """Whether its DDS is Cyclone DDS."""
+        return self.key.startswith(_CYCLONE)
+
+
+def _discovered(data: Any) -> DiscoveredEndpoint:
+    """The content of a ``_BuiltinEndpoint``."""
+    key = bytes(data.key)
+    topic, type_name = data.topic_name.decode(errors="replace"), data.type_name.decode(errors="replace")
+    qos, user_data = _read_qos(data.qos, key), _read_user_data(data.qos)
+    return DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, qos, user_data)
+
+
 class _Endpoint:
     """Common part of readers and writers. ``incompatible`` and ``matched`` ask the library."""
 
     _matched_status = ""
     _incompatible_status = ""
+    _others = ""
+    """The endpoints that it matches: publications or subscriptions."""
 
     def __init__(self, entity: Entity) -> None:
         self.entity = entity
@@ -328,6 +366,23 @@ class _Endpoint:
     def matched(self) -> int:
         """Number of endpoints on the other side currently matched."""
         return int(self._get(self._matched_status).third)
+
+    def others(self) -> list[DiscoveredEndpoint]:
+        """The endpoints on the other side that are matched."""
+        handles = (c.c_uint64 * _MOST_MATCHES)()
+        found = _checked(_matched_endpoints[self._others][0](self.entity, handles, _MOST_MATCHES), "ask for matches")
+        endpoints = [self.other(handle) for handle in handles[: min(found, _MOST_MATCHES)]]
+        return [endpoint for endpoint in endpoints if endpoint is not None]
+
+    def other(self, handle: int) -> DiscoveredEndpoint | None:
+        """A matched endpoint on the other side, for instance the ``source`` of a sample; None if it has left."""
+        pointer = _matched_endpoints[self._others][1](self.entity, handle)
+        if not pointer:
+            return None
+        try:
+            return _discovered(pointer.contents)
+        finally:
+            _free_endpoint(pointer)
 
     def incompatible(self) -> tuple[int, str]:
         """Number of endpoints refused for incompatible QoS since the last call, and the policy of the last one."""
@@ -350,6 +405,7 @@ class RawReader(_Endpoint):
     """Takes whole messages. Only one thread may use it at a time."""
 
     _matched_status = "subscription_matched"
+    _others = "publication"
     _incompatible_status = "requested_incompatible_qos"
 
     def __init__(self, participant: Entity, topic: Entity, qos: Qos, user_data: bytes = b"") -> None:
@@ -365,6 +421,10 @@ class RawReader(_Endpoint):
         self._samples = (c.c_void_p * BATCH)()
         self._infos = (_SampleInfo * BATCH)()
         self._scratch = c.create_string_buffer(4096)
+
+    def watch_matches(self) -> None:
+        """Trigger a waitset whenever publishers come or leave."""
+        _checked(_set_status_mask(self.entity, _SUBSCRIPTION_MATCHED), "set a status mask")
 
     def take(self) -> list[Sample]:
         """Up to BATCH messages that wait, oldest first."""
@@ -396,6 +456,7 @@ class RawWriter(_Endpoint):
     """Writes whole messages, from any thread."""
 
     _matched_status = "publication_matched"
+    _others = "subscription"
     _incompatible_status = "offered_incompatible_qos"
 
     def __init__(self, participant: Entity, topic: Entity, qos: Qos, user_data: bytes = b"") -> None:
@@ -408,6 +469,10 @@ class RawWriter(_Endpoint):
         sertype = c.c_void_p()
         _checked(_get_sertype(self.entity, c.byref(sertype)), "ask for a type")
         self._sertype = sertype
+
+    def watch_matches(self) -> None:
+        """Trigger a waitset whenever subscribers come or leave."""
+        _checked(_set_status_mask(self.entity, _PUBLICATION_MATCHED), "set a status mask")
 
     def write(self, payload: bytes) -> None:
         """Send one message, zero-padded to a multiple of 4 (the library would pad with uninitialised memory).
@@ -424,18 +489,6 @@ class RawWriter(_Endpoint):
             head = payload[:4].hex(" ")
             raise MiddlewareError(f"message of {len(payload)} bytes, {head} …, is not CDR; not published")
         _checked(_writecdr(self.entity, serdata), "publish")
-
-
-@dataclass(frozen=True)
-class DiscoveredEndpoint:
-    """A publisher or subscriber of the graph, with names as on DDS."""
-
-    key: bytes
-    participant: bytes
-    topic: str
-    type_name: str
-    qos: Qos
-    user_data: bytes = b""
 
 
 class EndpointWatch:
@@ -457,10 +510,7 @@ class EndpointWatch:
             if not infos[index].valid or infos[index].instance_state != _ALIVE:
                 changes.append((key, None))
                 continue
-            topic, type_name = data.topic_name.decode(errors="replace"), data.type_name.decode(errors="replace")
-            qos, user_data = _read_qos(data.qos, key), _read_user_data(data.qos)
-            found = DiscoveredEndpoint(key, bytes(data.participant_key), topic, type_name, qos, user_data)
-            changes.append((key, found))
+            changes.append((key, _discovered(data)))
         if taken:
             _return_loan(self.entity, samples, taken)
         return changes

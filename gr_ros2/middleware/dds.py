@@ -27,10 +27,13 @@ from gr_ros2.middleware.cdr_dds import (
     RawWriter,
     WaitSet,
     create_topic,
+    delete,
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
+from gr_ros2.middleware.dds_services import SERVICE_QOS, DdsClient, DdsServer, ServiceParticipant
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -40,7 +43,7 @@ _PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
 _log = logging.getLogger(__name__)
 
 
-class DdsMiddleware(DdsParticipant):
+class DdsMiddleware(DdsParticipant, ServiceParticipant):
     """A participant.
 
     :param domain_id: 0..232, auto takes ROS_DOMAIN_ID, default 0
@@ -77,6 +80,7 @@ class DdsMiddleware(DdsParticipant):
         self._next_number = _FIRST_ENDPOINT
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
+        self._pairs: list[DdsServer | DdsClient] = []
         self._found: dict[int, dict[bytes, DiscoveredEndpoint]] = {_PUBLICATIONS: {}, _SUBSCRIPTIONS: {}}
         self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
@@ -100,6 +104,10 @@ class DdsMiddleware(DdsParticipant):
     @property
     def closed(self) -> bool:
         return self._closed
+
+    @property
+    def own_guid(self) -> bytes:
+        return self._guid
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> DdsSubscription:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
@@ -125,6 +133,14 @@ class DdsMiddleware(DdsParticipant):
         self._attach(writer.entity, (writer.entity,), publisher.service)
         self.announce()
         return publisher
+
+    def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> DdsServer:
+        self._check_open(f"serve {service}")
+        return DdsServer(self, ros_graph.check_topic(service), type_name, on_request, node)
+
+    def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> DdsClient:
+        self._check_open(f"call {service}")
+        return DdsClient(self, ros_graph.check_topic(service), type_name, on_reply, on_server)
 
     def discover(self) -> list[TopicInfo]:
         """The topics seen so far; a fresh participant needs a moment (tenths of a second) to see any."""
@@ -177,14 +193,47 @@ class DdsMiddleware(DdsParticipant):
             endpoint.writer.delete()
         self.announce()
 
+    def make_pair(self, end: DdsServer | DdsClient) -> None:
+        names = ros_graph.dds_service(end.name, end.type_name)
+        topics = [create_topic(self._participant, *name) for name in names]
+        data = [self._data_of(name) + end.mark for _, name in names]
+        # The writer is first: a reader alone on a topic of requests makes clients of Fast DDS wait for ever.
+        writer = RawWriter(self._participant, topics[end.writes], SERVICE_QOS, data[end.writes])
+        reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
+        for topic in topics:
+            delete(topic)  # it lives on in its endpoints
+        writer.watch_matches()
+        reader.watch_matches()
+        end.reader, end.writer = reader, writer
+        with self._lock:
+            self._pairs.append(end)
+        self._attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
+        self.announce()
+
+    def drop_pair(self, end: DdsServer | DdsClient) -> None:
+        if self._closed:
+            return
+        with self._lock:
+            self._pairs.remove(end)
+        self._detach(end.reader.entity)
+        end.reader.delete()
+        end.writer.delete()
+        self.announce()
+
     def announce(self) -> None:
         with self._announcing:
             with self._lock:
                 readers = [reader.guid for subscription in self._subscriptions for reader in subscription.readers()]
                 writers = [publisher.writer.guid for publisher in self._advertised]
-            info = ros_graph.participant_entities_info(
-                self._guid, *self._node, readers, writers, gid_bytes=self._gid_bytes
-            )
+                own = [end for end in self._pairs if not end.node]
+                readers += [end.reader.guid for end in own]
+                writers += [end.writer.guid for end in own]
+                nodes = [ros_graph.NodeEntities(*self._node, readers, writers)]
+                for name in sorted({end.node for end in self._pairs if end.node}):
+                    ends = [end for end in self._pairs if end.node == name]
+                    guids = [end.reader.guid for end in ends], [end.writer.guid for end in ends]
+                    nodes.append(ros_graph.NodeEntities(*_split(name), *guids))
+            info = ros_graph.participant_entities_info(self._guid, nodes, gid_bytes=self._gid_bytes)
             try:
                 self._discovery.write(info)
             except DdsError:
@@ -287,7 +336,10 @@ class DdsMiddleware(DdsParticipant):
         """User data of an endpoint: the type hash that other endpoints on the graph announce, otherwise that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
-        name = ros_graph.dds_type(type_name)
+        return self._data_of(ros_graph.dds_type(type_name)) or ros_graph.endpoint_user_data(type_hash(type_name))
+
+    def _data_of(self, name: str) -> bytes:
+        """The type hash that other endpoints announce for a type on DDS, as user data; empty if none does."""
         with self._lock:
             told = [
                 ros_graph.hash_told(endpoint.user_data)
@@ -295,7 +347,7 @@ class DdsMiddleware(DdsParticipant):
                 for endpoint in found.values()
                 if endpoint.type_name == name and endpoint.participant != self._guid
             ]
-        return ros_graph.endpoint_user_data(next(filter(None, told), "") or type_hash(type_name))
+        return ros_graph.endpoint_user_data(next(filter(None, told), ""))
 
     def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
         with self._lock:
@@ -310,3 +362,9 @@ class DdsMiddleware(DdsParticipant):
     def _detach(self, key: Entity) -> None:
         with self._lock:
             self._services.pop(self._numbers.pop(key, 0), None)
+
+
+def _split(node: str) -> tuple[str, str]:
+    """Name and namespace of a node."""
+    namespace, _, name = node.rpartition("/")
+    return name, namespace or "/"

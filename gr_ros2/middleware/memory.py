@@ -14,8 +14,10 @@ from weakref import WeakValueDictionary
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered, refused_policies
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, TopicInfo, grouped
+from gr_ros2.middleware.base import MessageCallback, Publisher, Qos, TopicInfo, grouped
 from gr_ros2.middleware.delivery import CallbackThread, QueuedSubscription
+from gr_ros2.middleware.memory_services import MemoryClient, MemoryServer, MemoryServices
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback, ServiceGraph
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import Auto
 
@@ -27,6 +29,7 @@ class _Graph:
         self.lock = threading.RLock()
         self.publishers: list[MemoryPublisher] = []
         self.subscriptions: list[MemorySubscription] = []
+        self.services = MemoryServices(self.lock)
 
     def endpoints(self) -> list[MemoryPublisher | MemorySubscription]:
         return [*self.publishers, *self.subscriptions]
@@ -144,7 +147,7 @@ class MemorySubscription(QueuedSubscription):
                 graph.left(self)
 
 
-class MemoryMiddleware(Middleware):
+class MemoryMiddleware(ServiceGraph):
     """A participant of a graph in this process.
 
     :param domain_id: 0..232, auto takes ROS_DOMAIN_ID; participants of equal domain share a graph
@@ -185,6 +188,24 @@ class MemoryMiddleware(Middleware):
                 self.graph.replay(subscription)
         return publisher
 
+    def serve(
+        self,
+        service: str,
+        type_name: str,
+        on_request: RequestCallback,
+        node: str = "",  # noqa: ARG002 - nobody asks for nodes here
+    ) -> MemoryServer:
+        names = ros_graph.check_topic(service), type_name
+        with self.graph.lock:
+            self._check_open(f"serve {service}")
+            return MemoryServer(self.graph.services, self, self.thread, names, on_request)
+
+    def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> MemoryClient:
+        names = ros_graph.check_topic(service), type_name
+        with self.graph.lock:
+            self._check_open(f"call {service}")
+            return MemoryClient(self.graph.services, self, self.thread, names, (on_reply, on_server))
+
     def discover(self) -> list[TopicInfo]:
         with self.graph.lock:
             found = [
@@ -202,6 +223,7 @@ class MemoryMiddleware(Middleware):
                 if endpoint.middleware is self:
                     endpoint.closed = True
                     self.graph.left(endpoint)
+            self.graph.services.left(self)
         self.thread.close()
 
     def _check_open(self, what: str) -> None:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -30,8 +30,10 @@ __all__ = [
     "PARTICIPANT_USER_DATA",
     "DiscoveryOptions",
     "DiscoveryRange",
+    "NodeEntities",
     "check_node",
     "check_topic",
+    "dds_service",
     "dds_topic",
     "dds_type",
     "discovery_options",
@@ -72,6 +74,16 @@ _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 def dds_topic(topic: str) -> str:
     """``/robot_1/odom`` as ``rt/robot_1/odom``."""
     return "rt" + topic
+
+
+def dds_service(service: str, type_name: str) -> tuple[tuple[str, str], tuple[str, str]]:
+    """Topic and type of a service's requests, and of its replies.
+
+    ``/robot_1/add`` of ``example_interfaces/srv/AddTwoInts`` has ``rq/robot_1/addRequest`` of
+    ``example_interfaces::srv::dds_::AddTwoInts_Request_``, and ``rr/robot_1/addReply`` of ``…_Response_``.
+    """
+    request, response = (dds_type(f"{type_name}_{part}") for part in ("Request", "Response"))
+    return (f"rq{service}Request", request), (f"rr{service}Reply", response)
 
 
 def ros_topic(name: str) -> str | None:
@@ -177,27 +189,32 @@ def hash_told(user_data: bytes) -> str:
     return match[1].decode() if match else ""
 
 
-def participant_entities_info(
-    participant: bytes,
-    node_name: str,
-    namespace: str,
-    readers: Sequence[bytes],
-    writers: Sequence[bytes],
-    *,
-    gid_bytes: int = 24,
-) -> bytes:
-    """The message on ros_discovery_info for one node, CDR little endian.
+class NodeEntities(NamedTuple):
+    """A node and its endpoints on the DDS.
 
-    :param participant: GUID, 16 bytes; likewise those of readers and writers
+    :param namespace: absolute
+    :param readers: GUIDs, 16 bytes each; likewise those of the writers
+    """
+
+    name: str
+    namespace: str
+    readers: Sequence[bytes]
+    writers: Sequence[bytes]
+
+
+def participant_entities_info(participant: bytes, nodes: Sequence[NodeEntities], *, gid_bytes: int = 24) -> bytes:
+    """The message on ros_discovery_info for the nodes of one participant, CDR little endian.
+
+    :param participant: GUID, 16 bytes
     """
     store = _discovery_types(gid_bytes)
     gid_class, node_class, info_class = (store.types[name] for name in _DISCOVERY_MESSAGES)
 
-    def gids(*guids: bytes) -> list[Any]:
+    def gids(guids: Sequence[bytes]) -> list[Any]:
         return [gid_class(np.frombuffer(guid.ljust(gid_bytes, b"\0"), np.uint8)) for guid in guids]
 
-    node = node_class(namespace, node_name, gids(*readers), gids(*writers))
-    return bytes(store.serialize_cdr(info_class(*gids(participant), [node]), _DISCOVERY_MESSAGES[-1]))
+    told = [node_class(node.namespace, node.name, gids(node.readers), gids(node.writers)) for node in nodes]
+    return bytes(store.serialize_cdr(info_class(*gids([participant]), told), _DISCOVERY_MESSAGES[-1]))
 
 
 @cache

@@ -24,6 +24,9 @@ PHY = BackendTable(
         "lora": Backend(
             "gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO, title="LoRa-like"
         ),
+        "modem": Backend(
+            "gr_ros2.phy.modem", "ModemPhy", "a radio that modulates packets itself; no samples", title="Modem"
+        ),
     },
     Backend,
 )

@@ -1,8 +1,8 @@
 """The interface of a physical layer: packets in, packets out, and the airtime of a packet.
 
 A PHY with samples gives two GNU Radio hier blocks, `transmitter` (message port `pdus` in, complex stream out)
-and `receiver` (complex stream in, message port `pdus` out). The `direct` PHY has no samples: its packets cross
-on the message port itself. Invariant: the airtime of a packet depends on its length alone.
+and `receiver` (complex stream in, message port `pdus` out). The PHYs `direct` and `modem` have no samples: their
+packets cross as messages. Invariant: the airtime of a packet depends on its length alone.
 """
 
 from __future__ import annotations
@@ -89,6 +89,8 @@ class Phy(ABC):
 
     name: ClassVar[str]
     has_samples: ClassVar[bool] = True
+    has_airtime: ClassVar[bool] = True
+    """Whether a packet takes time on the air."""
     Options: ClassVar[type[Any]] = PhyOptions
     """A frozen dataclass: the settings of this PHY, each with a default."""
 

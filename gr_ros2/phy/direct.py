@@ -16,6 +16,7 @@ class DirectPhy(Phy):
 
     name = "direct"
     has_samples = False
+    has_airtime = False
 
     def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
         super().__init__(packet_len, sample_rate, **options)

@@ -25,7 +25,7 @@ class LoopbackLink(PacketPath, Flowgraph):
     """A flowgraph from a source's message port `pdus` to a sink's.
 
     :param phy: which physical layer
-    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``XX
+    :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``
     :param sink: block with message port `pdus` in, which counts the processed PDUs in ``handled``
     :param channel: between transmitter and receiver
     :param throttled: packets pass at the rate of the channel (:class:`AirtimeGate`); False lets them pass as fast as
@@ -56,7 +56,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         phy.check_channel(self.channel)
         self._throttled = throttled
         last = source
-        if phy.has_samples and throttled:
+        if throttled and phy.has_airtime:
             airtime_of = phy.airtime if phy.any_length else None
             self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)

@@ -48,11 +48,18 @@ class Contender:
 
 
 CONTENDERS = {
-    "gr-ros2": Contender(
-        "gr-ros2", False, "version 0, compressed, 64-byte packets", {"compression": True, "queue": "fifo"}
+    "gr-ros2": Contender("gr-ros2", True, "version 1, compressed", {"version": 1, "compression": True, "source": {}}),
+    "gr-ros2-v0": Contender(
+        "gr-ros2",
+        False,
+        "version 0, compressed",
+        {"version": 0, "compression": True, "source": {"scheduler": "freshness", "queue_depth": 8}},
     ),
     "gr-ros2-plain": Contender(
-        "gr-ros2", False, "version 0, as it is, a packet per message", {"compression": False, "queue": "latest"}
+        "gr-ros2",
+        False,
+        "version 0, as it is, a packet per message",
+        {"version": 0, "compression": False, "source": {"scheduler": "freshness", "queue_depth": 1}},
     ),
     "cyclone-best-effort": Contender("dds", False, "Cyclone DDS, best effort"),
     "cyclone-reliable": Contender("dds", True, "Cyclone DDS, reliable"),

@@ -7,18 +7,21 @@ own air.
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from array import array
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import TracebackType
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, TopicOptions
+from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.gr.pmts import packet_of
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
@@ -32,13 +35,11 @@ from gr_ros2.race.namespaces import inside
 from gr_ros2.race.tun import Tun, loopback_up
 from gr_ros2.registry import Registry
 
-SOURCE_DOMAIN, SINK_DOMAIN = 1, 2
-"""DDS domains at the two ends of gr-ros2. One process cannot use the same domain in two namespaces."""
+DOMAINS = (1, 2)
+"""DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""
 SOURCE_ID = 1
 DEPTH = 1000
 """Messages that the local graphs keep. The number is large, because no message may be lost there."""
-QUEUE_DEPTH = 8
-"""Most messages that wait at ROS Source while the computer is busy."""
 
 _POLL_S = 0.05
 _JOIN_S = 1.0
@@ -53,19 +54,22 @@ class RaceRadio:
     """
 
     phy: str
-    options: dict[str, Any]
     sample_rate: float
     packet_loss: float
     seed: int
 
     def with_frames_of(self, length: int) -> Phy:
-        """The PHY for frames of ``length`` bytes, or of at most ``length`` bytes."""
-        phy: Phy = PHY.load(self.phy)(length, self.sample_rate, **self.options)
+        """The PHY for frames of at most ``length`` bytes."""
+        phy: Phy = PHY.load(self.phy)(length, self.sample_rate)
         return phy
+
+    @cached_property
+    def _phy(self) -> Phy:
+        return self.with_frames_of(MTU)
 
     def airtime_s(self, length: int) -> float:
         """Airtime of a frame of ``length`` bytes, s."""
-        return self.with_frames_of(length).airtime()
+        return self._phy.airtime(length)
 
     def channel(self, direction: int) -> ChannelConfig:
         """The channel of one direction, 0 or 1."""
@@ -97,11 +101,13 @@ class LinkReport:
 
 
 class RaceRosLink:
-    """gr-ros2 between two namespaces: a ROS graph at each end, the radio between them, in one direction.
+    """gr-ros2 between two namespaces: a ROS graph and a robot's end of the link at each end, the radio between them.
+
+    Version 1 uses both directions: messages there, reports back. Version 0 sends nothing back.
 
     :param namespaces: paths of the namespaces of the sending and the receiving end
     :param topic: its absolute name and its type
-    :param packet_len: bytes of a packet
+    :param packet_len: bytes of the longest packet
     :param contender: the contender whose settings are used
     :raises GrRos2Error: when a part does not start
     """
@@ -114,47 +120,64 @@ class RaceRosLink:
         packet_len: int,
         contender: Contender,
     ) -> None:
-        self._log = LinkLog()
-        registry = Registry.from_rows([topic])
-        phy = radio.with_frames_of(packet_len)
-        self._size, self._airtime = packet_len, phy.airtime()
+        self._radio, self._settings, self._packet_len = radio, contender.settings, packet_len
+        self._registry = Registry.from_rows([topic])
+        self._logs = (LinkLog(), LinkLog())
         with ExitStack() as stack:
-            graphs: list[Middleware] = []
-            for namespace, domain_id in zip(namespaces, (SOURCE_DOMAIN, SINK_DOMAIN), strict=True):
+            ends: list[tuple[RosSource, RosSink]] = []
+            for direction, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
                 loopback_up(namespace)
-                graphs.append(stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain))))  # type: ignore[misc]
-            common: dict[str, Any] = {"packet_len": packet_len, "compression": contender.settings["compression"]}
-            source = RosSource(
-                registry,
-                middleware=graphs[0],
-                observer=self,
-                seed=radio.seed,
-                robot_id=SOURCE_ID,
-                scheduler="freshness",
-                queue_depth=QUEUE_DEPTH,
-                subscriber_depth=DEPTH,
-                topic_options={topic[0]: TopicOptions(queue=contender.settings["queue"])},
-                **common,
-            )
-            stack.callback(source.close)
-            self._sink = RosSink(registry, middleware=graphs[1], publisher_depth=DEPTH, **common)
-            stack.callback(self._sink.close)
+                graph = stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain)))  # type: ignore[misc]
+                ends.append(self._end(direction, graph))
+                for block in ends[-1]:
+                    stack.callback(block.close)
+            (self._source, _), (_, self._sink) = ends
             self._sink.announce(SOURCE_ID, [0])
-            self._source, self._link = source, LoopbackLink(phy, source, self._sink, channel=radio.channel(0))
-            stack.callback(self._link.stop)
-            self._link.start()
+            self._links: list[LoopbackLink] = []
+            for direction, (source, _) in enumerate(ends):
+                phy, sink = radio.with_frames_of(packet_len), ends[1 - direction][1]
+                self._links.append(LoopbackLink(phy, source, sink, channel=radio.channel(direction)))
+                stack.callback(self._links[-1].stop)
+            for link in reversed(self._links):  # the receiving end listens when the sending end begins
+                link.start()
             self._stack = stack.pop_all()
+
+    def _end(self, direction: int, graph: Middleware) -> tuple[RosSource, RosSink]:
+        """The blocks of one robot, which share one endpoint. Its packets take a direction each."""
+        common: dict[str, Any] = {
+            "version": self._settings["version"],
+            "robot_id": SOURCE_ID + direction,
+            "packet_len": self._packet_len,
+            "compression": self._settings["compression"],
+        }
+        source = SourceConfig(subscriber_depth=DEPTH, **common, **self._settings["source"])
+        sink = SinkConfig(publisher_depth=DEPTH, **common)
+        phy = self._radio.with_frames_of(self._packet_len)
+        start = Start(1, reports=True, any_length=phy.any_length)
+        rng = random.Random(self._radio.seed)
+        log = _FrameLog(phy, self._logs[direction])
+        end = LiveEnd(lambda hears: make_endpoint(self._registry, source, sink, start=start, rng=rng, observer=hears))
+        blocks: dict[str, Any] = {"middleware": graph, "end": end}
+        return (
+            RosSource(self._registry, observer=log, **blocks, **own_settings(source)),
+            RosSink(self._registry, **blocks, **own_settings(sink)),
+        )
 
     @property
     def output_topic(self) -> str:
         """The topic on which the receiving end publishes the messages."""
         return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
 
+    def matched(self) -> bool:
+        """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""
+        return self._source.matched and self._sink.matched
+
     def report(self) -> LinkReport:
         """The traffic on the air so far."""
         topics = self._source.stats()["topics"].values()
         drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
-        return LinkReport(self._log, LinkLog(), {**drops, "on_air": self._link.counts().dropped})
+        on_air = sum(link.counts().dropped for link in self._links)
+        return LinkReport(*self._logs, {**drops, "on_air": on_air})
 
     def close(self) -> None:
         """Stop the radio and leave both graphs."""
@@ -168,13 +191,19 @@ class RaceRosLink:
     ) -> None:
         self.close()
 
+
+class _FrameLog:
+    """Logs the packets that one end sends."""
+
+    def __init__(self, phy: Phy, log: LinkLog) -> None:
+        self._phy, self._log = phy, log
+
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
-        """Log a packet that leaves."""
         if isinstance(event, SentPacket):
-            self._log.note(event.now, self._size, self._airtime)
+            self._log.note(event.now, len(event.data), self._phy.airtime(len(event.data)))
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Do nothing: the sink is not observed."""
+        """Do nothing: a source does not receive."""
 
 
 class RaceIpLink:
@@ -207,6 +236,10 @@ class RaceIpLink:
                 phy.prefer_latency()
                 self._links.append(link)
             self._stack = stack.pop_all()
+
+    def matched(self) -> bool:
+        """True: IP has no ends that must find each other."""
+        return True
 
     def report(self) -> LinkReport:
         """The traffic on the air so far."""

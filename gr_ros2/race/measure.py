@@ -205,6 +205,24 @@ def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
     return best
 
 
+def ahead(cells: Sequence[RaceCell], contender: str) -> dict[str, list[str]]:
+    """Who is better than a contender, by column. All cells must have the same condition; equal shown numbers are equal.
+
+    A contender without a number is behind all that have one.
+    """
+    own = {cell.contender: cell for cell in cells}.get(contender)
+    found: dict[str, list[str]] = {}
+    for name, column in COLUMNS.items():
+        value = None if own is None else getattr(own, name)
+        for cell in cells:
+            other = getattr(cell, name)
+            if other is None or (value is not None and column.shown(other) == column.shown(value)):
+                continue
+            if value is None or (other > value) == (column.better == "most"):
+                found.setdefault(name, []).append(cell.contender)
+    return found
+
+
 def by_condition(cells: Sequence[RaceCell]) -> Mapping[tuple[float, float], list[RaceCell]]:
     """The cells, grouped by (load, loss)."""
     groups: dict[tuple[float, float], list[RaceCell]] = {}

@@ -28,8 +28,7 @@ from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire.v0 import V0
 
 PHY_NAME = "ofdm"
-PHY_OPTIONS = {"gap": 112, "detection_threshold": "stock"}
-"""The PHY consists of GNU Radio's own blocks, which take frames of any length."""
+"""The PHY with its defaults. For every contender, a frame is only as long on the air as its bytes need."""
 SIM_TOPIC = "/robot_1/odom"
 _SIM_ROBOT = 1
 _SIM_START_NS = 1_700_000_000_000_000_000
@@ -53,7 +52,7 @@ class RaceSettings(Sampled, Packets, Traffic):
     :param load: of the link by the recording as it is, 1 = all of its capacity
     :param sample_rate: samples/s instead of ``load``; auto = chosen by it
     :param duration_s: s of the recording
-    :param packet_len: bytes of gr-ros2's packets; of `gr-ros2-plain` they are as long as a message needs
+    :param packet_len: bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs
     :param match_s: s that both ends have to find each other
     :param drain_s: s that what is on its way has after the last message was published
     :param seed: of the simulator, the losses and gr-ros2's sender
@@ -61,7 +60,7 @@ class RaceSettings(Sampled, Packets, Traffic):
 
     bag_topic: Text = AUTO
     peers: tuple[str, ...] = ()
-    loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2)
+    loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     packet_len: PacketLen = 64
@@ -118,12 +117,12 @@ def check(settings: RaceSettings) -> None:
     racing = chosen(settings.peers).values()
     if any(contender.stack == "zenoh" for contender in racing) and find_spec("zenoh") is None:
         raise BackendMissingError("zenoh is not installed: pip install eclipse-zenoh==1.10.2, or race other --peers")
-    PHY.load(PHY_NAME)(settings.packet_len, 1.0, **PHY_OPTIONS)
+    PHY.load(PHY_NAME)(settings.packet_len, 1.0)
 
 
 def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Condition]:
     """Every combination of load and loss, the smallest first."""
-    phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0, **PHY_OPTIONS)
+    phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0)
     needed = recording.hz * phy.airtime_samples()
     if settings.sample_rate != AUTO:
         rates = {needed / settings.sample_rate: settings.sample_rate}

@@ -1,4 +1,4 @@
-"""The results of the race: a table, `race.json`, the cells as CSV and Parquet, one figure.
+"""The results of the race: a table, also in Markdown, `race.json`, the cells as CSV and Parquet, one figure.
 
 Invariants: a file is written completely or not at all. Only the numbers decide which contender is marked as a winner.
 """
@@ -20,15 +20,18 @@ from matplotlib.figure import Figure
 from gr_ros2 import __version__
 from gr_ros2.files import write_text, write_whole
 from gr_ros2.race.contenders import CONTENDERS
-from gr_ros2.race.measure import COLUMNS, RaceCell, by_condition, shown, winners
+from gr_ros2.race.measure import COLUMNS, RaceCell, ahead, by_condition, shown, winners
 from gr_ros2.race.race_settings import dump
 from gr_ros2.race.runner import Race
 from gr_ros2.record.trace import write_csv
-from gr_ros2.report.figures import COLOURS, save_figure
+from gr_ros2.report.colours import COLOURS
+from gr_ros2.report.figures import save_figure
 from gr_ros2.report.table import Grid
 
 RACE_FILE = "race.json"
 WON = "*"
+OURS = "gr-ros2"
+"""The contender with the program's own defaults."""
 _DRAWN = ("pdr", "age_mean", "latency_p99", "airtime_per_message", "first_message")
 _LINEAR = {"pdr"}
 
@@ -53,6 +56,31 @@ def race_grid(race: Race) -> Grid:
     return Grid(f"The race ({WON} best of its group)", headings, tuple(sections), texts=3)
 
 
+def race_markdown(race: Race) -> str:
+    """The table in Markdown, the best of a condition in bold, and who is ahead of ours and where."""
+    headings = ["Load", "Loss", "Contender", *(column.heading for column in COLUMNS.values())]
+    lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
+    for (load, loss), cells in by_condition(race.cells).items():
+        best = winners(cells)
+        for cell in cells:
+            numbers = [
+                f"**{shown(cell, name)}**" if cell.contender in best[name] else shown(cell, name) for name in COLUMNS
+            ]
+            lines.append(f"| {load:.0%} | {loss:.0%} | `{cell.contender}` | {' | '.join(numbers)} |")
+    return "\n".join([*lines, "", *(f"- {line}" for line in ahead_of_ours(race)), ""])
+
+
+def ahead_of_ours(race: Race) -> list[str]:
+    """One line per condition: in which columns which contenders are better than ours."""
+    lines = []
+    for (load, loss), cells in by_condition(race.cells).items():
+        if not any(cell.contender == OURS for cell in cells):
+            continue
+        columns = [f"{COLUMNS[name].heading} ({', '.join(who)})" for name, who in ahead(cells, OURS).items()]
+        lines.append(f"load {load:.0%}, loss {loss:.0%}: ahead of {OURS}: {'; '.join(columns) or 'nobody'}")
+    return lines
+
+
 def notes(race: Race) -> list[str]:
     """Facts that a reader of the table must know, one line each."""
     recording = race.recording
@@ -62,6 +90,7 @@ def notes(race: Race) -> list[str]:
         f"{recording.topic}: {len(recording.payloads)} messages of {size:.0f} B on average, {recording.hz:.1f}/s; "
         + "; ".join(f"load {load:.0%} is {rate:,.0f} samples/s" for load, rate in rates)
     ]
+    lines += ahead_of_ours(race)
     for cell in race.cells:
         where = f"{cell.contender}, load {cell.load:.0%}, loss {cell.loss:.0%}"
         if not cell.matched:
@@ -87,6 +116,7 @@ def write_race(race: Race, out: Path) -> list[Path]:
     table = _table(race.cells)
     return [
         write_whole(out / RACE_FILE, text, write_text),
+        write_whole(out / "race.md", race_markdown(race), write_text),
         write_whole(out / "race.csv", table, write_csv),
         write_whole(out / "race.parquet", table, pa_parquet.write_table),
         *save_figure(race_figure(race.cells), out, "race"),

@@ -22,7 +22,6 @@ from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
     PHY_NAME,
-    PHY_OPTIONS,
     Condition,
     RaceRecording,
     RaceSettings,
@@ -94,7 +93,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
 
 
 def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
-    radio = RaceRadio(PHY_NAME, PHY_OPTIONS, condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)
@@ -123,7 +122,7 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
         timeout_s = settings.match_s + _PLAY_SLACK_S
         began = listener.call("connect", timeout_s=timeout_s)
         talker.call("connect", timeout_s=timeout_s)
-        matched = _wait_matched(settings.match_s, talker, listener)
+        matched = _wait_matched(settings.match_s, talker, listener, air)
         t_first = talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S)
         t_sent = [t_first + due for due in recording.due]
         _drain(settings.drain_s, listener, len(t_sent))
@@ -132,9 +131,9 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
         return Observed(began, matched, t_sent, listener.call("heard"), report, busy)
 
 
-def _wait_matched(limit_s: float, *ends: Worker) -> bool:
+def _wait_matched(limit_s: float, *parts: Worker) -> bool:
     limit = time.monotonic() + limit_s
-    while not (matched := all(end.call("matched") for end in ends)) and time.monotonic() < limit:
+    while not (matched := all(part.call("matched") for part in parts)) and time.monotonic() < limit:
         time.sleep(_POLL_S)
     return matched
 

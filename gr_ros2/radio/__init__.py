@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from gr_ros2.backends import Backend, BackendTable
 
@@ -11,9 +13,13 @@ from gr_ros2.backends import Backend, BackendTable
 class FrontEndBackend(Backend):
     """One row of the front end table.
 
+    :param phy: the PHY of a link that names none
+    :param phy_options: its settings
     :param sample_rate: default sample rate of a link, samples/s; all devices of the front end support it
     """
 
+    phy: str = "psk"
+    phy_options: Mapping[str, Any] = field(default_factory=dict)
     sample_rate: float = 1e6
 
 
@@ -54,6 +60,32 @@ FRONT_ENDS = BackendTable(
             "gr-iio, part of GNU Radio 3.10",
             title="Pluto Radio",
             sample_rate=2.5e6,
+        ),
+        "kiss": FrontEndBackend(
+            "gr_ros2.radio.kiss",
+            "KissFrontEnd",
+            "TNCs and modems that speak KISS, such as direwolf",
+            "pyserial",
+            title="KISS Modem",
+            phy="modem",
+            phy_options={"bit_rate": 1200.0, "overhead_bytes": 19, "overhead_s": 0.4},
+        ),
+        "serial": FrontEndBackend(
+            "gr_ros2.radio.serial",
+            "SerialFrontEnd",
+            "telemetry radios on a serial line",
+            "pyserial",
+            title="Serial Modem",
+            phy="modem",
+            phy_options={"bit_rate": 57_600.0, "overhead_bytes": 5},
+        ),
+        "udp": FrontEndBackend(
+            "gr_ros2.radio.udp",
+            "UdpFrontEnd",
+            "one datagram per packet, for modems with an Ethernet port",
+            title="UDP Modem",
+            phy="modem",
+            phy_options={"bit_rate": 1e6, "overhead_bytes": 28},
         ),
     },
     FrontEndBackend,

@@ -29,7 +29,8 @@ class LinkConfig(AnyLink):
 
     :param name: what errors and the status line call it
     :param registry: CSV path, relative to the YAML file, or the name of a built-in one: the topics that are sent; with
-        version 0 the same at every robot, with version 1 each announces its own, and '' sends none
+        version 0 the same at every robot, with version 1 each announces its own; '' sends what ``ros_source.topics``
+        finds on the ROS graph
     :param ros_source: the sending block; its robot_id must be another at every robot
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
     :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings

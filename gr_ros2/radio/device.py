@@ -21,7 +21,7 @@ from gr_ros2.config import STRICT, Count, Seconds, Text
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
-from gr_ros2.radio.front_end import FrontEnd, FrontEndOptions, Hertz
+from gr_ros2.radio.front_end import FrontEnd, Hertz, SharedAir
 from gr_ros2.radio.stream_events import GapCounter
 from gr_ros2.setting import AUTO, Auto
 
@@ -43,7 +43,7 @@ Direction = Literal["tx", "rx"]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class DeviceOptions(FrontEndOptions):
+class DeviceOptions(SharedAir):
     """Settings of every radio.
 
     :param args: which device, in the words of its driver; auto takes the first found
@@ -59,7 +59,6 @@ class DeviceOptions(FrontEndOptions):
     :param lead: zero samples before each burst, while the amplifier settles
     :param tail: zero samples behind each burst at least
     :param multiple: samples a burst is filled up to a multiple of, for drivers that send whole transfers only
-    :param half_duplex: receive nothing while sending, and ``turnaround_s`` afterwards
     :param turnaround_s: s, with ``half_duplex``: from the end of a burst until the device hears again and what it heard
         of the burst has come through its buffers; nothing is sent in it either
     """
@@ -76,7 +75,6 @@ class DeviceOptions(FrontEndOptions):
     lead: Annotated[Count, Field(title="Zeros before a burst (samples)")] = 32
     tail: Annotated[Count, Field(title="Zeros behind a burst (samples)")] = 64
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
-    half_duplex: bool = False
     turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.005
 
     @property
@@ -96,8 +94,6 @@ class DeviceFrontEnd(FrontEnd):
     any_length = True
     example_args: ClassVar[str]
     """Example of ``args``, for error messages."""
-    find_with: ClassVar[str]
-    """Command that lists the devices present, for error messages."""
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)

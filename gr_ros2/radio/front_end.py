@@ -1,5 +1,7 @@
 """The interface of a front end: a block that takes samples, a block that gives samples, and the time of a packet.
 
+A front end for a device with a modulation of its own has one block that takes and gives packets instead.
+
 Invariants: the constructor opens the front end, so that a wrong device or address is an error at once and not later in
 a thread. `close` releases everything and may be called twice. `counters` counts everything that is lost.
 """
@@ -31,6 +33,16 @@ class FrontEndOptions:
     guard_s: Annotated[Seconds, Field(title="Silence after a packet (s)")] = 0.0
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SharedAir(FrontEndOptions):
+    """What a front end takes that may have one channel for both directions.
+
+    :param half_duplex: nothing can be received while something is sent
+    """
+
+    half_duplex: bool = False
+
+
 class FrontEnd(ABC):
     """The connection of one robot to the air.
 
@@ -48,18 +60,34 @@ class FrontEnd(ABC):
     """Whether a robot receives its own packets as if another robot had sent them."""
     any_length: ClassVar[bool] = False
     """Whether bursts may have different lengths. If not, all bursts and packets are as long as the longest."""
+    carries_packets: ClassVar[bool] = False
+    """Whether it carries packets and not samples, because the device behind it modulates them itself."""
+    find_with: ClassVar[str] = ""
+    """Command that lists the devices present, for errors and `gr-ros2 doctor`; '' = there is none."""
     refuses: ClassVar[frozenset[str]] = frozenset()
     """Options of its base class that it does not support. GRC does not offer them."""
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
-        if not phy.has_samples and not self.loops_back:
+        if not self.carries(type(phy)) and self.carries_packets:
+            raise ConfigError(
+                f"front_end {self.name}: takes packets for a modem of a known bit rate, which phy {phy.name} does not "
+                "have; set phy to {name: modem, options: {bit_rate: …}}"
+            )
+        if not self.carries(type(phy)):
             raise ConfigError(
                 f"front_end {self.name}: phy {phy.name} has no samples to carry; choose another phy, or front_end sim"
             )
         if not self.any_length:
             phy.pad_all()
         self.phy = phy
+
+    @classmethod
+    def carries(cls, phy: type[Phy]) -> bool:
+        """Whether it works with a PHY."""
+        if cls.carries_packets:
+            return phy.has_airtime and not phy.has_samples
+        return phy.has_samples or cls.loops_back
 
     @property
     @abstractmethod
@@ -70,6 +98,11 @@ class FrontEnd(ABC):
     @abstractmethod
     def source(self) -> Any:
         """Block that gives the received samples; None if nothing is received."""
+
+    @property
+    def packets(self) -> Any:
+        """Block with message ports `pdus` in and out that carries packets; None if it carries samples."""
+        return None
 
     def wire(self, graph: Any) -> None:  # noqa: B027 - most have one block in each direction
         """Connect the blocks after ``sink`` and before ``source`` in a flowgraph."""

@@ -11,57 +11,79 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.phy import PHY
+from gr_ros2.radio import FRONT_ENDS, FrontEndBackend
+from gr_ros2.topic_choice import words_of
 
 DEFAULT_REGISTRY = "table4"
-DEFAULT_PHY = "psk"
 
 
 @dataclass(frozen=True)
 class Flag:
     """An option of the command line.
 
-    :param setting: setting of a front end that the option sets
+    :param settings: names of the setting that the option sets; a front end has at most one of them
     :param meaning: description for help and errors
     """
 
-    setting: str
+    settings: tuple[str, ...]
     meaning: str
+
+    def setting(self, known: Mapping[str, object]) -> str | None:
+        """Its setting among the ``known`` ones of a front end; None if that has none."""
+        return next((name for name in self.settings if name in known), None)
 
 
 FLAGS: Mapping[str, Flag] = {
-    "listen": Flag("bind", "zmq: own address, host:port; a port alone is on all interfaces"),
-    "peer": Flag("connect", "zmq: address of another robot, host:port; may stand several times"),
-    "device": Flag("args", "which device, in the words of its driver; without it the first found"),
-    "frequency": Flag("frequency", "Hz, to send at, and to receive at unless --frequency-rx says otherwise"),
-    "frequency-rx": Flag("frequency_rx", "Hz, to receive at"),
+    "listen": Flag(("bind", "listen"), "zmq, udp: own address, host:port; a port alone is on all interfaces"),
+    "peer": Flag(("connect", "send_to"), "zmq, udp: address of another robot, host:port; may stand several times"),
+    "device": Flag(
+        ("args", "device"),
+        "which device, in the words of its driver, without it the first found; kiss, serial: /dev/ttyUSB0 or "
+        "tcp://HOST:PORT",
+    ),
+    "frequency": Flag(("frequency",), "Hz, to send at, and to receive at unless --frequency-rx says otherwise"),
+    "frequency-rx": Flag(("frequency_rx",), "Hz, to receive at"),
 }
 
 
-def one_line(robot: int, radio: str, registry: str | None, flags: Mapping[str, Any]) -> dict[str, Any]:
+def one_line(
+    robot: int, radio: str, registry: str | None, flags: Mapping[str, Any], topics: str | None = None
+) -> dict[str, Any]:
     """A link's settings, as its YAML file would have them.
 
     :param robot: 0..254; its topics are in the namespace ``/robot_N``
     :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
-    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``
+    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``, or none with ``topics``
     :param flags: value of each option of ``FLAGS`` that was given
+    :param topics: which topics of the registry, or without one of the ROS graph; None sends the whole registry
     :raises ConfigError: for an unknown radio, an option that the radio does not have, or a missing option that it needs
     :raises BackendMissingError: when software that the radio needs is not installed
     """
     known = {item.name: item for item in fields(FRONT_ENDS.load(radio).Options)}
+    names = {name: setting for name, flag in FLAGS.items() if (setting := flag.setting(known)) is not None}
     for flag in flags:
-        if FLAGS[flag].setting not in known:
-            takes = [f"--{name}" for name, other in FLAGS.items() if other.setting in known]
+        if flag not in names:
+            takes = [f"--{name}" for name in names]
             raise ConfigError(f"--{flag}: radio {radio} has no such setting; it takes {', '.join(takes) or 'none'}")
-    for name, other in FLAGS.items():
-        item = known.get(other.setting)
-        if item is not None and name not in flags and item.default is MISSING and item.default_factory is MISSING:
-            raise ConfigError(f"--{name} is missing, radio {radio} needs it ({other.meaning})")
-    chosen = {FLAGS[flag].setting: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
+    for name, setting in names.items():
+        item = known[setting]
+        if name not in flags and item.default is MISSING and item.default_factory is MISSING:
+            raise ConfigError(f"--{name} is missing, radio {radio} needs it ({FLAGS[name].meaning})")
+    chosen = {names[flag]: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
+    default = DEFAULT_REGISTRY if topics is None else ""
+    chosen_topics = {} if topics is None else {"topics": list(words_of(topics))}
     return {
         "name": f"robot_{robot}",
-        "registry": DEFAULT_REGISTRY if registry is None else registry,
-        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}"},
-        "phy": {"name": DEFAULT_PHY, "sample_rate": FRONT_ENDS[radio].sample_rate},
+        "registry": default if registry is None else registry,
+        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
+        "phy": _phy(FRONT_ENDS[radio]),
         "front_end": {"name": radio, **chosen},
     }
+
+
+def _phy(row: FrontEndBackend) -> dict[str, Any]:
+    phy: dict[str, Any] = {"name": row.phy}
+    if PHY.load(row.phy).has_samples:
+        phy["sample_rate"] = row.sample_rate
+    return {**phy, **({"options": dict(row.phy_options)} if row.phy_options else {})}

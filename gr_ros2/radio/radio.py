@@ -69,7 +69,9 @@ class Radio(PacketPath, HierBlock):
         self.msg_connect(self, "pdus", self._gate, "pdus")
         self.msg_connect(self._gate, "credit", self, "credit")
         last: Any = self._gate
-        if phy.has_samples:
+        if front_end.packets is not None:
+            last = self._follow(last, front_end.packets)
+        elif phy.has_samples:
             self._connect_samples(record, instrumented)
             last = self._receiver
         if last is None:
@@ -137,8 +139,8 @@ class Radio(PacketPath, HierBlock):
 def make_radio(
     phy: str,
     packet_len: int,
-    sample_rate: float,
-    front_end: str,
+    sample_rate: float = 0.0,
+    front_end: str = "sim",
     phy_options: dict[str, Any] | None = None,
     *,
     channel: Mapping[str, Any] | None = None,
@@ -149,7 +151,7 @@ def make_radio(
 
     :param phy: a name of ``gr_ros2.phy.PHY``
     :param packet_len: bytes on the wire
-    :param sample_rate: samples/s
+    :param sample_rate: samples/s; ignored by a PHY without samples
     :param front_end: a name of ``gr_ros2.radio.FRONT_ENDS``
     :param phy_options: further settings of the PHY
     :param channel: settings of :class:`gr_ros2.config.ChannelConfig`, for front ends without a radio. If they are

@@ -16,6 +16,7 @@ from typing import Any
 
 from gr_ros2.config import SinkConfig
 from gr_ros2.gr import RosLink, RosSink, RosSource
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
@@ -26,6 +27,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.radio import Radio
+from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO, Auto
 
 _log = logging.getLogger(__name__)
@@ -57,7 +59,7 @@ class RobotLink(Flowgraph):
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
-        self.registry = config.load_registry()
+        self._registry = config.load_registry()
         self._clock = clock
         self._started: float | None = None
         self._instrumented = instrumented
@@ -79,6 +81,8 @@ class RobotLink(Flowgraph):
             self.phy, self.front_end, channel=config.channel, record=config.record, instrumented=self._instrumented
         )
         self._stack.callback(self.radio.close)
+        self.calls: LiveCalls | None = None
+        """The services that cross the link; None with version 0 and where the front end loops back."""
         graphs = self._graphs(middleware)
         if self.front_end.loops_back:
             self._two_blocks(graphs, observer)
@@ -95,7 +99,7 @@ class RobotLink(Flowgraph):
     def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
         """Both directions share one endpoint, so that received packets can change what is sent."""
         both = RosLink(
-            self.registry,
+            self._registry,
             self.config.ros_source,
             self._sink_config(),
             middleware=graphs,
@@ -105,7 +109,7 @@ class RobotLink(Flowgraph):
             clock=self._clock,
         )
         self._stack.callback(both.close)
-        self.source, self.sink = both.source, both.sink
+        self.source, self.sink, self.calls = both.source, both.sink, both.calls
         self.msg_connect(both, "pdus", self.radio, "pdus")
         self.msg_connect(self.radio, "credit", both, "credit")
         self.msg_connect(self.radio, "pdus", both, "pdus")
@@ -114,9 +118,10 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        self.source = RosSource(self.registry, middleware=graphs[0], any_length=self.phy.any_length, **common, **source)
+        any_length = self.phy.any_length
+        self.source = RosSource(self._registry, middleware=graphs[0], any_length=any_length, **common, **source)
         self._stack.callback(self.source.close)
-        self.sink = RosSink(self.registry, middleware=graphs[1], **common, **sink)
+        self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
         self.msg_connect(self.source, "pdus", self.radio, "pdus")
         self.msg_connect(self.radio, "credit", self.source, "credit")
@@ -126,6 +131,11 @@ class RobotLink(Flowgraph):
     def node_name(self) -> str:
         """The node name that ``ros2 node list`` shows."""
         return f"gr_ros2_link_{self.config.ros_source.src_id()}"
+
+    @property
+    def registry(self) -> Registry:
+        """The topics that are sent; it grows if they are looked for on the ROS graph."""
+        return self.source.registry
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
         """The participants of source and sink: one for both if they are on the same graph."""
@@ -194,14 +204,15 @@ class RobotLink(Flowgraph):
         return [*self._observers.told(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, packets to and from the air, the PHY, the counters of the front end, and
-        :meth:`incomplete`."""
+        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
+        end, and :meth:`incomplete`."""
         phy, counts = self.phy, self.radio.counts()
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             "source": self.source.stats(),
             "sink": self.sink.stats(),
+            "calls": {} if self.calls is None else self.calls.stats(),
             "packets": {
                 "out": counts.passed,
                 "backlog": counts.backlog,

@@ -1,4 +1,4 @@
-"""Topics that a link waits for because nobody publishes them, and the topics that are published instead.
+"""Topics that a link waits for because there is no publisher, and the topics that are published instead.
 
 Invariant: a line is returned only if it has changed. A look changes nothing on the graph.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 ALL_THERE = "every topic has a publisher"
 _SHOWN = 6
-"""Largest number of topics that a line names. Of further topics it tells only the number."""
+"""Largest number of topics that a line names. Further topics are only counted."""
 
 
 class Waiting:
@@ -35,12 +35,22 @@ class Waiting:
 
         :raises MiddlewareError: when the graph cannot be asked
         """
-        missing = self._source.unmatched
-        line = waiting_line(missing, self._types(), self._source.middleware.discover()) if missing else ALL_THERE
+        missing, choice = self._source.unmatched, self._source.choice
+        wanted = missing or ([] if self._source.subscribed or not choice.open else [choice.everything])
+        line = waiting_line(wanted, self._types(), self._others()) if wanted else self._sent()
         if line == self._told:
             return None
         self._told = line
         return line
+
+    def _others(self) -> list[TopicInfo]:
+        """What is on the graph, except for what will be sent at once."""
+        infos, choice = self._source.middleware.discover(), self._source.choice
+        return [info for info in infos if choice.row_name(info.topic) is None]
+
+    def _sent(self) -> str:
+        """That every topic has a publisher; with the topics, where the user did not name them."""
+        return f"{ALL_THERE}: {_listed(list(self._source.subscribed))}" if self._source.choice.open else ALL_THERE
 
     def _types(self) -> dict[str, str]:
         return {name: topic.type_name for name, topic in self._source.subscribed.items()}
@@ -56,7 +66,7 @@ def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[
     published = [info for info in found if info.publishers and info.topic not in INFRASTRUCTURE]
     wrong = [info for info in published if types.get(info.topic, info.type_name) != info.type_name]
     others = [info for info in published if info.topic not in types]
-    last_names, wanted_types = {name.rpartition("/")[2] for name in missing}, {types[name] for name in missing}
+    last_names, wanted_types = {name.rpartition("/")[2] for name in missing}, {types.get(name) for name in missing}
 
     def meant(info: TopicInfo) -> tuple[bool, bool, str]:
         return info.topic.rpartition("/")[2] not in last_names, info.type_name not in wanted_types, info.topic

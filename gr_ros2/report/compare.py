@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.ledger_rows import LedgerRow, row_order
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
-from gr_ros2.report.figures import latency_figure, ledger_figure, row_order
+from gr_ros2.report.figures import latency_figure, ledger_figure
 from gr_ros2.report.page import Run, Section, latencies, lead_of, save, write_page
 from gr_ros2.report.table import Grid, milliseconds, number
 from gr_ros2.report.timelines import Deliveries, age_figure, delivery_figure

@@ -1,12 +1,12 @@
 """The figures of an experiment: the paper's figure 7 (paths) and figure 6 (latency), the loss ledger; as PNG and SVG.
 
 Invariants: figures are independent objects; matplotlib's global state is not changed, so figures can be drawn in any
-thread, with or without a display; a ledger row has the same colour in every figure.
+thread, with or without a display.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 
@@ -17,22 +17,19 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.ledger_rows import row_order
+from gr_ros2.record.result import AirUse
+from gr_ros2.report.colours import AIR_COLOURS, COLOURS, row_colour
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
 
 _SENT, _RECEIVED = "#1f5fbf", "#d62728"
 
-COLOURS = (
-    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
-    *("#88ccee", "#882255", "#44aa99", "#ddcc77", "#332288", "#aa4499", "#999933", "#661100"),
-)
-"""Colours of topics and runs, in their order. Colour-blind readers can distinguish them as well as is possible with
-sixteen colours."""
-
 _RASTER_ABOVE = 20_000
 """Number of points above which a line is stored as a bitmap in the SVG. Otherwise the file would become too large."""
+_DPI = 150
+"""Dots per inch of a PNG."""
 
 
 def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, received_name: str) -> Figure:
@@ -140,17 +137,20 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
     return figure
 
 
-def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
-    """The ledger rows that occurred: delivered and repaired first, then the others by name, in_flight last."""
-    found = {row for ledger in ledgers for row, count in ledger.items() if count}
-    return sorted(
-        found, key=lambda row: (row != LedgerRow.DELIVERED, row != LedgerRow.REPAIRED, row == LedgerRow.IN_FLIGHT, row)
-    )
-
-
-def row_colour(row: str) -> str:
-    """The colour of a ledger row. A row that this version does not know also has a fixed colour."""
-    return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]
+def air_figure(uses: Sequence[AirUse]) -> Figure:
+    """What the packets sent were for: one bar of 100 % of their airtime, with the number of packets of each kind."""
+    figure = Figure(figsize=(8.0, 1.7), layout="constrained")
+    axes = figure.add_subplot(title="What the air was used for", xlabel="share of the air used [%]", xlim=(0, 100))
+    left = 0.0
+    for use in uses:
+        width = use.share * 100
+        axes.barh([0], [width], left=left, height=0.7, color=AIR_COLOURS[use.kind], label=use.kind)
+        if width > 1.5 + 1.2 * len(str(use.packets)):  # where the number fits into the bar
+            axes.text(left + width / 2, 0, str(use.packets), ha="center", va="center", fontsize=8)
+        left += width
+    axes.set_yticks([])
+    figure.legend(loc="outside lower center", ncols=len(uses) or 1, fontsize="small", frameon=False)
+    return figure
 
 
 def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
@@ -161,8 +161,14 @@ def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
     paths = [Path(directory) / f"{name}.png", Path(directory) / f"{name}.svg"]
     try:
         Path(directory).mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_figure(paths[0], dpi=150)
-        figure.set_layout_engine("none")  # keep the layout: computing it again would take half of the time
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(_DPI)
+        # The layout is computed once, here. With a layout engine, matplotlib draws every file twice.
+        layout = figure.get_layout_engine()
+        if layout is not None:
+            layout.execute(figure)
+            figure.set_layout_engine(None)
+        canvas.print_figure(paths[0], dpi=_DPI)
         FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
     except OSError as error:
         raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error

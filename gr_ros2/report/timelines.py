@@ -19,7 +19,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from gr_ros2.record.metrics import age_sawtooth
 from gr_ros2.record.trace import Floats, Ints, Messages, Packets
-from gr_ros2.report.figures import COLOURS
+from gr_ros2.report.colours import COLOURS
 
 _BINS = 40
 """Approximate number of intervals into which a run is divided."""

@@ -65,7 +65,7 @@ def offered_packets(scenario: Scenario, registry: Registry) -> float:
 
 def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     """Topic ids of the topics the source subscribes, by their absolute names."""
-    chosen = [registry.named(name) for name in scenario.ros_source.topics] or list(registry)
+    chosen = registry.chosen(scenario.ros_source.topics)
     return {topic.on_graph(scenario.ros_source.namespace): topic.topic_id for topic in chosen}
 
 

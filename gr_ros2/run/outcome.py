@@ -46,5 +46,5 @@ def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:
         "sample_rate": phy.sample_rate if phy.has_samples else None,
         "runs_on": phy.runs_on(),
         "airtime_samples": phy.airtime_samples() if phy.has_samples else None,
-        **recorder.airtime(phy.airtime if phy.has_samples else None),
+        **recorder.airtime(phy.airtime if phy.has_airtime else None),
     }

@@ -91,7 +91,7 @@ class Simulated:
     """The result of a simulation.
 
     :param duration_s: s during which messages were offered
-    :param airtime_s: of the longest packet, s; 0 for a PHY without samples
+    :param airtime_s: of the longest packet, s; 0 for a PHY without airtime
     :param packets: as in ``result.json``
     """
 
@@ -264,7 +264,7 @@ class LinkDirection:
     """One direction of a link: the messages offered to the sending end, the airtime of its packets, and the receiving
     end.
 
-    :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without samples
+    :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without airtime
     :param messages: in the order of time
     :param src_id: of the end that sends; None: the scenario's source
     :param delay_s: s from the end of a packet's airtime to its arrival

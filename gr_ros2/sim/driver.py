@@ -65,7 +65,11 @@ class Driver:
         gap = self._world.clearance(paths).min(axis=1) - self._wall_gap
         safe = gap >= 0
         cost = cost + np.maximum(0.0, 1.0 - gap / _COMFORT_WALL_M)
+        low, high = paths.min(axis=(0, 1)), paths.max(axis=(0, 1))
         for other in others:
+            apart = np.maximum(other.reserved.min(axis=0) - high, low - other.reserved.max(axis=0))
+            if apart.max() > self._robot_gap + _COMFORT_M:
+                continue  # its path is so far from all of these that it changes neither safety nor cost
             dx = paths[:, :, 0, None] - other.reserved[:, 0]
             dy = paths[:, :, 1, None] - other.reserved[:, 1]
             gap = np.sqrt((dx * dx + dy * dy).reshape(len(paths), -1).min(axis=1)) - self._robot_gap

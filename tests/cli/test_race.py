@@ -10,7 +10,7 @@ from gr_ros2.cli.main import BAD_INPUT, run
     [
         (["--loss", "some"], "--loss some: write percentages with commas between, such as 0,5,20"),
         (["--load", "-50"], "load.0 = -0.5"),
-        (["--peers", "nobody"], "peers = 'nobody': no such contender; known are gr-ros2, gr-ros2-plain"),
+        (["--peers", "nobody"], "peers = 'nobody': no such contender; known are gr-ros2, gr-ros2-v0"),
         (["--source", "here.mcap"], "source = 'here.mcap': write sim or bag:PATH"),
         (["--duration", "0"], "duration_s = 0"),
     ],

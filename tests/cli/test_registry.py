@@ -120,9 +120,9 @@ def test_what_no_registry_can_have_is_left_out_with_the_reason() -> None:
     found = [*FOUND, SERVICE, FEEDBACK, STATUS, *TWO, TopicInfo("/robot-1/odom", "nav_msgs/msg/Odometry", (Qos(),))]
     assert unfit(FOUND) == {}
     assert unfit(found) == {
-        SERVICE.topic: "it belongs to a service, and a link carries topics alone",
-        FEEDBACK.topic: "it belongs to an action, and a link carries topics alone",
-        STATUS.topic: "it belongs to an action, and a link carries topics alone",
+        SERVICE.topic: "it belongs to a service, whose row this command does not write (docs/how-to/services.md)",
+        FEEDBACK.topic: "it belongs to an action, whose row this command does not write (docs/how-to/services.md)",
+        STATUS.topic: "it belongs to an action, whose row this command does not write (docs/how-to/services.md)",
         "/n": "it has several types, std_msgs/msg/Int32 and std_msgs/msg/String",
         "/robot-1/odom": "ROS allows no such name, '-' may not stand in a ROS name; letters, digits, _ and / may",
     }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,6 +36,22 @@ def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
     out = capsys.readouterr().out
     assert "paper-direct: 1 s of simulated time" in out
     assert "Where every sent message went" in out
+
+
+@pytest.mark.parametrize("repetitions", [1, 2])
+def test_a_report_can_wait(repetitions: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "paper-direct", "--repetitions", str(repetitions), *LOSSY, "--out", str(tmp_path)]
+    assert command.run([*words, "--no-report"]) == 0
+    assert f"For the report: gr-ros2 report {tmp_path}\n" in capsys.readouterr().out
+    assert not [*tmp_path.rglob("*.html"), *tmp_path.rglob("*.png"), *tmp_path.rglob("*.svg")]
+    assert len([*tmp_path.rglob("result.json")]) == repetitions
+    assert command.run(["report", str(tmp_path)]) == 0
+    assert (tmp_path / "report.html").is_file()
+
+
+def test_matplotlib_is_loaded_only_to_draw() -> None:
+    program = "import sys, gr_ros2.cli.run, gr_ros2.cli.dashboard; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 
 
 def test_progress_is_told_where_the_output_is_no_terminal(

@@ -40,7 +40,7 @@ SWEEP: dict[str, Any] = {
     "list": [{"phy.name": "ofdm", "phy.options": {}}, {"phy.name": "gfsk", "phy.options": {}}],
 }
 
-OTHERS = {"rviz2", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
+OTHERS = {"rviz2", "direwolf", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
@@ -58,6 +58,14 @@ ONLY_PARSED = {
     ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
     ("docs/tutorial.md", "gr-ros2 registry from-graph --namespace /robot_1 --out topics.csv"): "needs a robot",
     ("docs/tutorial.md", "gr-ros2 registry check topics.csv"): "the same",
+    (
+        "docs/how-to/radios.md",
+        "gr-ros2 link --robot 1 --radio kiss --device tcp://localhost:8001 --set front_end.callsign=N0CALL-1",
+    ): "direwolf is not running",
+    (
+        "docs/how-to/radios.md",
+        "gr-ros2 link --robot 1 --radio serial --device /dev/ttyUSB0 --set phy.options.bit_rate=64000",
+    ): "no such device",
 }
 """Commands that a test cannot run as they stand: why. They are parsed like the others."""
 SHORTER = {
@@ -70,6 +78,8 @@ SHORTER = {
     "sweep": ("--set", "duration_s=0.5"),
 }
 """What is added to a command so that it ends soon."""
+REPORTING = ("README.md", "docs/tutorial.md")
+"""Pages whose runs write their reports too. The others' runs do without: drawing takes longer than the run."""
 
 
 def merged(base: Mapping[str, Any], keys: list[str], values: Any) -> dict[str, Any]:
@@ -156,14 +166,14 @@ def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fill(folder: Path) -> None:
-    ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", "clean", folder=folder)
+    demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=samples")
+    ours(*demo, "--out", "clean", folder=folder)
     for name in ("noisy", "results/a", "results/b"):
         shutil.copytree(folder / "clean", folder / name)
     bag = folder / "clean" / "delivered"
     (mcap,) = bag.glob("*.mcap")
     shutil.copy(mcap, folder / "IN.mcap")
-    renamed = ("--set", "ros_sink.namespace_format=/robot_{src_id}")
-    ours("run", "demo", "--duration", "2", "--set", "time=samples", "--out", "robot", *renamed, folder=folder)
+    ours(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
     shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
     shutil.copy(ROOT / "gr_ros2/scenarios/demo.yaml", folder / "my_scenario.yaml")
     shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
@@ -172,7 +182,9 @@ def fill(folder: Path) -> None:
 
 
 def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the program in a folder, with a home folder of its own; what it measures is kept for the next command."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **({} if home is None else {"HOME": str(home)})}
+    environment["XDG_CACHE_HOME"] = str((home or folder).parent / "cache")
     command = [sys.executable, "-m", "gr_ros2.cli", *arguments]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, f"{' '.join(arguments)}: {done.stderr}"
@@ -189,13 +201,13 @@ def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, t
             (folder / name).write_text(other.text)
     if words[-2:-1] == ["--out"] or "--out" in words:
         shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
-    shorter = list(SHORTER.get(words[1], ()))
-    if shorter and shorter[0] != "--set" and shorter[0] in words:  # of several settings of one name the last holds
-        shorter = []
+    shorter = list(SHORTER.get(words[1], ()))  # of several settings of one name the last holds
     if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {
         re.split("=", word)[0] for word in words
     }:
         shorter += ["--set", "time=samples"]
+    if words[1] in ("run", "demo") and block.page not in REPORTING:
+        shorter += ["--no-report"]
     if "--dashboard" in words:
         words = [word if word != "--dashboard" else "--dashboard=0" for word in words]
     if {"--set", "front_end={name: file, read: sent}"} <= set(words):

@@ -10,7 +10,7 @@ import pytest
 
 import gr_ros2
 from gr_ros2.errors import CodecError
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow, row_order
 
 ROOT = Path(gr_ros2.__file__).parent
 ENDS = {"source", "sink", "link"}
@@ -51,6 +51,12 @@ def test_rows_are_not_written_out_where_they_are_meant(row: LedgerRow) -> None:
                 assert not [arg for arg in node.args if isinstance(arg, ast.Constant) and arg.value == row.value], path
                 made += 1
     assert made
+
+
+def test_a_row_keeps_its_place() -> None:
+    assert row_order([{"in_flight": 1, "b": 1, "none": 0}, {"delivered": 1, "a": 1}]) == [
+        *("delivered", "a", "b", "in_flight"),
+    ]
 
 
 MADE_WITH_A_ROW = {"Lost", "Refused", "Dropped"}

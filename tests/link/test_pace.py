@@ -34,8 +34,36 @@ def test_the_interval_of_credits_is_measured_while_packets_wait() -> None:
     pace = Pace(AUTO)
     for at, waiting in ((0.0, True), (0.1, True), (0.2, False), (9.0, True)):
         pace.credit()
+        assert pace.may_leave(at)
         pace.left(at, waiting=waiting)
     assert pace.interval == pytest.approx(0.1)
+
+
+def test_the_first_interval_after_a_pause_counts_only_until_there_is_a_better_one() -> None:
+    """The first credit after a pause comes early: the PHY asks before it is free."""
+    pace = Pace(AUTO)
+    pace.use_credit()
+    assert not pace.may_leave(0.0)
+    pace.credit()
+    for at, interval in ((0.0, 0.0), (0.08, 0.08), (0.18, 0.1), (0.28, 0.1)):
+        assert pace.may_leave(at)
+        assert pace.interval == pytest.approx(interval)
+        pace.left(at, waiting=True)
+        pace.credit()
+    assert pace.may_leave(1.0)
+    assert pace.interval == pytest.approx(0.1)
+
+
+def test_the_air_is_free_when_all_that_left_is_over() -> None:
+    pace = Pace(AUTO)
+    pace.use_credit()
+    assert pace.free(3.0) == 3.0
+    for at in (0.0, 0.1, 0.2, 0.3):
+        pace.credit()
+        assert pace.may_leave(at)
+        pace.left(at, waiting=True)
+    assert pace.free(0.3) == pytest.approx(0.4)
+    assert pace.free(0.5) == 0.5
 
 
 def test_a_late_packet_does_not_lower_the_rate() -> None:

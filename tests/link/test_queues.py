@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.link import Sender
-from gr_ros2.link.queues import queue_for
+from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.queues import TopicQueue, queue_for
 from tests.link.engines import delivered, drain, read, receiver, sender
 
 
@@ -198,3 +199,17 @@ def test_every_message_ends_once(
     ended = Counter(topic for topic, _ in source.stats.refused.elements()) + source.stats.sent
     assert source.idle
     assert ended == source.stats.submitted
+
+
+def test_a_message_may_be_useless_before_the_deadline_of_its_queue() -> None:
+    queue = TopicQueue("deadline", 60.0)
+    lifespans = (60.0, 2.0, 100.0, 5.0)
+    for serial, lifespan_s in enumerate(lifespans):
+        queue.admit(Outgoing(serial, 0, b"message", 0, 10.0, lifespan_s=lifespan_s), 0)
+    assert [message.expires for message in queue] == [70.0, 12.0, 70.0, 15.0]
+    dropped = list(queue.expire(12.5, 0.0, 0.0, 50))
+    assert [(item.message.serial, item.row, item.detail) for item in dropped] == [
+        (1, "stale", "it waited longer than 2000 ms")
+    ]
+    assert [item.message.serial for item in queue.expire(16.0, 0.0, 0.0, 50)] == [3]
+    assert [message.serial for message in queue] == [0, 2]

@@ -41,8 +41,8 @@ def test_the_sample_rate_follows_from_the_load_and_the_load_from_the_sample_rate
     heavy, light = 2.0, 0.5
     found = conditions(RaceSettings(load=(heavy, light), loss=(0.2, 0.0)), recording)
     assert [(each.load, each.loss) for each in found] == [(light, 0.0), (light, 0.2), (heavy, 0.0), (heavy, 0.2)]
-    # 741 bytes with CRC-32 in 48 BPSK carriers are 124 symbols; 3 more, of 80 samples each, and a gap of 112.
-    assert found[0].sample_rate * light == pytest.approx(35 * (127 * 80 + 112), rel=1e-3)
+    # 741 bytes with CRC-32 in 48 BPSK carriers are 124 symbols; 3 more, of 80 samples each, and a gap of 32.
+    assert found[0].sample_rate * light == pytest.approx(35 * (127 * 80 + 32), rel=1e-3)
     assert found[2].sample_rate * heavy == pytest.approx(found[0].sample_rate * light)
     (fixed,) = conditions(RaceSettings(sample_rate=found[2].sample_rate, loss=(0.0,)), recording)
     assert fixed.load == pytest.approx(heavy)

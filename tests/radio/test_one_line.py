@@ -10,9 +10,11 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.errors import ConfigError
+from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
+from gr_ros2.setting import AUTO
 from gr_ros2.settings_file import portable_registry, settled
 from gr_ros2.yaml_text import yaml_text
 
@@ -23,6 +25,9 @@ GIVEN: dict[str, dict[str, Any]] = {
     "soapy": {"frequency": 433.2e6, "device": "driver=hackrf"},
     "uhd": {"frequency": 433.2e6, "frequency-rx": 434.4e6},
     "pluto": {"frequency": 433.2e6},
+    "kiss": {"device": "tcp://localhost:8001"},
+    "serial": {"device": "/dev/ttyUSB0"},
+    "udp": {"listen": "5551", "peer": ("10.0.0.2:5551",)},
 }
 
 
@@ -33,7 +38,9 @@ def test_the_yaml_it_prints_says_the_same(radio: str, tmp_path: Path) -> None:
     )
     settings = link_from(values)
     assert (settings.name, settings.ros_source.src_id(), settings.ros_source.namespace) == ("robot_7", 7, "/robot_7")
-    assert settings.phy.sample_rate == FRONT_ENDS[radio].sample_rate
+    row = FRONT_ENDS[radio]
+    assert (settings.phy.name, settings.phy.options) == (row.phy, row.phy_options)
+    assert settings.phy.sample_rate == (row.sample_rate if PHY.load(row.phy).has_samples else AUTO)
     FRONT_ENDS.load(radio).Options(**settings.front_end_options)
     path = tmp_path / "saved.yaml"
     path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
@@ -48,10 +55,21 @@ def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypat
     assert portable_registry(settled(one_line(1, "sim", None, {}), Path())["registry"]) == "table4"
 
 
+def test_topics_of_the_graph_need_no_registry(tmp_path: Path) -> None:
+    values = settled(one_line(1, "sim", None, {}, "auto, -camera/*"), Path())
+    settings = link_from(values)
+    assert (settings.registry, settings.ros_source.topics) == ("", ("auto", "-camera/*"))
+    path = tmp_path / "saved.yaml"
+    path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
+    assert load_link(path) == settings
+    assert load_link(path, ["ros_source.topics=auto, -camera/*"]) == settings
+    assert portable_registry(settled(one_line(1, "sim", "table4", {}, "odom"), Path())["registry"]) == "table4"
+
+
 @pytest.mark.parametrize(
     ("radio", "flags", "said"),
     [
-        ("zmq", {"listen": "5551"}, r"--peer is missing, radio zmq needs it \(zmq: address of another robot"),
+        ("zmq", {"listen": "5551"}, r"--peer is missing, radio zmq needs it \(zmq, udp: address of another robot"),
         ("pluto", {}, r"--frequency is missing, radio pluto needs it \(Hz"),
         ("pluto", {"peer": ("a:1",)}, "--peer: radio pluto has no such setting; it takes --device, --frequency"),
         ("sim", {"listen": "5551"}, "--listen: radio sim has no such setting; it takes none"),
@@ -65,4 +83,4 @@ def test_an_option_too_many_or_too_few_is_named(radio: str, flags: dict[str, Any
 
 def test_every_option_is_a_setting_of_some_radio() -> None:
     settings = {name for radio in FRONT_ENDS.own for name in FRONT_ENDS.load(radio).Options.__dataclass_fields__}
-    assert {flag.setting for flag in FLAGS.values()} <= settings
+    assert {setting for flag in FLAGS.values() for setting in flag.settings} <= settings

@@ -12,8 +12,12 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.gr.health import LinkHealth
 from gr_ros2.keys import new_key_file
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import load_link
-from tests.radio.robots import Robot
+from tests.domains import domain
+from tests.middleware.support import CUSTOM, LATCHED, message
+from tests.radio.robots import QOS, Robot
 from tests.waiting import wait_for
 
 SLOW = 2e5
@@ -66,6 +70,56 @@ def test_a_receiver_without_a_registry_gets_every_message_though_packets_are_los
     assert caplog.text.count("no key, so anybody can read") == 2
 
 
+def test_topics_are_taken_from_the_graph_and_what_was_received_is_not_sent_back(
+    ends: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    """Both robots send all that they have. Types, QoS, and topics that come later are known from the graph alone."""
+    options = {"robot_1/early": {"codec": "none"}}
+    words: dict[str, Any] = {"topics": "auto, -*/secret/*", "namespace": "", "topic_options": options}
+    with (
+        robot(1, ends[0], tmp_path, registry="", ros_source={**words, "robot_id": 1}) as one,
+        robot(2, ends[1], tmp_path, registry="", ros_source={**words, "robot_id": 2}) as two,
+        MemoryMiddleware(domain_id=domain(1)) as near,
+        MemoryMiddleware(domain_id=domain(2)) as far,
+    ):
+        said = message(1, 300)
+        arrived: dict[str, list[bytes]] = {name: [] for name in ("kept", "early", "later", "secret/key", "_hidden")}
+        for name, heard in arrived.items():
+            far.subscribe(f"/rx_robot_1/robot_1/{name}", CUSTOM, Qos(None, None, 0), heard.append)
+        near.advertise("/robot_1/kept", CUSTOM, LATCHED).publish(said)
+        near.advertise("/rx_robot_9/chat", CUSTOM, QOS)  # from another link on this graph
+        publishers = {name: near.advertise(f"/robot_1/{name}", CUSTOM, QOS) for name in arrived if name != "kept"}
+        wait_for(lambda: arrived["kept"], "the message that its publisher keeps")
+        assert [end.durability for end in republished(far, "/rx_robot_1/robot_1/kept")] == ["transient_local"]
+
+        def arrives(name: str) -> bool:
+            publishers[name].publish(said)
+            return bool(arrived[name])
+
+        wait_for(lambda: arrives("early"), "a topic of the graph")
+        added = near.advertise("/added", CUSTOM, QOS)
+        wait_for(lambda: "/added" in one.link.source.subscribed, "a topic that comes later")
+        added.close()
+        wait_for(lambda: "/added" in one.link.source.unmatched, "its publisher to go")
+        wait_for(lambda: "/robot_2/chat" in two.link.source.subscribed, "what robot 2 itself has")
+        answer = two.say(5)
+        wait_for(lambda: arrives("later") and republished(near, "/rx_robot_2/robot_2/chat"), "both directions")
+        assert answer
+        assert set(one.link.source.subscribed) == {
+            *("/robot_1/chat", "/robot_1/kept", "/robot_1/early", "/robot_1/later", "/added")
+        }
+        assert set(two.link.source.subscribed) == {"/robot_2/chat"}
+        assert not arrived["secret/key"]
+        assert not arrived["_hidden"]
+        names = [topic.name for topic in one.link.registry if topic.is_topic]
+        assert [f"/{name}" for name in names] == list(one.link.source.subscribed)
+
+
+def republished(graph: MemoryMiddleware, topic: str) -> list[Qos]:
+    """The publishers of a topic on a graph."""
+    return [offer for info in graph.discover() if info.topic == topic for offer in info.publishers]
+
+
 def test_either_end_may_start_again(ends: list[dict[str, Any]], tmp_path: Path) -> None:
     with robot(1, ends[0], tmp_path) as one:
         for first in (10, 20):
@@ -100,7 +154,7 @@ def test_with_a_key_only_those_who_have_it_are_heard(
                 receiver, *_ = LinkHealth(two.link.config.diagnostics, "link").judge(two.link.stats(), 0.0)
                 assert any("packets refused: sealed" in problem for problem in receiver.problems)
                 assert not two.heard
-                assert f"({kind})" in caplog.text
+                wait_for(lambda: f"({kind})" in caplog.text, "a line about it")  # noqa: B023 - called at once
     with robot(1, ends[0], tmp_path) as one, robot(2, ends[1], tmp_path, key=fleet) as two:
         one.say(3)
         wait_for(lambda: rejected(two).get("not_sealed", 0) > 0, "a packet that is not sealed")

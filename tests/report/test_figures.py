@@ -7,18 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.report.figures import (
-    SENT_EVERY,
-    latency_figure,
-    ledger_figure,
-    path_figure,
-    row_colour,
-    row_order,
-    save_figure,
-)
+from gr_ros2.report.figures import SENT_EVERY, latency_figure, ledger_figure, path_figure, save_figure
 
 ANGLE = np.linspace(0, 6, 501)
 PATH = np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])
@@ -51,6 +43,13 @@ def test_files_are_png_and_svg(tmp_path: Path) -> None:
     assert "<svg" in svg.read_text()
 
 
+def test_the_layout_is_the_one_that_matplotlib_computes(tmp_path: Path) -> None:
+    own, other = (path_figure(PATH, PATH[::20], "a", "b") for _ in range(2))
+    png, _ = save_figure(own, tmp_path, "path")
+    other.savefig(tmp_path / "expected.png", dpi=150)
+    assert (imread(png) == imread(tmp_path / "expected.png")).all()
+
+
 def test_pyplot_is_not_touched(tmp_path: Path) -> None:
     save_figure(latency_figure({"a": [0.1]}), tmp_path, "latency")
     assert "matplotlib.pyplot" not in sys.modules
@@ -75,11 +74,3 @@ def test_ledger_bars_fill_the_width() -> None:
 def test_no_ledger_can_be_drawn(tmp_path: Path) -> None:
     written = save_figure(ledger_figure({"a": {}}), tmp_path, "ledger")
     assert [path.stat().st_size > 0 for path in written] == [True] * 2
-
-
-def test_a_row_keeps_its_place_and_colour() -> None:
-    assert row_order([{"in_flight": 1, "b": 1, "none": 0}, {"delivered": 1, "a": 1}]) == [
-        *("delivered", "a", "b", "in_flight"),
-    ]
-    assert len({row_colour(row) for row in LedgerRow}) == len(LedgerRow)
-    assert row_colour("never heard of") == "#882255"

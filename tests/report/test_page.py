@@ -65,7 +65,7 @@ def test_the_papers_numbers_stand_above_the_runs(tmp_path: Path) -> None:
         f"{_goodput(tmp_path)} Direct the paper 15.0 452 452 1.00 21767.9"
     )
     assert "made &lt;by&gt; hand" in text
-    assert "8 (16%) lost for want of a fragment" in text
+    assert "8 (16%) lost because a fragment did not arrive" in text
 
 
 def _goodput(directory: Path) -> str:

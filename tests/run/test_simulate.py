@@ -190,7 +190,7 @@ class Answering(EndpointV0):
     answers = True
 
     def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
-        events = super().receive(data, now)
+        events = super().receive(data, now, snr_db)
         for event in events:
             if isinstance(event, Delivered):
                 self.submit(event.topic_id, len(event.payload).to_bytes(4, "big"), now)

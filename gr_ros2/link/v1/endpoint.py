@@ -17,7 +17,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy
+from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.events import (
     AirKind,
@@ -39,13 +39,14 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController, Rung
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
+from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -58,7 +59,6 @@ from gr_ros2.wire.control import (
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.v1 import (
     BROADCAST,
-    MAX_TOPICS,
     QOS_STANDING,
     TABLE_TOPIC,
     Entry,
@@ -74,7 +74,7 @@ from gr_ros2.wire.v1 import (
 )
 
 FORCED = 20
-"""New packets after which a report that found no room is sent in a packet of its own: 5 % of the slots."""
+"""Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
 _POLL_S = 0.02
@@ -117,8 +117,6 @@ class Endpoint:
         self._rate = RateController(ladder) if ladder else None
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
-        if topics is not None and len(topics) > MAX_TOPICS:
-            raise ConfigError(f"{len(topics)} topics; at most {MAX_TOPICS}")
         self.received = ReceiverStats()
         """What arrived and what did not."""
         self._observer = observer
@@ -129,7 +127,7 @@ class Endpoint:
         sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
         self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
-        """Byte of a packet up to which its body is padded."""
+        """Number of bytes to which the packet with its padded body extends."""
         self._trailer = self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
         self.window = RepairWindow(
@@ -140,10 +138,13 @@ class Endpoint:
         )
         self.topics = topics
         """What it sends."""
-        self._speaks = bool(topics) or settings.hears
+        self._codec = codec
         self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._pace = Pace(settings.packet_rate)
+        self._hold = Hold()
+        self._repair_at = -inf
+        """Time in s up to which repairs wait, because a new message is about to come."""
         self._talk = Talk(settings, boot, encrypts=self.keys.encrypts)
         self._started = False
         self._hello_number = -1
@@ -157,7 +158,7 @@ class Endpoint:
     @property
     def answers(self) -> bool:
         """Whether what it receives can change what it sends."""
-        return self._speaks
+        return bool(self.topics) or self.settings.hears
 
     @property
     def sent(self) -> SenderStats:
@@ -170,12 +171,40 @@ class Endpoint:
         mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a serialized message."""
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a serialized message.
+
+        :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline
+        """
         if self.topics is None or not 0 <= topic_id < len(self.topics):
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
-        self.outbox.submit(topic_id, payload, now)
+        self._hold.submitted(topic_id, now)
+        self.outbox.submit(topic_id, payload, now, lifespan_s)
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Start or stop announcing a service to the other robots. At the start, services are not announced."""
+        if self.outbox.offer(topic_id, offered=offered) and self._started:
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
+
+    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:
+        """Send one more topic. The robots that hear this one learn of it from the next hello.
+
+        :return: everything that is sent; the new topic is the last one
+        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option
+        """
+        before = self.topics or ()
+        topic = Topic(len(before), name, type_name, options)
+        together = Registry([*before, topic])
+        if self._codec is not None:
+            self._codec.add(topic)
+        self.topics = together
+        self.outbox.add([topic])
+        self._talk.hurry(self._now)
+        if self._started and self._repeat_at == inf and self.settings.repeat_s:
+            self._repeat_at = self._now + self.settings.repeat_s
+        return together
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
@@ -242,12 +271,12 @@ class Endpoint:
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if self._pace.out_of_credit or now < self._pace.slot or not self._speaks:
+        if not self._pace.may_leave(now) or not self.answers:
             return None
         data = self._compose(now)
         if data is None:
             return None
-        self._pace.left(now, waiting=not self.outbox.idle)
+        self._pace.left(now, waiting=True)
         return data
 
     def use_credit(self) -> None:
@@ -264,14 +293,22 @@ class Endpoint:
         return self._pace.out_of_credit
 
     def follow(
-        self, topic_id: int, *, reliable: bool = True, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+        self,
+        topic_id: int,
+        *,
+        reliable: bool = True,
+        latched: bool = False,
+        depth: int = 0,
+        lifespan_s: float = 0.0,
+        period_s: float = 0.0,
     ) -> bool:
         """Take over the QoS of a topic's publishers, where the configuration leaves it open.
 
         :return: whether that changed its queue
         """
         before, table = self.queue(topic_id), self.outbox.digest
-        self.outbox.follow(topic_id, reliable=reliable, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
+        kept = {"reliable": reliable, "latched": latched}
+        self.outbox.follow(topic_id, **kept, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
         if self.outbox.digest != table:
             self._talk.hurry(self._now)
         return self.queue(topic_id) != before
@@ -286,6 +323,7 @@ class Endpoint:
     def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         self._now = max(self._now, now)
+        self._repair_at = -inf
         self._receive(data, now, snr_db)
         events, self._events = self._events, []
         return events
@@ -312,7 +350,7 @@ class Endpoint:
     def next_departure(self) -> float | None:
         """When ``next_packet`` may have something, if no other method is called before."""
         now = self._now
-        if self.out_of_credit or not self._speaks:
+        if self.out_of_credit or not self.answers:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
@@ -320,10 +358,12 @@ class Endpoint:
             leaving.append(waiting)
         if self.settings.hears:
             leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+            leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
         if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
-            leaving.append(now if self._mode() == "idle" else now + _POLL_S)
+            doubt = min(now + _POLL_S, self.window.next_doubt(now))
+            leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
         return max(min(leaving), self._pace.slot)
 
     # ---- what leaves
@@ -354,8 +394,11 @@ class Endpoint:
             return self._control(asks, "hello", now)
         if self._pace.known:
             self.window.mode = self._mode()
-            return self._repair(now)
-        return None
+            repair = self._repair(now)
+            if repair is not None:
+                return repair
+        early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
+        return self._say(early, now) if early else None
 
     def _start(self, now: float) -> None:
         self._started = True
@@ -387,6 +430,8 @@ class Endpoint:
         clear = write_header(header)
         data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
         self.window.sent(number, body, data, lives, now)
+        if lives:
+            self._hold.left(now, self.window.loss)
         return self._leave(data, Packet(header, tuple(entries), encrypted=self.keys.encrypts), "new", now, parts)
 
     def _standing(
@@ -409,16 +454,25 @@ class Endpoint:
         return self._standing(Standing(row, clear=clear), self.window.newest, body, entries, kind=kind, now=now)
 
     def _repair(self, now: float) -> bytes | None:
-        chosen = self.window.next(now)
+        self._repair_at = -inf
+        chosen = self.window.next(now, self._held)
+        held = self._repair_at > now
+        if chosen is None:
+            lives = () if held else self.window.exhausted(now)
+            return self._source([], lives, 0, (), now) if lives else None
+        self._hold.repaired(waiting=held)
         if isinstance(chosen, Repair):
             number, mask, row, oldest, combined = chosen
             return self._standing(Standing(row, mask, oldest), number, combined, (), kind="repair", now=now)
-        if chosen is not None:
-            header = read_header(chosen.data, self.settings.packet_len)
-            entries = tuple(read_body(chosen.body, self._room))
-            return self._leave(chosen.data, Packet(header, entries, encrypted=self.keys.encrypts), "repair", now)
-        lives = self.window.exhausted(now)
-        return self._source([], lives, 0, (), now) if lives else None
+        header = read_header(chosen.data, self.settings.packet_len)
+        entries = tuple(read_body(chosen.body, self._room))
+        return self._leave(chosen.data, Packet(header, entries, encrypted=self.keys.encrypts), "repair", now)
+
+    def _held(self, now: float) -> bool:
+        """Whether a repair that could leave now waits for a new message."""
+        airtime = self._pace.interval
+        self._repair_at = self._hold.until(now, self._pace.free(now) + airtime, airtime)
+        return self._repair_at > now
 
     def _hello(self, now: float) -> bytes:
         quiet = self.window.newest == self._hello_number and not self.window.reported

@@ -21,28 +21,28 @@ MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
 class Settings:
     """One robot's end of a link.
 
-    :param src_id: 0..254; ``NOBODY`` at an end that only receives, and takes packets whomever they are for
+    :param src_id: 0..254; ``NOBODY`` at an end that only receives. Such an end takes packets for any robot
     :param packet_len: bytes of the longest packet, the same at all ends
     :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
-    :param dst_id: whom packets are for, 255 everybody
+    :param dst_id: id of the robot that packets are for, 255 = all robots
     :param hop: hop count of addressed packets
     :param repair: what idle slots carry; auto takes ``thrifty`` where reports come and ``idle`` where none do
-    :param expected_loss: share of packets lost, as long as no report tells
+    :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
-    :param half_duplex: whether a report takes a slot from what is received
-    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired
+    :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
+    :param hold_s: s that a complete message of a reliable topic waits for an earlier one that can still be repaired
     :param report_every: packets received from one report to the next
-    :param repeat_s: s between repeats of latched messages while nobody reports; 0 off
-    :param give_up_s: s of silence after which a robot is taken for gone
+    :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
+    :param give_up_s: s of silence after which a robot is regarded as gone
     :param reassembly_timeout_s: s that an incomplete message waits for its next fragment
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
-    :param min_fragment: bytes of a message below which no fragment begins in a packet that others share
-    :param flush_timeout_s: s that a partly filled packet waits for company
-    :param packet_rate: packets/s at most; auto as credits come, where they do; 0 unpaced
-    :param queue_depth: messages waiting per topic; 0 unbounded
-    :param depth: newer messages after which one of a topic without lifespan is not repaired any more, while nobody
-        reports
+    :param min_fragment: fewest bytes of a message that begin in a packet which has entries of others
+    :param flush_timeout_s: s that a partly filled packet waits for more entries
+    :param packet_rate: packets/s at most; auto = as many as credits allow, where credits are given; 0 = no limit
+    :param queue_depth: messages that may wait per topic; 0 = no limit
+    :param depth: number of newer messages of the same topic after which a message is not repaired any more. It applies
+        to topics without lifespan, while no robot reports
     """
 
     src_id: int
@@ -65,7 +65,7 @@ class Settings:
     flush_timeout_s: float = 0.0
     packet_rate: float | Auto = AUTO
     queue_depth: int = 100
-    depth: int = 16
+    depth: int = 48
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:

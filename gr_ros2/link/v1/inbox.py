@@ -26,7 +26,7 @@ from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
-from gr_ros2.link.v1.repair import MAP, SPAN
+from gr_ros2.link.v1.repair import MAP, PROMPT, SPAN
 from gr_ros2.wire.control import REPORT_LEN, Control, Report, reportable
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table
@@ -106,7 +106,7 @@ class Inbox:
         self.decoder = RepairDecoder(room, self._plausible, span)
         self.decoder.begin(first)
         self.decoder.newest = first - 1
-        self._low = self._wanted = first
+        self._first = self._low = self._wanted = first
         """Packets before this number are neither waited for nor needed."""
         self._dead = first
         """The sender does not repair packets before this number any more."""
@@ -236,6 +236,11 @@ class Inbox:
             return now
         return self._reported_at + _REPORT_S
 
+    @property
+    def report_helps(self) -> bool:
+        """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
+        return self._unreported > 0 and self.loss >= PROMPT and not self._settings.half_duplex
+
     def report(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
         self._unreported = 0
@@ -305,7 +310,8 @@ class Inbox:
             self.counts["missing"] += gone
             self._stats.packet_loss_est += gone
             self._missed = True
-            self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
+            if newest >= self._first:  # earlier ones are missing because nobody listened
+                self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
         self.decoder.advance(number)
         gaps, floor = self._gaps, self.decoder.floor
         gaps.extend((now, missing) for missing in range(max(newest + 1, floor), newest + 1 + gone))

@@ -9,6 +9,9 @@ packet heard before the restart is refused. A robot that stands still (its packe
 below that number once it says that it has heard the present start of this robot: only that robot can say so, and only
 after the restart.
 
+Where packets are not sealed, only the boot number of every robot is stored. A robot whose boot number is stored was
+heard before this robot restarted, so its packets count from the first hello on, and no message comes out twice.
+
 Invariants: no body is given out that was not opened; no standing packet is given out twice; where packets are sealed,
 an older start of a robot is never accepted again.
 """
@@ -197,7 +200,7 @@ class Neighbours:
 
     def settle(self, now: float) -> None:
         """Store the exact packet number reached by robots that are quiet."""
-        if self._save is None:
+        if self._save is None or not self._keys.sealed:
             return
         for neighbour in self._known.values():
             exact = neighbour.inbox.newest + 1
@@ -225,7 +228,9 @@ class Neighbours:
         trailer = self._trailer(src_id, hello, clear, rest, (number, standing.row))
         boot, floor = self._stored.get(src_id, (-1, 0))
         floor = floor if boot == hello.boot else 0
-        if number < floor:
+        if not self._keys.sealed:
+            floor = number + 1 if boot == hello.boot else 0
+        elif number < floor:
             if Heard(*self._own) not in entries:
                 raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
             floor = number + 1
@@ -236,7 +241,7 @@ class Neighbours:
         met = Neighbour(src_id, hello.boot, trailer, inbox, hello, now)
         met.rows[number] = 1 << standing.row
         self._known[src_id] = met
-        self._store(met, max(floor, number + 1), now)
+        self._store(met, max(floor, number + 1) if self._keys.sealed else 0, now)
         return Opened(met, header, number, standing, b"", entries, True, neighbour)
 
     def _refuse_old(self, src_id: int, boot: int, neighbour: Neighbour | None, now: float) -> None:
@@ -283,7 +288,7 @@ class Neighbours:
 
     def _guard(self, neighbour: Neighbour, number: int, now: float) -> None:
         """Store that a robot has reached this number, before the packet is used."""
-        if number < neighbour.floor or self._save is None:
+        if number < neighbour.floor or self._save is None or not self._keys.sealed:
             return
         if now - neighbour.saved < _SAVING_S:
             neighbour.reserve = min(2 * neighbour.reserve, _MOST_RESERVED)

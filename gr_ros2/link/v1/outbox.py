@@ -9,8 +9,8 @@ the free bytes of the packet; it is not fixed beforehand.
 
 *Lifetime.* The topic decides how long a message is worth repairing. With ``latest``, it is until a newer message has
 left whole. With a lifespan, it is until that has passed. Otherwise it is until ``depth`` newer messages have left, or
-enough newer ones to fill a repair. Receivers that report say when they have a message; then only the publishers' depth
-limits the lifetime.
+enough newer ones to fill a repair, and not longer after the next message than a receiver waits for it. Receivers that
+report say when they have a message; then only the publishers' depth limits the lifetime.
 
 Invariants: the messages of a topic begin one after the other, each after the one before has left whole; every message
 ends in being sent or in a Refused with its row.
@@ -37,7 +37,7 @@ from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
-from gr_ros2.registry import Registry
+from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
@@ -54,6 +54,12 @@ SETTLING_S = 1.0
 it yet."""
 STARTING_S = 2.0
 """s from the start during which the table is repaired even if no receiver reports."""
+WORTH = 0.85
+"""Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
+receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
+REPORTED_DEPTH = 160
+"""Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
+known."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -111,18 +117,16 @@ class Outbox:
         observer: Observer,
     ) -> None:
         self._settings = settings
-        self._topics = topics
+        self._topics: dict[int, Topic] = {}
         self._boot = boot
         self._room = room
         self._codec = codec
         self._observe = observer
         self._queues: dict[int, TopicQueue] = {}
         self._depths: dict[int, int] = {}
-        for topic in topics or ():
-            self._queues[topic.topic_id] = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
-        self._lives: dict[int, deque[tuple[Life, int]]] = {
-            topic_id: deque() for topic_id in (*self._queues, TABLE_TOPIC)
-        }
+        self._latched: dict[int, bool] = {}
+        """Whether the publishers of a topic keep messages for late joiners."""
+        self._lives: dict[int, deque[tuple[Life, int]]] = {TABLE_TOPIC: deque()}
         self._packets_of: Counter[int] = Counter()
         """Lifetimes that packets refer to, by topic."""
         self._kept: dict[int, deque[_Kept]] = {}
@@ -136,17 +140,45 @@ class Outbox:
         self._starting_until = inf
         self.reported = False
         """Whether receivers report, so that it is known when a message is over."""
-        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        self._with_deadline: list[TopicQueue] = []
         self._ordered: dict[int, bool] = {}
+        self._hidden: set[int] = set()
+        """Topics that the table leaves out: services whose server is not there."""
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
-            self._queues[TABLE_TOPIC] = TopicQueue("latest")
-            self._tabulate()
+            self.add(topics)
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """Take a message. It may be refused, or cause other messages of its topic to be dropped."""
-        assert self._topics is not None
+    def add(self, topics: Sequence[Topic]) -> None:
+        """Send and announce these topics too."""
+        for topic in topics:
+            self._topics[topic.topic_id] = topic
+            self._queues[topic.topic_id] = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
+            self._lives[topic.topic_id] = deque()
+        self._hidden |= {topic.topic_id for topic in topics if not topic.is_topic}
+        if TABLE_TOPIC not in self._queues:
+            self._queues[TABLE_TOPIC] = TopicQueue("latest")
+        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        self._tabulate()
+
+    def offer(self, topic_id: int, *, offered: bool) -> bool:
+        """Announce a service, or no longer.
+
+        :return: whether the table of topics has changed
+        """
+        if offered:
+            self._hidden.discard(topic_id)
+        else:
+            self._hidden.add(topic_id)
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+        """Take a message. It may be refused, or cause other messages of its topic to be dropped.
+
+        :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
+        """
         topic = self._topics[topic_id]
         serial = self._serial
         self._serial += 1
@@ -160,11 +192,14 @@ class Outbox:
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
-        if topic.latched:
+        if self._is_latched(topic):
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
             kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
         qos = QOS_NAMES.index(topic.options.qos)
-        self._admit(Message(serial, topic_id, payload, qos, now, topic.options.weight, coded=codec is not None))
+        weight = topic.options.weight
+        self._admit(
+            Message(serial, topic_id, payload, qos, now, weight, coded=codec is not None, lifespan_s=lifespan_s)
+        )
 
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
@@ -178,7 +213,6 @@ class Outbox:
                 qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
                 queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
             else:
-                assert self._topics is not None
                 weight = self._topics[topic_id].options.weight
                 again = Message(
                     kept.serial, topic_id, kept.payload, QOS_BULK, now, weight, repeat=True, coded=kept.coded
@@ -202,14 +236,16 @@ class Outbox:
             if now >= kept.named
         ]
 
-    def follow(self, topic_id: int, *, reliable: bool, depth: int, lifespan_s: float, period_s: float) -> bool:
+    def follow(
+        self, topic_id: int, *, reliable: bool, latched: bool, depth: int, lifespan_s: float, period_s: float
+    ) -> bool:
         """Take over the QoS of a topic's publishers, where the configuration leaves it open.
 
         :return: whether the table of topics has changed
         """
-        assert self._topics is not None
         queue = self._queues[topic_id]
         self._depths[topic_id] = depth
+        self._latched[topic_id] = latched
         self._ordered[topic_id] = reliable
         queue.change(*queue_for(self._topics[topic_id].options, depth, lifespan_s, period_s))
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
@@ -297,7 +333,9 @@ class Outbox:
     def _tabulate(self) -> None:
         """Make the table of topics."""
         rows = []
-        for topic in self._topics or ():
+        for topic in self._topics.values():
+            if topic.topic_id in self._hidden:
+                continue
             options = topic.options
             reliable = options.reliability
             ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
@@ -305,18 +343,25 @@ class Outbox:
             depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
             codec = "" if self._codec is None else options.codec
             qos = QOS_NAMES.index(options.qos)
-            name, kind = topic.name, topic.type_name
-            rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, topic.latched, min(depth, 255), codec))
+            name, kind, latched = topic.name, topic.type_name, self._is_latched(topic)
+            rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, latched, min(depth, 255), codec))
+        if not rows and not self.digest:
+            return
         table = write_table(rows)
         self.digest = crc32(table)
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
+
+    def _is_latched(self, topic: Topic) -> bool:
+        """Whether late joiners get the newest messages: as configured, by ROS convention, or as its publishers say."""
+        learned = topic.options.durability == AUTO and self._latched.get(topic.topic_id, False)
+        return learned or topic.latched
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
-        depth = AUTO if self._topics is None else self._topics[topic_id].options.queue_depth
+        depth = self._topics[topic_id].options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
     def _admit(self, message: Message) -> None:
@@ -384,7 +429,10 @@ class Outbox:
         if queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = self._depths.get(topic_id, 0) or 10 * most
+            most = self._depths.get(topic_id, 0) or REPORTED_DEPTH
+        elif lives:
+            before, _ = lives[-1]
+            before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
         lives.append((message.life, message.index))
         self._packets_of[topic_id] += message.index
         while len(lives) > 1 and (len(lives) > most or (self._packets_of[topic_id] > GROUP and not self.reported)):

@@ -12,6 +12,11 @@ replaced by newer ones. With one live packet the rule is repetition, which is ag
 the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, and after 1.36
 times as many in separate groups of 64.
 
+*Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
+then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
+reports are rare, it cannot know that so soon: it sends about as many repairs as losses are to be expected, before a
+report names them.
+
 *Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
 reduced to ``FEW`` packets, and to those of the newest message.
 
@@ -22,7 +27,7 @@ coefficients; no live packet is more than ``span`` numbers old.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
@@ -42,6 +47,9 @@ SPAN = 30_000
 MAP = 64
 """Number of packets that a report covers."""
 
+PROMPT = 1 / 64
+"""Share of packets lost from which on a receiver reports every packet at once, if that takes no slot from anything. The
+sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
 TURN = 3
 """While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
@@ -51,7 +59,9 @@ _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair (thrifty)."""
 _TIMES = 512
 _PATIENCE_S = 0.2
-"""s after which a packet that no report covers counts as lost with probability 1/2."""
+"""s that are added to the time for a report, unless the receiver reports every packet at once."""
+_MARGIN = 1.2
+"""Factor on the longest recent delay of a report."""
 
 
 @dataclass(slots=True, eq=False)
@@ -102,20 +112,48 @@ class Repair(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Receiver:
-    """What the reports of one receiver have told."""
+    """What is known from the reports of one receiver."""
 
     bit: int
     heard: float
     loss: float = 0.0
     newest: int = -1
     interval: float = 0.0
+    waits: bool = False
+    """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    """Times in s from the departure of packets that were sent once to the report that covers them."""
     lost: set[int] = field(default_factory=set)
 
     @property
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it."""
         return min(self.delays) if self.delays else 0.0
+
+    @property
+    def prompt(self) -> bool:
+        """Whether it reports every packet at once, so that a report that does not come says something."""
+        return self.loss >= PROMPT and bool(self.answers)
+
+    @property
+    def answer(self) -> float:
+        """Time in s after which a report about a packet is to be expected."""
+        return max(self.answers) * _MARGIN if self.prompt else self.delay + self.interval
+
+    @property
+    def patience(self) -> float:
+        """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
+        return self.answer if self.prompt else 2 * self.answer + _PATIENCE_S
+
+    @property
+    def doubt(self) -> float:
+        """Probability that a packet is lost if its report does not come: it or the report was lost."""
+        return 1 / (2 - self.loss) if self.prompt else max(self.loss, 0.5)
+
+
+def _never(_now: float) -> bool:
+    return False
 
 
 class RepairWindow:
@@ -135,13 +173,15 @@ class RepairWindow:
         self._expected = expected_loss
         self._span = span
         self._records: dict[int, Sent] = {}
-        """All packets from the oldest live one on, by number and in this order."""
+        """All packets from the oldest one that can still be repaired, by number and in this order."""
         self._oldest = 0
         """No older packet is recorded."""
         self.newest = 0
         """Number of the last source packet; 0 before the first."""
         self._receivers: dict[int, Receiver] = {}
         self._everybody = 0
+        self.loss = expected_loss
+        """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
         """Negated numbers of the packets that the only receiver lacks."""
         self._rows: dict[int, int] = {}
@@ -152,6 +192,9 @@ class RepairWindow:
         self._flight: deque[tuple[float, int, int]] = deque()
         """The time until which a repair may be on its way without a report about it, and its window."""
         self._times: dict[int, float] = {}
+        """When the newest packets left, s."""
+        self._once: set[int] = set()
+        """Those of them that were neither sent again nor combined: what a report says arrived when it was sent."""
         self._slots = [0.0, 0.0]
         """Recent numbers of new packets and of idle slots."""
 
@@ -165,6 +208,8 @@ class RepairWindow:
         self.newest = number
         self._times[number] = now
         self._times.pop(number - _TIMES, None)
+        self._once.add(number)
+        self._once.discard(number - _TIMES)
         slots = self._slots
         slots[0] = slots[0] * _DECAY + 1
         slots[1] *= _DECAY
@@ -182,6 +227,7 @@ class RepairWindow:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
             peer = self._receivers[receiver] = Receiver(1 << free, now)
             self._everybody |= peer.bit
+            self.loss = self._worst()
         return peer
 
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
@@ -198,14 +244,21 @@ class RepairWindow:
         gap = now - peer.heard
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
+        self.loss = self._worst()
         sent_at = self._times.get(number)
         if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
+            if loss >= PROMPT and number > peer.newest and number in self._once:
+                peer.answers.append(now - sent_at)
         peer.newest = max(peer.newest, number)
         records, bit, delay = self._records, peer.bit, peer.delay
+        peer.waits = False
         for back in range(MAP):
             record = records.get(number - back)
-            if record is None or record.confirmed & bit:
+            if record is None:
+                peer.waits |= number > back and not arrived >> back & 1
+                continue
+            if record.confirmed & bit:
                 continue
             if arrived >> back & 1:
                 record.confirmed |= bit
@@ -226,6 +279,7 @@ class RepairWindow:
         peer = self._receivers.pop(receiver, None)
         if peer is not None:
             self._everybody &= ~peer.bit
+            self.loss = self._worst()
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
@@ -254,8 +308,15 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def next(self, now: float) -> Sent | Repair | None:
-        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing."""
+    def _worst(self) -> float:
+        return max((peer.loss for peer in self._receivers.values()), default=self._expected)
+
+    def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
+        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
+
+        :param held: whether a combination has to wait, at this time in s; only asked if there is one. One that has a
+            packet in it that is known to be lost does not wait
+        """
         slots = self._slots
         slots[0] *= _DECAY
         slots[1] = slots[1] * _DECAY + 1
@@ -270,7 +331,26 @@ class RepairWindow:
         window = self._window(now)
         if not window or (self.mode == "thrifty" and not self._worth(window, now)):
             return None
+        if held(now) and not self._named(window):
+            slots[1] -= 1  # repair cannot use this slot
+            return None
         return self._combination(window, now)
+
+    def _named(self, window: list[Sent]) -> bool:
+        """Whether a report names a packet of this window that is lost."""
+        return any(record.number in peer.lost for peer in self._receivers.values() if peer.lost for record in window)
+
+    def next_doubt(self, now: float) -> float:
+        """When a report about one of the newest packets, or about a repair, is overdue next (thrifty), s; inf if none
+        is expected."""
+        times = [at for at, _, _ in self._flight if at > now][:1]
+        waits = [(peer.bit, peer.patience) for peer in self._receivers.values()]
+        for number in range(self.newest, max(self._oldest, self.newest - GROUP + 1) - 1, -1):
+            record = self._records.get(number)
+            if record is not None:
+                overdue = (record.at + patience for bit, patience in waits if not record.confirmed & bit)
+                times += [at for at in overdue if at > now]
+        return min(times, default=inf)
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
         """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and
@@ -292,6 +372,7 @@ class RepairWindow:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     record.at = now
+                    self._once.discard(number)
                     return record
         return None
 
@@ -322,7 +403,7 @@ class RepairWindow:
 
     def _shrunk(self, window: list[Sent]) -> list[Sent]:
         """The window, or a part of it if idle slots cannot make up for the losses."""
-        loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+        loss = self.loss
         new, idle = self._slots
         need = loss / (1 - loss) * new if loss < 1 else inf
         if need <= idle:
@@ -376,15 +457,17 @@ class RepairWindow:
         if not self._receivers:
             return len(window) * self._expected > under_way * (1 - self._expected) + _ENOUGH
         for peer in self._receivers.values():
-            patience = 2 * (peer.delay + peer.interval)
+            if peer.waits and not under_way:
+                return True
+            expected = 0.0 if peer.prompt else peer.loss
+            patience, doubt = peer.patience, peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
                     if record.number in peer.lost:
                         need += 1
                     else:
-                        late = now - record.at > patience + _PATIENCE_S
-                        need += max(peer.loss, 0.5) if late else peer.loss
+                        need += doubt if now - record.at > patience else expected
             if need > under_way * (1 - peer.loss) + _ENOUGH:
                 return True
         return False
@@ -406,6 +489,7 @@ class RepairWindow:
         assert row is not None
         combined = combine([(record.number, record.body) for record in window], row)
         self._fly(now, first, newest)
+        self._once.difference_update(range(first, newest + 1))
         self.counts["combined"] += 1
         oldest = first == self._oldest
         return Repair(newest, mask, row, oldest, combined)
@@ -429,7 +513,7 @@ class RepairWindow:
 
     def _fly(self, now: float, first: int, last: int) -> None:
         if self.mode == "thrifty":
-            wait = max((peer.delay + peer.interval for peer in self._receivers.values()), default=inf)
+            wait = max((peer.answer for peer in self._receivers.values()), default=inf)
             self._flight.append((now + wait, first, last))
 
     def _retire(self, now: float) -> None:

@@ -175,7 +175,7 @@ def _check_workers(client: Client, address: str) -> None:
     crowded = next((worker for worker, number in threads.items() if number > 1), None)
     if crowded is not None:
         raise ConfigError(
-            f"--scheduler {address}: worker {crowded} has {threads[crowded]} threads, and a flowgraph wants a process "
+            f"--scheduler {address}: worker {crowded} has {threads[crowded]} threads, and a flowgraph needs a process "
             "to itself; start workers with --nthreads 1"
         )
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gr_ros2.report.figures import COLOURS
+from gr_ros2.report.colours import COLOURS
 from gr_ros2.study.sweep.axes import NAMES, Panel, Place, choose_axes, curve_panels, heat_panels, places
 from gr_ros2.study.sweep.definition import PDR, VALUES, SweepPlan
 from gr_ros2.study.sweep.summaries import Summary

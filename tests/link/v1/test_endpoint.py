@@ -9,7 +9,8 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, read_header
+from gr_ros2.registry import Registry
+from gr_ros2.wire.v1 import MAX_MESSAGE, MAX_TOPICS, Part, body_room, read_header
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 
 MODES: list[SealMode] = ["none", "authenticate", "encrypt"]
@@ -55,6 +56,20 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert len(two.delivered()) == 100
     assert one.end.sent.air["new"] - before == 100
     assert one.end.sent.air["repair"] == 0
+
+
+@pytest.mark.parametrize("half_duplex", [False, True])
+def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
+    one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
+    air = Air(one, two, loss=0.2)
+    for number in range(200):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(0.1)
+    air.run(3.0)
+    assert len(two.delivered()) == 200
+    reports, arrived = two.end.sent.air["report"], two.end.received.packets
+    assert (reports > 0.9 * arrived) != half_duplex
+    assert (reports < 0.75 * arrived) == half_duplex
 
 
 def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None:
@@ -107,6 +122,30 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> No
     assert late.delivered() == [text(1, 700)]
     assert waited <= (packets + 2 * 4 + 4) * SLOT_S  # the map, two round trips of two slots each way, and the table
     assert two.delivered() == [text(1, 700)]
+
+
+def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_keep() -> None:
+    one, two = Robot(1), Robot(2)
+    air = Air(one, two, loss=0.2)
+    air.run(2.0)
+    for number in range(MAX_TOPICS):
+        one.end.add(f"topic_{number}", "std_msgs/msg/String", TopicOptions())
+        one.end.follow(number, reliable=True, latched=number == 7)
+    with pytest.raises(ConfigError, match="241 topics; a link carries at most 240"):
+        one.end.add("one_more", "std_msgs/msg/String", TopicOptions())
+    sent = [text(number) for number in range(MAX_TOPICS)]
+    for number in reversed(range(MAX_TOPICS)):
+        one.end.submit(number, sent[number], air.now)
+    air.run(60.0, lambda: len(two.delivered()) == MAX_TOPICS)
+    assert sorted(two.delivered()) == sorted(sent)
+    rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
+    assert [row.topic_id for row in rows if row.latched] == [7]
+    assert one.end.topics is not None
+    assert len(rows) == len(one.end.topics) == MAX_TOPICS
+    late = Robot(3)
+    air.robots.append(late)
+    air.run(60.0, lambda: bool(late.delivered()))
+    assert late.delivered() == [sent[7]]
 
 
 def test_where_nobody_can_ask_what_is_kept_is_repeated() -> None:
@@ -287,3 +326,77 @@ def test_settings_out_of_range_are_refused() -> None:
         with pytest.raises(ConfigError):
             Settings(**{"src_id": 1, **wrong})
     assert body_room(Settings(1, packet_len=40).packet_len, sealed=True) >= 20
+
+
+def test_a_service_is_announced_while_it_is_offered() -> None:
+    rows = Registry.from_rows({"odom": "nav_msgs/Odometry", "add": "example_interfaces/srv/AddTwoInts"})
+    one, two = Robot(1, rows.with_calls()), Robot(2)
+    air = Air(one, two, loss=0.2)
+
+    def known() -> list[str]:
+        return [row.name for row in two.end.rows(1).values()]
+
+    air.run(3.0)
+    assert known() == ["odom"]
+    for _ in range(3):
+        one.end.offer(1, offered=True)
+        air.run(5.0, lambda: known() == ["odom", "add"])
+        assert known() == ["odom", "add"]
+        one.end.offer(1, offered=False)
+        air.run(5.0, lambda: known() == ["odom"])
+        assert known() == ["odom"]
+
+
+def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_then_also_that_it_is_over() -> None:
+    one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
+    air = Air(one, two)
+    air.run(2.0)
+    assert one.end.outbox.digest == 0
+    one.end.offer(0, offered=True)
+    air.run(1.0)
+    assert [row.name for row in two.end.rows(1).values()] == ["_calls"]
+    one.end.offer(0, offered=False)
+    air.run(1.0)
+    assert not two.end.rows(1)
+
+
+def test_a_service_that_is_there_from_the_start_is_announced_though_packets_are_lost() -> None:
+    for seed in range(5):
+        one, two = Robot(1, Registry.from_rows({"add": "example_interfaces/srv/AddTwoInts"}).with_calls()), Robot(2)
+        one.end.offer(0, offered=True)
+        air = Air(one, two, loss=0.5, seed=seed)
+        air.run(10.0, lambda: bool(two.end.rows(1)))  # noqa: B023 - called at once
+        assert [row.name for row in two.end.rows(1).values()] == ["add"]
+
+
+def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
+    one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
+    air = Air(one, two)
+    one.end.offer(0, offered=True)
+    air.run(1.0)
+    lose = [True]
+    air.lost = lambda *_: lose[0]
+    brief, long = text(1, 51), text(2, 51)  # a packet each: what shares one is repaired together
+    one.end.submit(0, brief, air.now, 0.5)
+    one.end.submit(0, long, air.now, 5.0)
+    air.run(1.0)
+    lose[0] = False
+    air.run(3.0)
+    assert two.delivered() == [long]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
+    air = Air(one, two)
+    for number in range(20):
+        one.end.submit(ODOM, text(number), air.now)
+        air.run(4.0, lambda: text(number) in two.delivered())  # noqa: B023 - called at once
+        two.start()  # before it has reported
+        air.run(0.5)
+    delivered = two.delivered()
+    assert delivered == sorted(set(delivered), key=lambda payload: int(payload.split()[1]))
+    one.end.submit(ODOM, text(20), air.now)
+    air.run(1.0)
+    assert two.delivered()[-1] == text(20)
+    assert len(delivered) >= 15

@@ -229,6 +229,60 @@ def test_a_thrifty_sender_is_silent_without_losses_and_without_doubt() -> None:
     assert sender.next(9.0) is None
 
 
+def prompt(count: int, delay: float = 0.01) -> RepairWindow:
+    """A thrifty sender with one receiver, which loses packets and reports each one ``delay`` after it was sent."""
+    sender = window("thrifty")
+    for number in range(1, count + 1):
+        at = number / 10
+        sender.sent(number, body(number), b"packet %d" % number, (Life(),), at)
+        sender.report(9, number, (1 << 64) - 1, settled=True, loss=0.2, now=at + delay)
+    return sender
+
+
+def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
+    sender = prompt(4)
+    sender.sent(5, body(5), b"packet 5", (Life(),), 0.5)
+    assert sender.next(0.5) is None
+    overdue = sender.next_doubt(0.5)
+    assert 0.51 < overdue < 0.52
+    assert sender.next(0.51) is None
+    repair = sender.next(overdue + 1e-6)
+    assert isinstance(repair, Repair)
+    assert window_numbers(repair.number, repair.mask) == [5]
+    assert sender.next(overdue + 2e-6) is None  # until the repair is overdue too
+    again = sender.next_doubt(overdue + 2e-6)
+    assert 0.52 < again < 0.53
+    assert sender.next(again + 1e-6) is not None
+    sender.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.53)
+    assert sender.next(0.53) is None
+
+
+def test_the_delay_of_a_report_is_not_measured_on_what_was_repaired() -> None:
+    sender = prompt(4)
+    sender.sent(5, body(5), b"packet 5", (Life(),), 0.5)
+    assert sender.next(0.52) is not None
+    sender.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.7)
+    sender.sent(6, body(6), b"packet 6", (Life(),), 0.8)
+    assert sender.next_doubt(0.8) < 0.82
+
+
+def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None:
+    sender = window("thrifty")
+    gone = Life()
+    sender.sent(1, b"gone", b"packet 1", (gone,), 0.0)
+    sender.sent(2, b"here", b"packet 2", (Life(),), 0.1)
+    gone.over = True
+    sender.report(9, 2, (1 << 64) - 1 ^ 0b11, settled=False, loss=0.0, now=0.1)
+    sender.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
+    assert sender.next(0.2) is None  # all that is alive has arrived: there is nothing to combine
+    sender.sent(3, b"new", b"packet 3", (Life(),), 0.3)
+    repair = sender.next(0.3)
+    assert isinstance(repair, Repair)
+    assert (window_numbers(repair.number, repair.mask), repair.oldest) == ([3], True)
+    sender.report(9, 3, (1 << 64) - 1, settled=True, loss=0.0, now=0.4)
+    assert sender.next(0.4) is None
+
+
 def test_repair_that_cannot_keep_up_shrinks_its_window() -> None:
     sender = window(count=40, expected_loss=0.4)
     repair = sender.next(0.5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.saturated import SCENARIOS, TOLERANCE, ratios, run
+from bench.saturated import SCENARIOS, TOLERANCE, paced_ratios, ratios, run
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -17,6 +17,12 @@ def test_no_topic_is_older_than_with_version_0(name: str, loss: float) -> None:
     assert found
     for topic, (ratio, note) in found.items():
         assert ratio <= TOLERANCE[loss], f"{topic}: {note}"
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_a_repair_that_cannot_be_interrupted_delays_no_message(loss: float) -> None:
+    (ratio,) = paced_ratios("paper-ofdm-paced", loss, seeds=(1, 2)).values()
+    assert ratio <= TOLERANCE[loss]
 
 
 @pytest.mark.parametrize("name", SCENARIOS[1:])

@@ -1,0 +1,43 @@
+"""Bytes from a serial line or a TNC: whatever they are, bounded memory, and the next packet is read."""
+
+from __future__ import annotations
+
+import random
+from functools import partial
+
+from fuzz.loop import main, within
+from gr_ros2.radio.framing import Cobs, Framing, Kiss, Slip
+from gr_ros2.radio.kiss import Ax25Kiss, KissOptions
+
+BASE_S, BYTE_S = 5e-4, 5e-7
+"""s of processor time that a piece of the stream may take, and more for each byte of it."""
+LONGEST = 300
+_TNC = KissOptions(device="tcp://localhost:8001", callsign="N0CALL")
+_PACKET = b"\0\xc0\xdb" + bytes(range(61))
+
+
+def framings() -> list[Framing]:
+    """One of each kind."""
+    return [Slip(LONGEST), Cobs(LONGEST), Kiss(LONGEST), Ax25Kiss(LONGEST, None, _TNC)]
+
+
+def framing(data: bytes) -> None:
+    """Feed the bytes in two pieces, end the frame that they have begun, and send a packet."""
+    for one in framings():
+        half = len(data) // 2
+        for part in (data[:half], data[half:]):
+            within(BASE_S + BYTE_S * len(part), lambda: partial(list, one.feed(part)))  # noqa: B023 - called at once
+        assert one.held <= 2 * LONGEST + 64
+        assert all(len(packet) <= LONGEST for packet in one.feed(one.delimiter))
+        assert list(one.feed(one.frame(_PACKET))) == [_PACKET]
+
+
+def corpus() -> list[bytes]:
+    """Frames of all kinds, alone and one after the other."""
+    rng = random.Random(1)
+    frames = [one.frame(rng.randbytes(length)) for one in framings() for length in (1, 64, 254, 255, LONGEST)]
+    return [b"", bytes(8), b"\xc0" * 8, b"\xdb" * 8, *frames, b"".join(frames)]
+
+
+if __name__ == "__main__":
+    main(framing, corpus())

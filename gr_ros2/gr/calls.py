@@ -1,0 +1,255 @@
+"""Services across the link, between two ROS graphs and the engine of calls.
+
+A service of this robot is announced while a server for it is on the source's graph, and no longer. A service that
+another robot announces gets a server of ours on the sink's graph, for exactly as long as the robot announces it and is
+heard. So a client here finds a server only while there is one over there.
+
+Invariants: this class is a thin shell; the engine (:mod:`gr_ros2.calls`) decides, and the lock of the endpoint protects
+it; no endpoint on a graph is made, closed or written to while that lock is held.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, Outgoing, Request, Service
+from gr_ros2.errors import ConfigError, GrRos2Error, MiddlewareError
+from gr_ros2.gr.ends import LOOP_GUARD, LiveEnd
+from gr_ros2.gr.sink import RosSink
+from gr_ros2.gr.source import RosSource
+from gr_ros2.link import Delivered, ReceiverEvent
+from gr_ros2.link.events import Gone, Met
+from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.key import Key
+from gr_ros2.middleware import Middleware
+from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
+from gr_ros2.registry import CALLS_TYPE, Topic
+from gr_ros2.setting import AUTO
+
+DEADLINE_S = 30.0
+"""s that a call waits for its reply, unless ``deadline_s`` of its service says otherwise."""
+_NEVER_LATE = "_action/get_result"
+"""End of the name of a service that replies when its action has ended."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """A robot that is heard: its start, and the services that it has announced."""
+
+    boot: int
+    services: dict[int, Topic]
+    here: bool = True
+
+
+class LiveCalls:
+    """The services of both directions of one robot's link.
+
+    :param end: the endpoint, whose registry has a row for requests and replies behind those of the source
+    :param source, sink: the blocks whose graphs are joined
+    :raises ConfigError: for a service on a graph that carries topics only
+    """
+
+    def __init__(self, end: LiveEnd, source: RosSource, sink: RosSink) -> None:
+        assert isinstance(end.endpoint, Endpoint)
+        self._end: Endpoint = end.endpoint
+        self._lock, self._work = end.lock, end.work
+        self._engine = Calls(self._end.settings.src_id, self._end.boot)
+        self._row = len(source.registry)
+        self._sink = sink
+        self._clock = source.clock
+        self._robots: dict[int, _Robot] = {}
+        self._servers: dict[tuple[int, int], ServiceServer] = {}
+        self._counters: Counter[str] = Counter()
+        self._changing = threading.Lock()  # for the servers; held while they are made and closed
+        self._closed = False
+        self._own = {topic.topic_id: Offer(name, _deadline(topic)) for name, topic in source.services.items()}
+        self._offered: dict[int, Offer] = {}
+        """The services of this robot whose server is there, by id."""
+        self._clients: dict[int, ServiceClient] = {}
+        for name, topic in source.services.items():
+            graph = _with_services(source.middleware, name)
+            changed = partial(self._server_changed, topic.topic_id)
+            self._clients[topic.topic_id] = graph.client(name, topic.type_name, self._reply, changed)
+        sink.share(self)
+
+    def takes(self, event: ReceiverEvent) -> bool:
+        """Handle what an event means for services; returns whether it was a request or a reply."""
+        if isinstance(event, Met):
+            self._met(event)
+        elif isinstance(event, Gone):
+            self._change(event.src_id, here=False)
+        elif isinstance(event, Delivered) and self._is_frame(event):
+            self._receive(event)
+            return True
+        return False
+
+    def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
+        """Take over the services that a robot announces now."""
+        services = {topic.topic_id: topic for topic in topics if topic.is_service}
+        robot = self._robots.get(src_id)
+        if robot is None:
+            return
+        lost = robot.services.keys() - services.keys()
+        with self._lock:
+            self._engine.withdrawn(src_id, lost)
+        self._change(src_id, services=services)
+        feedback = [topic.topic_id for topic in topics if topic.is_topic and "/_action/" in topic.name]
+        if feedback and services:
+            self._sink.announce(src_id, feedback)
+
+    def stats(self) -> dict[str, Any]:
+        """A snapshot: counters of :class:`gr_ros2.calls.Calls` and of this class, and the calls that wait."""
+        with self._lock:
+            self._engine.expire(self._clock())
+            made, served = self._engine.waiting
+            counters = self._engine.counters + self._counters
+            refused = {reason: n for (topic_id, reason), n in self._end.sent.refused.items() if topic_id == self._row}
+            offered = sorted(offer.name for offer in self._offered.values())
+        with self._changing:
+            proxies = sorted(
+                self._name(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers
+            )
+        state = {"waiting": made, "serving": served, "offered": offered, "reached": proxies, "not_sent": refused}
+        return {**state, "counters": dict(counters)}
+
+    def close(self) -> None:
+        """Leave the graphs. Idempotent."""
+        with self._changing:
+            self._closed = True
+            ends: list[ServiceServer | ServiceClient] = [*self._servers.values(), *self._clients.values()]
+            self._servers.clear()
+        for end in ends:
+            end.close()
+
+    # ---- services of this robot
+
+    def _server_changed(self, topic_id: int, there: bool) -> None:
+        with self._lock:
+            if there:
+                self._offered[topic_id] = self._own[topic_id]
+                self._end.offer(self._row, offered=True)
+            else:
+                self._offered.pop(topic_id, None)
+            self._end.offer(topic_id, offered=there)
+            self._work.notify()
+        _log.info("service %s: %s", self._own[topic_id].name, "offered to other robots" if there else "no server")
+
+    def _reply(self, ticket: int, payload: bytes) -> None:
+        with self._lock:
+            now = self._clock()
+            self._send(self._engine.reply(ticket, payload, now), now)
+
+    # ---- services of other robots
+
+    def _met(self, event: Met) -> None:
+        with self._lock:
+            self._engine.started(event.src_id, event.boot)
+        known = self._robots.get(event.src_id)
+        if known is None or known.boot != event.boot:
+            self._change(event.src_id, services={})
+            with self._changing:
+                self._robots[event.src_id] = _Robot(event.boot, {})
+        else:
+            self._change(event.src_id, here=True)
+
+    def _change(self, src_id: int, *, services: dict[int, Topic] | None = None, here: bool | None = None) -> None:
+        """Make and close servers after a robot was heard, has become silent, or has announced other services."""
+        with self._changing:
+            robot = self._robots.get(src_id)
+            if robot is None or self._closed:
+                return
+            services = robot.services if services is None else services
+            here = robot.here if here is None else here
+            closing = []
+            for key in [key for key in self._servers if key[0] == src_id]:
+                same = services.get(key[1]) == robot.services.get(key[1])
+                if not here or not same:
+                    closing.append(self._servers.pop(key))
+            self._robots[src_id] = _Robot(robot.boot, services, here)
+            for server in closing:
+                server.close()
+            if here:
+                for topic in services.values():
+                    if (src_id, topic.topic_id) not in self._servers:
+                        self._serve(src_id, topic)
+                if services:
+                    with self._lock:
+                        self._end.offer(self._row, offered=True)
+
+    def _serve(self, src_id: int, topic: Topic) -> None:
+        """Make a server of ours for a service of another robot."""
+        name = self._name(src_id, topic)
+        try:
+            LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
+            graph = _with_services(self._sink.middleware, name)
+            taker = partial(self._request, src_id, topic)
+            # ros2 param and ros2 lifecycle look for the node before they call its services.
+            node = name.rpartition("/")[0] if topic.of_node else ""
+            self._servers[src_id, topic.topic_id] = graph.serve(name, topic.type_name, taker, node)
+        except GrRos2Error as error:
+            self._tell_first(f"not_served:{name}", error)
+
+    def _request(self, src_id: int, topic: Topic, client: Hashable, payload: bytes) -> None:
+        service = Service(src_id, self._robots[src_id].boot, topic.topic_id, self._name(src_id, topic))
+        with self._lock:
+            now = self._clock()
+            self._send(self._engine.call(service, client, payload, deadline_s=_deadline(topic), now=now), now)
+
+    def _name(self, src_id: int, topic: Topic) -> str:
+        return topic.republished(self._sink.config.namespace_format, src_id)
+
+    # ---- frames
+
+    def _is_frame(self, event: Delivered) -> bool:
+        with self._lock:
+            row = self._end.rows(event.src_id).get(event.topic_id)
+        return row is not None and row.type_name == CALLS_TYPE
+
+    def _receive(self, event: Delivered) -> None:
+        assert isinstance(event.key, Key)
+        with self._lock:
+            sender = event.src_id, event.key.boot
+            found = self._engine.receive(sender, event.payload, self._offered, self._clock())
+        try:
+            if isinstance(found, Request):
+                self._clients[found.service_id].call(found.ticket, found.payload)
+            elif isinstance(found, Answer):
+                self._servers[found.robot, found.service_id].reply(found.token, found.payload)
+        except KeyError:
+            self._tell_first("not_passed_on", MiddlewareError("a reply came after the server here was closed"))
+        except GrRos2Error as error:
+            self._tell_first("not_passed_on", error)
+
+    def _send(self, frame: Outgoing | None, now: float) -> None:
+        """Send a frame. Called with the lock held."""
+        if frame is not None:
+            self._end.submit(self._row, frame.data, now, frame.lifespan_s)
+            self._work.notify()
+
+    def _tell_first(self, counter: str, error: Exception) -> None:
+        with self._lock:
+            self._counters[counter] += 1
+            first = self._counters[counter] == 1
+        if first:
+            _log.warning("calls: %s (counted as %s)", error, counter)
+
+
+def _deadline(topic: Topic) -> float:
+    """s that a call of a service waits for its reply."""
+    if topic.options.deadline_s != AUTO:
+        return topic.options.deadline_s
+    return NO_DEADLINE if topic.name.endswith(_NEVER_LATE) else DEADLINE_S
+
+
+def _with_services(graph: Middleware, service: str) -> ServiceGraph:
+    if not isinstance(graph, ServiceGraph):
+        raise ConfigError(f"service {service}: middleware {graph.name} carries topics only; take dds, or rclpy")
+    return graph

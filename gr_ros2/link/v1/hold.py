@@ -1,0 +1,155 @@
+"""When a repair waits because a new message is about to come.
+
+A packet that is on the air cannot be interrupted. A repair that is not over when the next message of a periodic topic
+comes delays that message. So the endpoint learns the period of each topic, and a repair that nobody has asked for waits
+if it would delay the message that is due next.
+
+*Bounds.* A repair is not held back if:
+
+- the message does not come in time: it waits for a message only until it is late for what is usual on its topic, and
+  never longer than two airtimes;
+- repairs are owed: each new packet that leaves adds a share that covers the losses, each wait adds a little, and each
+  repair subtracts one. On a link where no repair fits between two messages, repairs go at this rate;
+- waiting does not help. Where the PHY has slots of its own, a message waits for the end of a slot whether a repair is
+  in it or not. After each wait that gained nothing, more repairs go without waiting than after the one before.
+
+Invariant: a wait lasts two airtimes at most, and after ``1 / WAITED`` waits a repair leaves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+OVERLAP = 1 / 4
+"""Part of a packet's airtime by which a repair may delay a message."""
+HEADROOM = 1.5
+"""Number of repairs that are owed, divided by the number of packets that are expected to be lost."""
+WAITED = 1 / 16
+"""Number of repairs owed per wait, independent of the losses."""
+_MOST_LOSS = 0.5
+_SMOOTHING = 1 / 8
+_STEADY = 1 / 4
+"""A topic is periodic if its intervals deviate from their mean by at most this part of it."""
+_FEW = 3
+"""Number of intervals from which on a topic may be called periodic."""
+_MOST_SKIPPED = 1024
+_GAIN = 1 / 16
+"""Part of a packet's airtime that a wait must gain to be worth it."""
+
+
+@dataclass(slots=True)
+class Period:
+    """The times at which the messages of one topic come.
+
+    :param last: time in s of the newest message
+    :param mean: mean interval in s
+    :param deviation: mean absolute deviation of the intervals from it, s
+    """
+
+    last: float
+    mean: float = 0.0
+    deviation: float = 0.0
+    count: int = 0
+
+    def observe(self, now: float) -> None:
+        """A message comes."""
+        interval = now - self.last
+        self.last = now
+        if not self.count:
+            self.mean = interval
+        elif interval < 2 * self.mean or self.count < _FEW:
+            self.deviation += (abs(interval - self.mean) - self.deviation) * _SMOOTHING
+            self.mean += (interval - self.mean) * _SMOOTHING
+        else:  # messages are missing, or the topic has changed its rate
+            self.deviation += (self.mean - self.deviation) * _SMOOTHING
+            self.mean += self.mean * _SMOOTHING
+        self.count += 1
+
+    @property
+    def due(self) -> float:
+        """When the next message is expected, s; infinite if the topic is not periodic."""
+        periodic = self.count >= _FEW and self.deviation <= self.mean * _STEADY
+        return self.last + self.mean if periodic else inf
+
+    @property
+    def late(self) -> float:
+        """s after ``due`` at which a message that has not come is not expected any more."""
+        return 2 * self.deviation + self.mean / 16
+
+
+class Hold:
+    """The decision for one sender. Times are in s."""
+
+    def __init__(self) -> None:
+        self._periods: dict[int, Period] = {}
+        self._soonest: tuple[float, float] | None = None
+        """When the next message is due, and until when it is waited for; None if not known."""
+        self._owed = 0.0
+        self._would_end = inf
+        """End of the first repair that was held back since the last packet left."""
+        self._airtime = 0.0
+        self._skipped = 0
+        """Number of consecutive repairs that left without waiting, because waiting does not help."""
+        self._skip = 0
+        """Number of repairs that leave without waiting before the next one waits."""
+
+    def submitted(self, topic_id: int, now: float) -> None:
+        """Note that a message of a topic has come."""
+        period = self._periods.get(topic_id)
+        if period is None:
+            self._periods[topic_id] = Period(now)
+        else:
+            period.observe(now)
+        self._soonest = None
+
+    def left(self, now: float, loss: float) -> None:
+        """Note that a new packet leaves.
+
+        :param loss: share of packets lost, as far as it is known or expected
+        """
+        loss = min(loss, _MOST_LOSS)
+        self._owed = min(self._owed + HEADROOM * loss / (1 - loss), 2.0)
+        if self._would_end < inf:
+            self._ended(self._would_end - now)
+
+    def repaired(self, *, waiting: bool) -> None:
+        """A repair leaves.
+
+        :param waiting: whether others have to wait still; this one did not because its packet is known to be lost
+        """
+        self._owed = max(self._owed - 1, 0.0)
+        if self._would_end < inf and not waiting:
+            self._ended(0.0)
+
+    def until(self, now: float, end: float, airtime: float) -> float:
+        """Time until which a repair waits that could leave now; ``now`` if it does not have to wait.
+
+        :param end: when it would be over
+        :param airtime: of a packet, 0 if unknown
+        """
+        if not airtime or self._owed >= 1:
+            return now
+        due, until = self._next(now)
+        if end - due <= OVERLAP * airtime:
+            return now
+        if self._would_end == inf:
+            if self._skipped < self._skip:
+                self._skipped += 1
+                return now
+            self._would_end, self._airtime = end, airtime
+            self._owed += WAITED
+        return max(now, min(until, self._would_end + airtime))
+
+    def _ended(self, gained: float) -> None:
+        """Note that a wait is over, and how many s a message gained by it."""
+        self._would_end = inf
+        self._skipped = 0
+        self._skip = 0 if gained > _GAIN * self._airtime else min(4 * self._skip + 4, _MOST_SKIPPED)
+
+    def _next(self, now: float) -> tuple[float, float]:
+        """When the next message is due, and until when it is waited for."""
+        if self._soonest is None or self._soonest[1] <= now:
+            times = [(due, due + period.late) for period in self._periods.values() if (due := period.due) < inf]
+            self._soonest = min((time for time in times if time[1] > now), default=(inf, inf))
+        return self._soonest

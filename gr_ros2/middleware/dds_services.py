@@ -1,0 +1,214 @@
+"""Servers and clients of services on the embedded DDS, as rmw_cyclonedds has them.
+
+A request begins with 16 bytes that name it: 8 of the client, and a number of its own. The reply begins with the same.
+The message follows. rmw_fastrtps has neither: there the identity is in inline QoS parameters of the DDS, which the
+library does not give out. So its clients and servers are refused and counted as ``other_rmw:/service``; with the
+middleware ``rclpy`` they take part.
+
+Invariants: a server's reader exists only together with its writer, since a client of Fast DDS that finds a reader alone
+waits for ever; a client says that a server is there only when both its endpoints match those of one server.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from abc import abstractmethod
+from collections.abc import Hashable
+
+from gr_ros2.errors import MiddlewareError
+from gr_ros2.middleware.base import Qos
+from gr_ros2.middleware.cdr_dds import DdsError, DiscoveredEndpoint, RawReader, RawWriter
+from gr_ros2.middleware.services import (
+    ReplyCallback,
+    RequestCallback,
+    ServerCallback,
+    ServiceClient,
+    ServiceGraph,
+    ServiceServer,
+)
+
+SERVICE_QOS = Qos("reliable", "volatile", 1000)
+"""The QoS of services in ROS, except for the depth, which is 10 there. So a burst of calls passes."""
+ENCAPSULATION, HEADER = 4, 16
+_NAME = 8
+"""Bytes that name a client."""
+
+_SERVICE_ID = re.compile(rb"(?:^|;)serviceid=([^;]*);")
+
+
+def with_header(header: bytes, payload: bytes) -> bytes:
+    """A message as it is on the DDS, from the bytes that name a request and the message alone."""
+    return payload[:ENCAPSULATION] + header + payload[ENCAPSULATION:]
+
+
+def without_header(data: bytes) -> tuple[bytes, bytes] | None:
+    """The inverse of :func:`with_header`; None where the bytes are too few."""
+    end = ENCAPSULATION + HEADER
+    return (data[ENCAPSULATION:end], data[:ENCAPSULATION] + data[end:]) if len(data) >= end else None
+
+
+class ServiceParticipant(ServiceGraph):
+    """The interface of a participant for its servers and clients."""
+
+    @property
+    @abstractmethod
+    def closed(self) -> bool: ...
+
+    @property
+    @abstractmethod
+    def own_guid(self) -> bytes:
+        """GUID of the participant."""
+
+    @abstractmethod
+    def make_pair(self, end: DdsServer | DdsClient) -> None:
+        """Set the endpoints of a server or a client. From then on, ``end.service`` is called when something arrives or
+        matches change."""
+
+    @abstractmethod
+    def drop_pair(self, end: DdsServer | DdsClient) -> None:
+        """Delete the endpoints of a server or a client."""
+
+
+class _End:
+    """What servers and clients have in common.
+
+    :ivar node: absolute name of the node to which it belongs; '' the participant's own
+    :ivar reads: which topic it reads, 0 that of requests, 1 that of replies; likewise ``writes``
+    """
+
+    reader: RawReader
+    writer: RawWriter
+
+    role = ""
+    reads, writes = 0, 1
+
+    def __init__(self, participant: ServiceParticipant, service: str, type_name: str, node: str = "") -> None:
+        self.name, self.type_name, self.node = service, type_name, node
+        self._participant = participant
+        self._closed = False
+        self._calling = threading.RLock()
+        self.mark = b"%sid=%s;" % (self.role.encode(), ".".join(f"{byte:x}" for byte in os.urandom(16)).encode())
+        """User data by which the two endpoints are known to belong together."""
+
+    def _refuse(self, other: DiscoveredEndpoint) -> None:
+        text = f"{self.name}: a {'client' if self.role == 'service' else 'server'} has another RMW than rmw_cyclonedds"
+        self._participant.count_once(
+            f"other_rmw:{self.name}", f"{text} (participant {other.participant.hex()}); take middleware rclpy"
+        )
+
+    def _write(self, writer: RawWriter, header: bytes, payload: bytes, what: str) -> None:
+        if self._closed or self._participant.closed:
+            raise MiddlewareError(f"{what} {self.name}: it is closed")
+        try:
+            writer.write(with_header(header, payload))
+        except DdsError as error:
+            raise MiddlewareError(f"{what} {self.name}: {error}") from error
+
+    def _close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with self._calling:  # a callback in progress ends first, unless this call comes from it
+                pass
+            self._participant.drop_pair(self)  # type: ignore[arg-type]
+
+
+class DdsServer(_End, ServiceServer):
+    """A server. ``reply`` may be called from any thread."""
+
+    role = "service"
+
+    def __init__(
+        self, participant: ServiceParticipant, service: str, type_name: str, on_request: RequestCallback, node: str
+    ) -> None:
+        super().__init__(participant, service, type_name, node)
+        self._on_request = on_request
+        participant.make_pair(self)
+
+    def service(self) -> None:
+        """Take requests. Called by the participant's thread."""
+        with self._calling:
+            self.reader.matched()  # resets the status that triggered
+            for sample in () if self._closed else self.reader.take():
+                client = self.reader.other(sample.source)
+                if client is not None and not client.is_cyclone:
+                    self._refuse(client)
+                    continue
+                parts = without_header(sample.payload)
+                if parts is None:
+                    self._participant.count(f"malformed:{self.name}", f"{self.name}: a request without a header")
+                    continue
+                header, payload = parts
+                self._participant.guarded(self.name, lambda h=header, p=payload: self._on_request(h, p))  # type: ignore[misc]
+
+    def reply(self, client: Hashable, payload: bytes) -> None:
+        assert isinstance(client, bytes)
+        self._write(self.writer, client, payload, "reply of")
+
+    def close(self) -> None:
+        self._close()
+
+
+class DdsClient(_End, ServiceClient):
+    """A client. ``call`` may be called from any thread."""
+
+    role = "client"
+    reads, writes = 1, 0
+
+    def __init__(
+        self,
+        participant: ServiceParticipant,
+        service: str,
+        type_name: str,
+        on_reply: ReplyCallback,
+        on_server: ServerCallback,
+    ) -> None:
+        super().__init__(participant, service, type_name)
+        self._on_reply, self._on_server = on_reply, on_server
+        self._name = os.urandom(_NAME)
+        self._available = False
+        participant.make_pair(self)
+        self.service()  # there may be matches already
+
+    def service(self) -> None:
+        """Take replies, and look whether a server is there. Called by the participant's thread."""
+        with self._calling:
+            if self._closed:
+                return
+            for sample in self.reader.take():
+                parts = without_header(sample.payload)
+                if parts is not None and parts[0].startswith(self._name):
+                    number, payload = int.from_bytes(parts[0][_NAME:], "little", signed=True), parts[1]
+                    self._participant.guarded(self.name, lambda n=number, p=payload: self._on_reply(n, p))  # type: ignore[misc]
+            self.reader.matched()
+            self.writer.matched()
+            available = self._find_server()
+            if available != self._available:
+                self._available = available
+                self._participant.guarded(self.name, lambda: self._on_server(available))
+
+    def call(self, number: int, payload: bytes) -> None:
+        if not self._available:
+            raise MiddlewareError(f"request of {self.name}: no server is there")
+        self._write(self.writer, self._name + number.to_bytes(8, "little", signed=True), payload, "request of")
+
+    def close(self) -> None:
+        self._close()
+
+    def _find_server(self) -> bool:
+        """Whether both endpoints match those of a server, as ``rmw_service_server_is_available`` decides."""
+        own = self._participant.own_guid
+        readers, writers = ([e for e in end.others() if e.participant != own] for end in (self.writer, self.reader))
+        for reader in readers:
+            if not reader.is_cyclone:
+                # What is written reaches every reader, and this one would take the header for a part of the message.
+                self._refuse(reader)
+                return False
+        needed, found = ({_service_id(endpoint) for endpoint in ends} for ends in (readers, writers))
+        return bool(needed & found)
+
+
+def _service_id(endpoint: DiscoveredEndpoint) -> bytes:
+    match = _SERVICE_ID.search(endpoint.user_data)
+    return match[1] if match else b""

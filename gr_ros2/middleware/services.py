@@ -1,0 +1,73 @@
+"""Services on a ROS graph: serialized requests and replies, without what names the client.
+
+Invariants: payloads are whole CDR messages with the encapsulation header, the same on every middleware; callbacks run
+in a thread of the back-end and must not block it for long; no callback runs after ``close`` has returned.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable
+
+from gr_ros2.middleware.base import Middleware
+
+RequestCallback = Callable[[Hashable, bytes], None]
+"""Takes a request: the client, to be given back with the reply, and the message."""
+ReplyCallback = Callable[[int, bytes], None]
+"""Takes a reply: the number that was given with the request, and the message."""
+ServerCallback = Callable[[bool], None]
+"""Takes whether a server is there."""
+
+
+class ServiceServer(ABC):
+    """A server of this participant."""
+
+    @abstractmethod
+    def reply(self, client: Hashable, payload: bytes) -> None:
+        """Send the reply to a request (raises MiddlewareError once closed).
+
+        :param client: as it came with the request
+        """
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class ServiceClient(ABC):
+    """A client of this participant."""
+
+    @abstractmethod
+    def call(self, number: int, payload: bytes) -> None:
+        """Send a request (raises MiddlewareError once closed, or where no server is there).
+
+        :param number: given back with the reply
+        """
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class ServiceGraph(Middleware):
+    """A participant that can have servers and clients."""
+
+    @abstractmethod
+    def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> ServiceServer:
+        """Make a server, which may take any time to reply.
+
+        :param service: absolute name
+        :param type_name: ``package/srv/Type``, or ``package/action/Type_SendGoal`` or ``_GetResult``
+        :param node: absolute name of the node to which it belongs, where the middleware can show others than its own;
+            '' is the participant's own
+        """
+
+    @abstractmethod
+    def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> ServiceClient:
+        """Make a client.
+
+        :param on_server: called when a server has come, and when the last one has left. Servers of this participant do
+            not count
+        """
+
+    def guarded(self, service: str, callback: Callable[[], None]) -> None:
+        """Call back about a service. An exception is counted and logged, and the thread goes on, as for topics."""
+        self.deliver(service, lambda _: callback(), b"")

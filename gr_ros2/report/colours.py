@@ -1,0 +1,23 @@
+"""Colours of topics, runs and ledger rows, on every page and in every figure.
+
+Invariant: a ledger row has the same colour everywhere.
+"""
+
+from __future__ import annotations
+
+from gr_ros2.link.ledger_rows import ROWS
+
+COLOURS = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
+    *("#88ccee", "#882255", "#44aa99", "#ddcc77", "#332288", "#aa4499", "#999933", "#661100"),
+)
+"""Colours of topics and runs, in their order. Colour-blind readers can distinguish them as well as is possible with
+sixteen colours."""
+
+AIR_COLOURS = {"new": "#2a9d5c", "repair": "#1d6b3f", "report": "#e69f00", "hello": "#9db8d9"}
+"""Colours of what packets are for."""
+
+
+def row_colour(row: str) -> str:
+    """The colour of a ledger row. A row that this version does not know also has a fixed colour."""
+    return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]

@@ -1,0 +1,139 @@
+"""A source without a registry: it finds its topics on the graph, whichever middleware reaches it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gnuradio import gr
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr import RosSource
+from gr_ros2.middleware import MIDDLEWARE, Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.waiting import Waiting
+from tests.domains import free_domains
+from tests.gr.probe import Probe
+from tests.middleware.support import CUSTOM, STRING, message
+from tests.waiting import wait_for
+
+ODOM = "nav_msgs/msg/Odometry"
+
+
+class Running:
+    """A source in a flowgraph, and what it emits."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.source = RosSource(**{"version": 1, "namespace": "/robot_1", "state": str(folder / "state"), **settings})
+        self.top, self.probe = gr.top_block(), Probe()
+        self.top.msg_connect((self.source, "pdus"), (self.probe, "pdus"))
+
+    def __enter__(self) -> Running:
+        self.top.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.top.stop()
+        self.top.wait()
+        self.source.close()
+
+    @property
+    def submitted(self) -> dict[str, int]:
+        return {name: topic["submitted"] for name, topic in self.source.stats()["topics"].items()}
+
+
+@pytest.mark.parametrize("middleware", ["memory", "dds", "rclpy"])
+def test_types_and_qos_are_those_of_the_graph(
+    middleware: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if middleware == "rclpy":
+        pytest.importorskip("rclpy", reason="needs a sourced ROS 2")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    caplog.set_level(logging.INFO, "gr_ros2.gr.source")
+    (domain,) = free_domains(1)
+    unknown = CUSTOM if middleware != "rclpy" else STRING  # rclpy needs the package of a type, the others do not
+    topics = ["odom", "auto", "-camera", "/elsewhere"]
+    with (
+        MIDDLEWARE.load(middleware)(domain_id=domain) as robot,
+        Running(tmp_path, topics=topics, middleware=middleware, domain_id=domain) as running,
+    ):
+        waiting = Waiting(running.source)
+        assert running.source.unmatched == ["/robot_1/odom", "/elsewhere"]
+        assert "no publisher on /robot_1/odom, /elsewhere yet" in str(waiting.look())
+        wheels = robot.advertise("/robot_1/wheels", unknown, Qos("best_effort", "volatile", 1))
+        robot.advertise("/robot_1/odom", ODOM, Qos("reliable", "volatile", 5))
+        robot.advertise("/robot_1/camera", STRING, Qos("reliable", "volatile", 5))
+        robot.subscribe("/robot_1/only_wanted", STRING, Qos("reliable", "volatile", 5), lambda _: None)
+        robot.advertise("/elsewhere", STRING, Qos("reliable", "transient_local", 1)).publish(message(1, 20))
+        wait_for(lambda: not running.source.unmatched, "all topics that are named")
+        wait_for(lambda: "/robot_1/wheels" in running.source.subscribed, "a topic that nobody named")
+
+        def crosses() -> bool:
+            wheels.publish(message(2, 20))
+            return bool(running.submitted["/robot_1/wheels"]) and bool(running.submitted["/elsewhere"])
+
+        wait_for(crosses, "messages to be taken")
+        rows = {topic.name: topic.type_name for topic in running.source.registry}
+        assert rows == {"odom": ODOM, "wheels": unknown, "/elsewhere": STRING}
+        queues = {name: topic["queue"] for name, topic in running.source.stats()["topics"].items()}
+        assert queues["/robot_1/wheels"] == "latest"
+        assert "every topic has a publisher: " in str(waiting.look())
+        wait_for(lambda: running.probe.packets, "packets")
+    assert f"topic /robot_1/wheels ({unknown}) of the ROS graph is sent" in caplog.text
+
+
+def test_what_cannot_be_sent_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (domain,) = free_domains(1)
+    options = {"scan": {"codec": "none"}, "odom": {"quantize": "no_such_field=1"}}
+    values: dict[str, Any] = {
+        "middleware": "memory",
+        "domain_id": domain,
+        "compression": True,
+        "topic_options": options,
+    }
+    with (
+        MemoryMiddleware(domain_id=domain) as robot,
+        Running(tmp_path, topics="auto, /scan", **values) as running,
+    ):
+        waiting = Waiting(running.source)
+        assert waiting.look() == "no publisher on /scan yet; nothing else is published on the graph"
+        robot.advertise("/robot_1/odom", ODOM, Qos())
+        robot.advertise("/robot_1/scan", STRING, Qos())
+        wait_for(lambda: "/robot_1/scan" in running.source.subscribed, "a topic that can be sent")
+        robot.advertise("/scan", STRING, Qos())  # would come out under the same name as the other one
+        wait_for(lambda: "topic /scan is not sent" in caplog.text, "a topic that cannot")
+        for number in range(300):
+            robot.advertise(f"/robot_1/topic_{number}", STRING, Qos())
+        wait_for(lambda: "241 topics" in caplog.text, "too many")
+        robot.advertise("/robot_1/one_more", STRING, Qos())
+        wait_for(lambda: "/robot_1/one_more" in running.source._left_out, "one more")
+    for name, why in (("/robot_1/odom", "no_such_field"), ("/scan", "duplicate topic '/scan'")):
+        (line,) = [line for line in caplog.messages if line.startswith(f"topic {name} is not sent: ")]
+        assert why in line
+    assert caplog.text.count("241 topics; a link carries at most 240") == 1
+    assert len(running.source.registry) == 240
+    assert running.source.registry.named("scan").options.codec == "none"
+
+
+def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) -> None:
+    (domain,) = free_domains(1)
+    with (
+        MemoryMiddleware(domain_id=domain) as robot,
+        Running(tmp_path, topics="auto", middleware="memory", domain_id=domain) as running,
+    ):
+        waiting = Waiting(running.source)
+        robot.advertise("/robot_2/odom", ODOM, Qos())
+        assert waiting.look() == "no publisher on /robot_1/* yet; seen on the graph: /robot_2/odom"
+        robot.advertise("/robot_1/odom", ODOM, Qos())
+        wait_for(lambda: running.source.subscribed, "the topic")
+        wait_for(lambda: waiting.look() == "every topic has a publisher: /robot_1/odom", "the line")
+
+
+def test_version_0_needs_a_registry(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="registry is missing"):
+        Running(tmp_path, version=0, topics="auto", middleware="memory", domain_id=free_domains(1)[0])

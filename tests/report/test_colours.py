@@ -1,0 +1,15 @@
+"""Colours that tell topics, runs and ledger rows apart."""
+
+from __future__ import annotations
+
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.report.colours import COLOURS, row_colour
+
+
+def test_no_two_rows_and_no_two_topics_look_alike() -> None:
+    assert len({row_colour(row) for row in LedgerRow}) == len(LedgerRow)
+    assert len(set(COLOURS)) == len(COLOURS)
+
+
+def test_a_row_of_another_version_has_a_colour_too() -> None:
+    assert row_colour("never heard of") == "#882255"
