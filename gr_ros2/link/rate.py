@@ -36,11 +36,11 @@ _GAPS = 4.0
 _UNANSWERED = 12
 """Packets to a robot since its last report, from which on its silence means something."""
 _LONGEST_GAP_S = 0.2
-_SMOOTHING, _FOLLOWING = 0.25, 0.5
-"""Shares of a new report in the two averages of the SNR."""
+_SMOOTHING = 0.25
+"""Share of a new report in the averages of SNR and time between reports."""
 _STEP_DB = 1.5
 """Change of the SNR from one report to the next that is believed at once, dB."""
-_CORRECTION_DB = 0.5
+_CORRECTION_DB = 0.1
 """dB of correction per report, for a loss of 1 where 0 was expected."""
 _MOST_CORRECTION_DB = 6.0
 _FADE = 0.97
@@ -78,9 +78,8 @@ class _Robot:
     """What is known of a receiver."""
 
     rung: int = 0
-    steady_db: float = -inf
-    recent_db: float = -inf
-    """SNR, averaged over many reports and over few."""
+    mean_db: float = -inf
+    """SNR, averaged over the newest reports."""
     correction_db: float = 0.0
     heard: float = -inf
     gap_s: float = _LONGEST_GAP_S
@@ -94,8 +93,8 @@ class _Robot:
 
     @property
     def snr_db(self) -> float:
-        """The SNR to count on: a rise is believed late, a fall at once."""
-        return min(self.steady_db, self.recent_db) - self.correction_db
+        """The SNR to count on."""
+        return self.mean_db - self.correction_db
 
 
 class RateController:
@@ -122,10 +121,9 @@ class RateController:
         known.gap_s += _SMOOTHING * (gap - known.gap_s)
         known.heard, known.unanswered = now, 0
         # A small difference is an error of measurement, a large one a change of the channel.
-        if abs(snr_db - known.steady_db) > _STEP_DB:
-            known.steady_db = known.recent_db = snr_db
-        known.steady_db += _SMOOTHING * (snr_db - known.steady_db)
-        known.recent_db += _FOLLOWING * (snr_db - known.recent_db)
+        if abs(snr_db - known.mean_db) > _STEP_DB:
+            known.mean_db = snr_db
+        known.mean_db += _SMOOTHING * (snr_db - known.mean_db)
         known.reports += 1
         surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db))
         correction = _FADE * known.correction_db + _CORRECTION_DB * surplus
@@ -148,8 +146,7 @@ class RateController:
     def _next(self, known: _Robot, now: float) -> int:
         known.unanswered += 1
         if self._silent(known, now):
-            # Once it is heard again, its SNR decides at once.
-            known.rung, known.reports, known.climbed = 0, known.patience, False
+            known.rung, known.reports, known.climbed = 0, 0, False
         return known.rung
 
     def _silent(self, known: _Robot, now: float) -> bool:

@@ -40,8 +40,8 @@ _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
 _REPORT_S = 0.1
 """s after which a report is due, even about a single packet."""
-_SNR_SMOOTHING = 0.5
-"""Share of a new packet in the reported SNR. A fading channel changes from packet to packet."""
+_SNR_SMOOTHING = 0.25
+"""Share of a new packet in the reported SNR: one preamble gives the SNR only to 1 dB."""
 _SNR_CHANGE_DB = 1.5
 """Change of the SNR that is reported at once."""
 _WAITING = 256
