@@ -12,12 +12,14 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.errors import ConfigError, MiddlewareError
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import ConfigError, MiddlewareError, RegistryError
+from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.registry import Registry
+from gr_ros2.registry import MAX_TOPICS, Registry
+from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller
 from tests.radio.calling_robots import Robots
 from tests.waiting import wait_for
@@ -139,3 +141,16 @@ def test_a_service_needs_both_directions_and_version_1() -> None:
     link = RobotLink(looped)
     assert link.stats()["calls"] == {}
     link.stop()
+
+
+def test_a_full_registry_has_no_room_for_calls() -> None:
+    full = {f"topic_{number}": "std_msgs/String" for number in range(MAX_TOPICS)}
+    one, two = SourceConfig(robot_id=1, version=1), SinkConfig(version=1)
+    with MemoryMiddleware(domain_id=free_domains(1)[0]) as graph:
+        link = RosLink(Registry.from_rows(full), one, two, middleware=(graph, graph))
+        assert link.calls is None
+        link.close()
+        with pytest.raises(RegistryError, match="241 topics"):
+            RosLink(
+                Registry.from_rows({**dict(list(full.items())[1:]), "add": ADD}), one, two, middleware=(graph, graph)
+            )
