@@ -113,11 +113,13 @@ def test_a_message_of_almost_16_MB_crosses_and_memory_stays_bounded(tmp_path: Pa
         cloud.publish(sent)
         held = [0]
 
-        def complete() -> bool:
+        def come(least: int) -> bool:
             held.append(two.link.stats()["sink"]["held_bytes"])
-            return bool(heard)
+            return max(held) >= least or bool(heard)
 
-        wait_for(complete, "the message")
+        for part in range(1, 16):  # patience is for each part, not for all
+            wait_for(lambda: come(part * len(sent) // 16), f"part {part} of the message")  # noqa: B023
+        wait_for(lambda: heard, "the message")
     assert heard == [sent]
     assert len(sent) > 15.9e6
     assert 0 < max(held) < 1.1 * len(sent)
