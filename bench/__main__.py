@@ -20,6 +20,7 @@ BENCHMARKS = {
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
     "port": "bench.port",
+    "live": "bench.live",
     "direct": "bench.runs",
     "fast": "bench.runs",
     "ofdm": "bench.runs",

@@ -247,6 +247,9 @@ ODOMETRY = (
     (0.27, 1.0, 0.995, 0.998, 1.08, None),
     (0.2, 3.0, 0.97, 0.98, None, None),
 )
+BUSY_HZ = 55.0
+"""Messages/s for which repair hardly has the slots that it needs: at 20 % loss 13.75 of 20 per second, if it knew the
+losses at once. Of an ideal sender's messages 98 % arrive within 267 ms."""
 
 
 def repair(seed: int = 1) -> list[Row]:
@@ -267,6 +270,9 @@ def repair(seed: int = 1) -> list[Row]:
                 add(f"{name}, {way}: mean age over the ideal's", outcome.age / ideal.age, "", "≤", age)
             if p99 is not None:
                 add(f"{name}, {way}: p99", outcome.p99 * 1e3, "ms", "≤", p99)
+    for way, back, least in (("one-way", None, 0.97), ("with reports", 0.2, 0.995)):
+        busy = run(hz=BUSY_HZ, loss=0.2, back=back, seed=seed)
+        add(f"odometry at {BUSY_HZ:g} Hz, 20% lost, {way}: PDR", busy.pdr[0], "", "≥", least)
     thrifty = run(loss=0.2, back=0.2, repair="thrifty", seed=seed)
     add("thrifty, 20% lost: PDR", thrifty.pdr[0], "", "≥", 0.998)
     add("thrifty, 20% lost: p99", thrifty.p99 * 1e3, "ms", "≤", 250)

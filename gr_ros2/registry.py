@@ -128,6 +128,12 @@ class Topic:
         return is_service(self.type_name)
 
     @property
+    def of_node(self) -> bool:
+        """Whether this row names a service that nodes have, below the name of its node."""
+        word = self.name.rpartition("/")[2]
+        return any(services.get(word) == self.type_name for services in _OF_NODES.values())
+
+    @property
     def is_topic(self) -> bool:
         """Whether this row names a topic: neither a service nor the row of requests and replies."""
         return self.type_name != CALLS_TYPE and not self.is_service

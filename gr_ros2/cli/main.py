@@ -50,7 +50,7 @@ COMMANDS: Commands = {
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
     "dict": ("gr_ros2.cli.dict:group", "Dictionaries for message compression."),
-    "key": ("gr_ros2.cli.key:group", "Keys for version 1 of the wire format, which `link` does not speak yet."),
+    "key": ("gr_ros2.cli.key:group", "Keys of a fleet, which seal the packets of version 1."),
     "wireshark": ("gr_ros2.cli.wireshark:wireshark", "The Wireshark dissector for captures made with --pcap."),
     "completion": ("gr_ros2.cli.completion:completion", "Completion of commands for bash, zsh and fish."),
     "grc-path": ("gr_ros2.cli.grc:grc_path", "The folder of block descriptions for GRC."),

@@ -59,10 +59,12 @@ def run(scenario: str, **options: Any) -> int:
 
 
 @click.command()
+@click.option("--version", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
 @_with_options
-def demo(**options: Any) -> int:
-    """Two simulated robots: the topics of one cross an OFDM link and come out at the other."""
-    return _run("demo", **options)
+def demo(version: str, overrides: tuple[str, ...], **options: Any) -> int:
+    """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other."""
+    older = () if version == "1" else ("version=0", "reports=null")
+    return _run("demo", overrides=(*older, *overrides), **options)
 
 
 def _run(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from gr_ros2.dashboard.views import PacketView, SpanView
 from gr_ros2.link.events import Received, Rejected
 from gr_ros2.registry import Registry
-from gr_ros2.wire import QOS_NAMES, Span, format_of
+from gr_ros2.wire import QOS_NAMES, Packet, Span, format_of
 
 NO_COLOUR = -1
 """Place in the palette of an unknown topic."""
@@ -29,16 +29,14 @@ def packet_views(
     :param colours: place in the palette by source id and topic id
     :param start: start of the run, s on the same clock
     """
-    views, last_seq = [], dict[int, int]()
+    views, newest = [], dict[int, int]()
     for t, event in events:
         if isinstance(event, Rejected):
             views.append(PacketView(t - start, len(event.data), refused=f"{event.error.kind}: {event.error}"))
             continue
         packet = event.packet
         wire = format_of(packet.version)
-        before = last_seq.get(packet.src_id)
-        missing = 0 if before is None else (packet.seq - before - 1) % (1 << wire.number_bits)
-        last_seq[packet.src_id] = packet.seq
+        missing = _missing(packet, newest)
         views.append(
             PacketView(
                 t - start,
@@ -54,13 +52,26 @@ def packet_views(
                 entries=len(packet.entries),
                 spans=tuple(
                     _span(span, packet.src_id, registry, colours)
-                    for span in wire.layout(packet, packet_len)
+                    for span in wire.layout(packet, packet_len, len(event.data))
                     if span.size
                 ),
                 missing=missing,
             )
         )
     return tuple(views)
+
+
+def _missing(packet: Packet, newest: dict[int, int]) -> int:
+    """Packets of the same source that are missing before this one.
+
+    :param newest: newest number that is known of each source; brought up to date
+    """
+    ring = 1 << format_of(packet.version).number_bits
+    ahead = (packet.seq - newest.get(packet.src_id, packet.seq)) % ring
+    if ahead >= ring // 2:
+        return 0  # an older packet, which came late or was sent again
+    newest[packet.src_id] = packet.seq
+    return max(ahead - packet.numbered, 0)
 
 
 def _span(span: Span, src_id: int, registry: Registry, colours: Mapping[tuple[int, int], int]) -> SpanView:

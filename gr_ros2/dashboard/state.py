@@ -11,6 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from math import nan
 from threading import Lock
+from typing import get_args
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
+    AirKind,
     Delivered,
     Lost,
     Missed,
@@ -136,6 +138,7 @@ class DashboardState:
             source = self._sources.setdefault(src_id, _SourceWindow())
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
+                self._packets[f"air_{event.kind}"] += 1
                 self._packets_sent.add(event.now)
                 for entry in event.entries:
                     source.messages.left(entry)
@@ -195,6 +198,7 @@ class DashboardState:
             colours = {key: place for place, key in enumerate(keys)}
             received = self._packets["handed_up"] - self._packets["rejected"]
             rejected = {kind: n for kind, n in sorted(self._packets.items()) if kind.startswith("rejected_")}
+            air = {f"air_{kind}": self._packets[f"air_{kind}"] for kind in get_args(AirKind)}
             heard = list(self._received)
             return Snapshot(
                 phase=self._phase,
@@ -208,7 +212,12 @@ class DashboardState:
                 paths=tuple(
                     self._path(place, key, start) for place, key in enumerate(keys) if self._topics[key].read_position
                 ),
-                packets={"sent": self._packets["sent"], "received": received, **rejected},
+                packets={
+                    "sent": self._packets["sent"],
+                    "received": received,
+                    **rejected,
+                    **(air if sum(air.values()) > air["air_new"] else {}),
+                },
                 packets_now=(
                     self._packets_sent.totals(now)[0] / RATE_S,
                     self._packets_received.totals(now)[0] / RATE_S,

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from html import escape
+from typing import get_args
 
 from gr_ros2.dashboard.packets import NO_COLOUR
 from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
-from gr_ros2.link.ledger_rows import row_order
+from gr_ros2.link.events import AirKind
+from gr_ros2.link.ledger_rows import LedgerRow, row_order
 from gr_ros2.report.colours import COLOURS, row_colour
 from gr_ros2.wire import BROADCAST
 
@@ -54,7 +56,23 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
         _tile("backlog", "–" if backlog is None else f"{backlog:,}", "packets queued in the PHY", backlog),
         _tile("snr", "–" if snr_db is None else f"{snr_db:.1f} dB", "SNR received", snr_db),
     ]
-    return f'<div class="tiles">{"".join(tiles)}</div>'
+    return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
+
+
+def _repair_tiles(snapshot: Snapshot) -> list[str]:
+    """What repair did, and what the packets sent were for; [] on a link that repairs nothing."""
+    air = {kind: snapshot.packets[f"air_{kind}"] for kind in get_args(AirKind) if f"air_{kind}" in snapshot.packets}
+    if not air:
+        return []
+    repaired, given_up = snapshot.in_row(LedgerRow.REPAIRED), snapshot.in_row(LedgerRow.GIVEN_UP)
+    tiles = [
+        _tile("repaired", f"{repaired:,}", "delivered after repair", repaired),
+        _tile("given_up", f"{given_up:,}", "given up", given_up),
+    ]
+    total = sum(air.values())
+    for kind, count in air.items():
+        tiles.append(_tile(f"air_{kind}", f"{count / total:.0%}", f"of packets out: {kind}", count / total))
+    return tiles
 
 
 def _tile(name: str, text: str, label: str, value: Number = None, css: str = "") -> str:

@@ -129,7 +129,8 @@ class Snapshot:
 
     :param phase: waiting, running, ended (result is in) or failed
     :param elapsed_s: s since the first message
-    :param packets: sent, received and each refusal by name
+    :param packets: sent, received and each refusal by name; if not all carried new messages, also ``air_new``,
+        ``air_repair``, ``air_report`` and ``air_hello``: those sent, by what they were for
     :param packets_now: packets/s sent and received in the last seconds
     """
 
@@ -145,6 +146,10 @@ class Snapshot:
     last_packets: tuple[PacketView, ...] = ()
     packets: Mapping[str, int] = field(default_factory=dict)
     packets_now: tuple[float, float] = (0.0, 0.0)
+
+    def in_row(self, row: str) -> int:
+        """Messages in a row of the ledger, over all topics."""
+        return sum(topic.ledger.get(row, 0) for topic in self.topics)
 
     @property
     def pdr(self) -> float | None:

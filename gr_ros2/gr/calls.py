@@ -190,9 +190,10 @@ class LiveCalls:
         try:
             LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
             graph = _with_services(self._sink.middleware, name)
-            self._servers[src_id, topic.topic_id] = graph.serve(
-                name, topic.type_name, partial(self._request, src_id, topic)
-            )
+            taker = partial(self._request, src_id, topic)
+            # ros2 param and ros2 lifecycle look for the node before they call its services.
+            node = name.rpartition("/")[0] if topic.of_node else ""
+            self._servers[src_id, topic.topic_id] = graph.serve(name, topic.type_name, taker, node)
         except GrRos2Error as error:
             self._tell_first(f"not_served:{name}", error)
 

@@ -11,18 +11,21 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import SinkConfig, SourceConfig, build
+from gr_ros2.errors import ConfigError
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
-from gr_ros2.registry import Registry
+from gr_ros2.registry import MAX_TOPICS, Registry
+from gr_ros2.setting import AUTO
 
 
 class RosLink(gr.hier_block2):  # type: ignore[misc]
@@ -57,7 +60,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         rows = read_registry(registry, needed=not source.version)
         start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
-        calls = source.version != 0
+        calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
         self.end = LiveEnd(
             lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
         )
@@ -66,7 +69,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
         self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
         self.calls: LiveCalls | None = None
-        """The services that cross the link; None with version 0."""
+        """The services that cross the link; None with version 0, and where topics leave no room for calls."""
         if calls:
             self.calls = LiveCalls(self.end, self.source, self.sink)
         for port in ("pdus", "credit"):
@@ -82,3 +85,25 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
             self.calls.close()
         self.source.close()
         self.sink.close()
+
+
+def make_link(*, half_duplex: bool = False, **values: Any) -> RosLink:
+    """Make a link from the settings of both halves in one list, as GRC does.
+
+    :param half_duplex: whether sending and receiving share the airtime
+    :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
+    :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
+    """
+    halves: list[Any] = []
+    known: set[str] = set()
+    for cls in (SourceConfig, SinkConfig):
+        names = {field.name for field in fields(cls)}
+        known |= names
+        halves.append(build(cls, {name: value for name, value in values.items() if name in names}))
+    unknown = sorted(values.keys() - known)
+    if unknown:
+        raise ConfigError(f"unknown key {unknown[0]}; known are {', '.join(sorted(known))}")
+    source, sink = halves
+    if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
+        sink = replace(sink, robot_id=source.src_id())
+    return RosLink(source.registry, source, sink, half_duplex=half_duplex)

@@ -153,6 +153,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         """Hand over what concerns services."""
         self._calls = calls
 
+    @property
+    def matched(self) -> bool:
+        """Whether every publisher has found a subscription."""
+        return all(publisher.matched() for publisher in list(self._publishers.values()))
+
     def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
         """Create the publishers of an expected sender now, so that subscribers find them before its first message.
 

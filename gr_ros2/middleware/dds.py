@@ -134,9 +134,9 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self.announce()
         return publisher
 
-    def serve(self, service: str, type_name: str, on_request: RequestCallback) -> DdsServer:
+    def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> DdsServer:
         self._check_open(f"serve {service}")
-        return DdsServer(self, ros_graph.check_topic(service), type_name, on_request)
+        return DdsServer(self, ros_graph.check_topic(service), type_name, on_request, node)
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> DdsClient:
         self._check_open(f"call {service}")
@@ -225,11 +225,15 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             with self._lock:
                 readers = [reader.guid for subscription in self._subscriptions for reader in subscription.readers()]
                 writers = [publisher.writer.guid for publisher in self._advertised]
-                readers += [end.reader.guid for end in self._pairs]
-                writers += [end.writer.guid for end in self._pairs]
-            info = ros_graph.participant_entities_info(
-                self._guid, *self._node, readers, writers, gid_bytes=self._gid_bytes
-            )
+                own = [end for end in self._pairs if not end.node]
+                readers += [end.reader.guid for end in own]
+                writers += [end.writer.guid for end in own]
+                nodes = [ros_graph.NodeEntities(*self._node, readers, writers)]
+                for name in sorted({end.node for end in self._pairs if end.node}):
+                    ends = [end for end in self._pairs if end.node == name]
+                    guids = [end.reader.guid for end in ends], [end.writer.guid for end in ends]
+                    nodes.append(ros_graph.NodeEntities(*_split(name), *guids))
+            info = ros_graph.participant_entities_info(self._guid, nodes, gid_bytes=self._gid_bytes)
             try:
                 self._discovery.write(info)
             except DdsError:
@@ -358,3 +362,9 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     def _detach(self, key: Entity) -> None:
         with self._lock:
             self._services.pop(self._numbers.pop(key, 0), None)
+
+
+def _split(node: str) -> tuple[str, str]:
+    """Name and namespace of a node."""
+    namespace, _, name = node.rpartition("/")
+    return name, namespace or "/"

@@ -74,6 +74,7 @@ class ServiceParticipant(ServiceGraph):
 class _End:
     """What servers and clients have in common.
 
+    :ivar node: absolute name of the node to which it belongs; '' the participant's own
     :ivar reads: which topic it reads, 0 that of requests, 1 that of replies; likewise ``writes``
     """
 
@@ -83,8 +84,8 @@ class _End:
     role = ""
     reads, writes = 0, 1
 
-    def __init__(self, participant: ServiceParticipant, service: str, type_name: str) -> None:
-        self.name, self.type_name = service, type_name
+    def __init__(self, participant: ServiceParticipant, service: str, type_name: str, node: str = "") -> None:
+        self.name, self.type_name, self.node = service, type_name, node
         self._participant = participant
         self._closed = False
         self._calling = threading.RLock()
@@ -119,9 +120,9 @@ class DdsServer(_End, ServiceServer):
     role = "service"
 
     def __init__(
-        self, participant: ServiceParticipant, service: str, type_name: str, on_request: RequestCallback
+        self, participant: ServiceParticipant, service: str, type_name: str, on_request: RequestCallback, node: str
     ) -> None:
-        super().__init__(participant, service, type_name)
+        super().__init__(participant, service, type_name, node)
         self._on_request = on_request
         participant.make_pair(self)
 

@@ -188,7 +188,13 @@ class MemoryMiddleware(ServiceGraph):
                 self.graph.replay(subscription)
         return publisher
 
-    def serve(self, service: str, type_name: str, on_request: RequestCallback) -> MemoryServer:
+    def serve(
+        self,
+        service: str,
+        type_name: str,
+        on_request: RequestCallback,
+        node: str = "",  # noqa: ARG002 - nobody asks for nodes here
+    ) -> MemoryServer:
         names = ros_graph.check_topic(service), type_name
         with self.graph.lock:
             self._check_open(f"serve {service}")

@@ -29,13 +29,13 @@ from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.adapt import Adaptation, Replays, compatible
 from gr_ros2.middleware.base import (
     JOIN_S,
     MessageCallback,
-    Middleware,
     Publisher,
     Qos,
     Subscription,
@@ -43,7 +43,9 @@ from gr_ros2.middleware.base import (
     finite,
 )
 from gr_ros2.middleware.rcl import told, translated
+from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -62,19 +64,24 @@ ENCAPSULATION = 4
 
 
 def message_class(type_name: str) -> Any:
-    """The Python class of ``package/msg/Type`` (or ``package/Type``), its C type support loaded.
+    """The Python class of ``package/msg/Type`` (or ``package/Type``, or an action's feedback), its C type support
+    loaded.
 
     :raises ConfigError: malformed, or not in the sourced workspaces
     """
-    package, _, name = normalize_type(type_name).partition("/msg/")
+    package, folder, name = normalize_type(type_name).split("/")
     try:
-        kind = getattr(import_module(f"{package}.msg"), name)
+        module = import_module(f"{package}.{folder}")
+        if folder == "action":
+            kind = getattr(module, name.removesuffix("_FeedbackMessage")).Impl.FeedbackMessage
+        else:
+            kind = getattr(module, name)
         if kind.__class__._TYPE_SUPPORT is None:
             kind.__class__.__import_type_support__()
     # The import runs generated code and loads C libraries, which may raise other errors than ImportError.
     except Exception as error:
         raise ConfigError(
-            f"type {package}/msg/{name} cannot be imported ({error}); source the workspace that has it "
+            f"type {package}/{folder}/{name} cannot be imported ({error}); source the workspace that has it "
             f"(. install/setup.bash) before starting, or use middleware 'dds', which needs no definitions"
         ) from error
     return kind
@@ -121,7 +128,7 @@ def _policy_name(event: Any) -> str:
         return str(event.last_policy_kind)
 
 
-class RclpyMiddleware(Middleware):
+class RclpyMiddleware(RclpyParticipant):
     """One ROS 2 node in a context of its own, spinning in a thread of its own.
 
     ``counters`` also has ``executor_failed``: errors of rclpy itself, for instance a message that it could not take.
@@ -168,6 +175,7 @@ class RclpyMiddleware(Middleware):
         self._open = True  # guarded by _lock: the node and its guard condition exist
         self._work: deque[tuple[Callable[[], None], threading.Event]] = deque()
         self._subscriptions: list[_RclpySubscription] = []
+        self._clients: list[RclpyClient] = []
         self._closing = threading.Event()
         self._failed = False
         # Reentrant; otherwise an error of rclpy while it takes a message would block the whole group permanently.
@@ -200,6 +208,30 @@ class RclpyMiddleware(Middleware):
         """
         self.check_open()
         return _RclpyPublisher(self, topic, type_name, qos)
+
+    def serve(
+        self,
+        service: str,
+        type_name: str,
+        on_request: RequestCallback,
+        node: str = "",  # noqa: ARG002 - a node of rclpy has its own endpoints only
+    ) -> RclpyServer:
+        """See services. The server belongs to this participant's node.
+
+        :raises ConfigError: a type that cannot be imported, a name ROS does not allow
+        """
+        self.check_open()
+        return RclpyServer(self, check_topic(service), type_name, on_request)
+
+    def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> RclpyClient:
+        """See services.
+
+        :raises ConfigError: a type that cannot be imported, a name ROS does not allow
+        """
+        self.check_open()
+        client = RclpyClient(self, check_topic(service), type_name, on_reply, on_server)
+        self._clients.append(client)
+        return client
 
     def discover(self) -> list[TopicInfo]:
         """See base. A topic with several types has one row per type; depths are known only where the RMW announces
@@ -263,8 +295,22 @@ class RclpyMiddleware(Middleware):
             except (RuntimeError, NameValidationException) as error:
                 raise MiddlewareError(f"{kind} of {arguments['topic']} failed: {error}") from error
 
+    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any]) -> Any:
+        """Make a service or a client of the node."""
+        try:
+            return getattr(self._node, f"create_{kind}")(service_type, name, *callback, callback_group=self._group)
+        except (RuntimeError, NameValidationException) as error:
+            raise MiddlewareError(f"{kind} of {name} failed: {error}") from error
+
+    def to_bytes(self, message: Any) -> bytes:
+        return bytes(serialize_message(message))
+
+    def to_message(self, payload: bytes, message_type: Any) -> Any:
+        return deserialize_message(payload, message_type)
+
     def destroy(self, kind: str, endpoint: Any) -> None:
         """Destroy an endpoint, in the executor's thread."""
+        self._clients = [client for client in self._clients if not client.is_of(endpoint)]
         with contextlib.suppress(InvalidHandle):  # destroyed with its node already
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
@@ -321,6 +367,8 @@ class RclpyMiddleware(Middleware):
             if failed:
                 subscription.revive()
             subscription.adapt()
+        for client in tuple(self._clients):
+            client.look()
 
     def _spin(self) -> None:
         try:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -30,6 +30,7 @@ __all__ = [
     "PARTICIPANT_USER_DATA",
     "DiscoveryOptions",
     "DiscoveryRange",
+    "NodeEntities",
     "check_node",
     "check_topic",
     "dds_service",
@@ -188,27 +189,32 @@ def hash_told(user_data: bytes) -> str:
     return match[1].decode() if match else ""
 
 
-def participant_entities_info(
-    participant: bytes,
-    node_name: str,
-    namespace: str,
-    readers: Sequence[bytes],
-    writers: Sequence[bytes],
-    *,
-    gid_bytes: int = 24,
-) -> bytes:
-    """The message on ros_discovery_info for one node, CDR little endian.
+class NodeEntities(NamedTuple):
+    """A node and its endpoints on the DDS.
 
-    :param participant: GUID, 16 bytes; likewise those of readers and writers
+    :param namespace: absolute
+    :param readers: GUIDs, 16 bytes each; likewise those of the writers
+    """
+
+    name: str
+    namespace: str
+    readers: Sequence[bytes]
+    writers: Sequence[bytes]
+
+
+def participant_entities_info(participant: bytes, nodes: Sequence[NodeEntities], *, gid_bytes: int = 24) -> bytes:
+    """The message on ros_discovery_info for the nodes of one participant, CDR little endian.
+
+    :param participant: GUID, 16 bytes
     """
     store = _discovery_types(gid_bytes)
     gid_class, node_class, info_class = (store.types[name] for name in _DISCOVERY_MESSAGES)
 
-    def gids(*guids: bytes) -> list[Any]:
+    def gids(guids: Sequence[bytes]) -> list[Any]:
         return [gid_class(np.frombuffer(guid.ljust(gid_bytes, b"\0"), np.uint8)) for guid in guids]
 
-    node = node_class(namespace, node_name, gids(*readers), gids(*writers))
-    return bytes(store.serialize_cdr(info_class(*gids(participant), [node]), _DISCOVERY_MESSAGES[-1]))
+    told = [node_class(node.namespace, node.name, gids(node.readers), gids(node.writers)) for node in nodes]
+    return bytes(store.serialize_cdr(info_class(*gids([participant]), told), _DISCOVERY_MESSAGES[-1]))
 
 
 @cache

@@ -51,11 +51,13 @@ class ServiceGraph(Middleware):
     """A participant that can have servers and clients."""
 
     @abstractmethod
-    def serve(self, service: str, type_name: str, on_request: RequestCallback) -> ServiceServer:
+    def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> ServiceServer:
         """Make a server, which may take any time to reply.
 
         :param service: absolute name
         :param type_name: ``package/srv/Type``, or ``package/action/Type_SendGoal`` or ``_GetResult``
+        :param node: absolute name of the node to which it belongs, where the middleware can show others than its own;
+            '' is the participant's own
         """
 
     @abstractmethod

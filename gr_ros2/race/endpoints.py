@@ -28,6 +28,8 @@ _ROS_DEPTH = 10
 """Messages that ROS 2 nodes keep by default."""
 _DOMAIN = 0
 _POLL_S = 0.02
+_LATE_S = 1.0
+"""s that the player of a recording may be late, because the computer is busy."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,8 @@ class RacePublisher:
     """Plays one topic of a bag.
 
     :param messages: number of messages to publish
-    :param duration_s: longest time to play, s; a message that the network delays beyond this time is never published
+    :param duration_s: length of the recording, s; a message that the network delays by more than a second beyond this
+        time is never published
     """
 
     def __init__(self, contender: Contender, topic: RaceTopic, bag: Path, messages: int, duration_s: float) -> None:
@@ -178,7 +181,7 @@ class RacePublisher:
         """Publish the messages at their recorded times. Return the time of the first one, s monotonic."""
         self._bag.subscribe(self._topic.name, self._topic.type_name, Qos(), self._publish)
         self._bag.start()
-        end = time.monotonic() + self._duration_s
+        end = time.monotonic() + self._duration_s + _LATE_S
         while self._published < self._messages and time.monotonic() < end:
             time.sleep(_POLL_S)
         self._bag.close()

@@ -168,6 +168,10 @@ class RaceRosLink:
         """The topic on which the receiving end publishes the messages."""
         return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
 
+    def matched(self) -> bool:
+        """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""
+        return self._source.matched and self._sink.matched
+
     def report(self) -> LinkReport:
         """The traffic on the air so far."""
         topics = self._source.stats()["topics"].values()
@@ -232,6 +236,10 @@ class RaceIpLink:
                 phy.prefer_latency()
                 self._links.append(link)
             self._stack = stack.pop_all()
+
+    def matched(self) -> bool:
+        """True: IP has no ends that must find each other."""
+        return True
 
     def report(self) -> LinkReport:
         """The traffic on the air so far."""

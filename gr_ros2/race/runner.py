@@ -122,7 +122,7 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
         timeout_s = settings.match_s + _PLAY_SLACK_S
         began = listener.call("connect", timeout_s=timeout_s)
         talker.call("connect", timeout_s=timeout_s)
-        matched = _wait_matched(settings.match_s, talker, listener)
+        matched = _wait_matched(settings.match_s, talker, listener, air)
         t_first = talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S)
         t_sent = [t_first + due for due in recording.due]
         _drain(settings.drain_s, listener, len(t_sent))
@@ -131,9 +131,9 @@ def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condi
         return Observed(began, matched, t_sent, listener.call("heard"), report, busy)
 
 
-def _wait_matched(limit_s: float, *ends: Worker) -> bool:
+def _wait_matched(limit_s: float, *parts: Worker) -> bool:
     limit = time.monotonic() + limit_s
-    while not (matched := all(end.call("matched") for end in ends)) and time.monotonic() < limit:
+    while not (matched := all(part.call("matched") for part in parts)) and time.monotonic() < limit:
         time.sleep(_POLL_S)
     return matched
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from gr_ros2.link.events import Accepted, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.record.ledger import Ledger, TopicLedger
 from gr_ros2.record.metrics import TopicMetrics, topic_metrics
 from gr_ros2.record.path_error import path_error, rms_error
@@ -43,8 +43,8 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
-        self._lengths: Counter[int] = Counter()
-        """Number of packets sent, by their length in bytes."""
+        self._lengths: Counter[tuple[AirKind, int]] = Counter()
+        """Number of packets sent, by what they were for and their length in bytes."""
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -61,7 +61,7 @@ class Recorder:
         """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
-            self._lengths[len(event.data)] += 1
+            self._lengths[event.kind, len(event.data)] += 1
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
@@ -102,9 +102,10 @@ class Recorder:
         self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
         return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
 
-    def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, float | None]:
+    def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, Any]:
         """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
-        per byte delivered.
+        per byte delivered; of the packets of each :data:`gr_ros2.link.events.AirKind`, where there were several; and
+        the bytes of all packets sent per message delivered.
 
         To be called after :meth:`finish`.
 
@@ -112,9 +113,13 @@ class Recorder:
             PHY without samples
         """
         longest = total = mean = None
+        sent_bytes = sum(length * count for (_, length), count in self._lengths.items())
+        spent: Counter[str] = Counter()
         if of_length is not None:
             longest = of_length(None)
-            total = sum(of_length(length) * count for length, count in self._lengths.items())
+            for (kind, length), count in self._lengths.items():
+                spent[kind] += of_length(length) * count  # type: ignore[assignment]
+            total = float(spent.total())
             mean = total / self._lengths.total() if total else longest
         return {
             "airtime_s": longest,
@@ -123,6 +128,8 @@ class Recorder:
             "airtime_per_byte_s": total / self._delivered_bytes
             if total is not None and self._delivered_bytes
             else None,
+            **({"airtime_of_kinds_s": dict(spent)} if len(spent) > 1 else {}),
+            "bytes_per_message": sent_bytes / self._delivered if self._delivered else None,
         }
 
     def received_at(self, src_id: int) -> Floats:

@@ -129,7 +129,9 @@ class Result:
     :param config: every setting of the scenario
     :param packets: counts by name: sent, received, crc_failed, malformed, …
     :param phy: name, channels (one per direction), sample_rate, runs_on (what processed the samples), airtime_s (of one
-        packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte), …
+        packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte),
+        bytes_per_message (of all packets sent, per delivered message), airtime_of_kinds_s (of new packets, repairs,
+        reports, hellos), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why
@@ -152,6 +154,27 @@ class Result:
     lateness: LatenessResult | None = None
     incomplete: tuple[str, ...] = ()
     receivers: tuple[ReceiverResult, ...] = ()
+
+
+@dataclass(frozen=True)
+class AirUse:
+    """What packets of one kind used.
+
+    :param kind: new, repair, report or hello
+    :param share: of the airtime of all packets sent, 0..1; of their number for a PHY without samples
+    """
+
+    kind: str
+    packets: int
+    share: float
+
+
+def air_uses(result: Result) -> list[AirUse]:
+    """What the air was used for; [] for a run in which all packets carried new messages."""
+    packets = {name[4:]: count for name, count in result.packets.items() if name.startswith("air_")}
+    spent = result.phy.get("airtime_of_kinds_s") or packets
+    total = sum(spent.values()) or 1
+    return [AirUse(kind, count, spent.get(kind, 0) / total) for kind, count in packets.items()]
 
 
 def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:

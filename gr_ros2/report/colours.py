@@ -14,6 +14,9 @@ COLOURS = (
 """Colours of topics and runs, in their order. Colour-blind readers can distinguish them as well as is possible with
 sixteen colours."""
 
+AIR_COLOURS = {"new": "#2a9d5c", "repair": "#1d6b3f", "report": "#e69f00", "hello": "#9db8d9"}
+"""Colours of what packets are for."""
+
 
 def row_colour(row: str) -> str:
     """The colour of a ledger row. A row that this version does not know also has a fixed colour."""

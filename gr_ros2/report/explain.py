@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from gr_ros2.link.lateness import LATE_S
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow, row_order
-from gr_ros2.record.result import Result
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow, arrived, row_order
+from gr_ros2.record.result import Result, air_uses
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.table import milliseconds
 
+_KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
 _TREND = 1.5
 """A latency that changes by less than this factor from the first to the last deliveries counts as unchanged."""
 
@@ -31,6 +32,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *_packets(result, packets),
         *_in_flight(trace, packets),
         *_trend(trace),
+        *repair_told(result),
         *_lateness(result),
     ]
 
@@ -75,30 +77,51 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     if not len(t_sent):
         return
     here = np.flatnonzero(~np.isnan(t_received))
-    arrived = len(here)
-    passed = int(here[-1]) + 1 if arrived else 0  # later packets may still be on their way
+    came = len(here)
+    passed = int(here[-1]) + 1 if came else 0  # later packets may still be on their way
+    what = "packets with new messages" if air_uses(result) else "packets"
     text = (
-        f"Of {len(t_sent):,} packets that left the source, {arrived:,} ({_percent(arrived / len(t_sent))}) reached the "
-        f"sink intact, {passed - arrived:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
+        f"Of {len(t_sent):,} {what} that left the source, {came:,} ({_percent(came / len(t_sent))}) reached the "
+        f"sink intact, {passed - came:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
         "PHY by the end"
     )
-    if result.phy.get("airtime_s") and result.config.get("time") != "unthrottled" and arrived:
+    if result.phy.get("airtime_s") and result.config.get("time") != "unthrottled" and came:
         span = max(result.duration_s, float(np.nanmax(t_received)))
         used = (
-            arrived
-            * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"])
-            / span
-            / result.phy.get("channels", 1)
+            came * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"]) / span / result.phy.get("channels", 1)
         )
         text += f"; those that arrived took {_percent(used)} of the air"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
-    if whole and arrived < passed:
+    if whole and came < passed:
+        unrepaired = " without repair" if air_uses(result) else ""
         yield (
             f"A message had {wanted:.1f} fragments on average and needs every one: of {whole:,} messages that left "
-            f"whole {complete:,} ({_percent(complete / whole)}) arrived complete; had the same share of packets been "
-            f"lost at random, {_percent((arrived / passed) ** wanted)} would have."
+            f"whole {complete:,} ({_percent(complete / whole)}) arrived complete{unrepaired}; had the same share of "
+            f"packets been lost at random, {_percent((came / passed) ** wanted)} would have."
         )
+
+
+def repair_told(result: Result) -> Iterator[str]:
+    """What repair did, and what the air was used for."""
+    uses = air_uses(result)
+    if not uses:
+        return
+    ledger: Counter[str] = Counter()
+    for topic in result.topics:
+        ledger.update(topic.ledger)
+    repaired, given_up = ledger[LedgerRow.REPAIRED], ledger[LedgerRow.GIVEN_UP]
+    if repaired or given_up:
+        yield (
+            f"Repair recovered {repaired:,} messages ({_percent(repaired / ledger.total())} of those sent) that had "
+            f"lost a packet; {given_up:,} were given up."
+        )
+    else:
+        yield "No message needed repair."
+    spent = ", ".join(f"{use.packets:,} for {_KINDS[use.kind]} ({_percent(use.share)})" for use in uses)
+    delivered = arrived(ledger)
+    per_message = f"; {result.packets['sent'] / delivered:.2f} packets for each message delivered" if delivered else ""
+    yield f"Packets sent, and their share of the air used: {spent}{per_message}."
 
 
 def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:

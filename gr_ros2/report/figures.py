@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.ledger_rows import row_order
-from gr_ros2.report.colours import COLOURS, row_colour
+from gr_ros2.record.result import AirUse
+from gr_ros2.report.colours import AIR_COLOURS, COLOURS, row_colour
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
@@ -133,6 +134,22 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
         figure.legend(loc="outside lower center", ncols=min(len(rows), 5), fontsize="small", frameon=False)
     else:
         axes.text(50, 0, "nothing was sent", ha="center")
+    return figure
+
+
+def air_figure(uses: Sequence[AirUse]) -> Figure:
+    """What the packets sent were for: one bar of 100 % of their airtime, with the number of packets of each kind."""
+    figure = Figure(figsize=(8.0, 1.7), layout="constrained")
+    axes = figure.add_subplot(title="What the air was used for", xlabel="share of the air used [%]", xlim=(0, 100))
+    left = 0.0
+    for use in uses:
+        width = use.share * 100
+        axes.barh([0], [width], left=left, height=0.7, color=AIR_COLOURS[use.kind], label=use.kind)
+        if width > 1.5 + 1.2 * len(str(use.packets)):  # where the number fits into the bar
+            axes.text(left + width / 2, 0, str(use.packets), ha="center", va="center", fontsize=8)
+        left += width
+    axes.set_yticks([])
+    figure.legend(loc="outside lower center", ncols=len(uses) or 1, fontsize="small", frameon=False)
     return figure
 
 

@@ -25,11 +25,11 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.files import write_text, write_whole
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.repetitions import run_folders
-from gr_ros2.record.result import Result, read_result, topic_numbers
+from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers
 from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2.report.explain import explanation
-from gr_ros2.report.figures import latency_figure, ledger_figure, path_figure, save_figure
-from gr_ros2.report.table import PAPER, Grid, ledger_grid, notes, paper_grid, summary_grid
+from gr_ros2.report.figures import air_figure, latency_figure, ledger_figure, path_figure, save_figure
+from gr_ros2.report.table import PAPER, Grid, air_grid, ledger_grid, notes, paper_grid, summary_grid
 from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
 
 REPORT_FILE = "report.html"
@@ -209,7 +209,7 @@ def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
         heading=run.label if several else "What happened",
         lead=lead_of(run) if several else "",
         sentences=[*explanation(result, run.trace), *notes(result)],
-        grids=[ledger_grid(result)],
+        grids=[grid for grid in (ledger_grid(result), air_grid(result)) if grid is not None],
         pictures=_draw(run, out, prefix),
         details=settings,
     )
@@ -249,7 +249,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
                 airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),
                 out,
                 f"{prefix}airtime",
-                "Airtime of the packets that left the source and of those that arrived",
+                "Airtime of the packets that left the source and of those that arrived, without repairs and reports",
             )
         )
     pictures.append(
@@ -260,13 +260,16 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
             "The loss ledger: every sent message ends in exactly one row; in brackets how many were sent",
         )
     )
+    if uses := air_uses(result):
+        caption = "What the packets sent were for, as shares of their airtime"
+        pictures.append(save(air_figure(uses), out, f"{prefix}air", caption))
     pictures.append(
         save(
             packets_figure(packets, [m.topic for m in topics]),
             out,
             f"{prefix}packets",
-            "The first packets: which topics' entries each carries (every other message lighter), when it left, and "
-            "when or whether it arrived",
+            "The first packets with new messages: which topics' entries each carries (every other message lighter), "
+            "when it left, and when or whether it arrived",
             wide=True,
         )
     )

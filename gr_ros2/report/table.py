@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.record.result import Result, TopicResult
+from gr_ros2.record.result import Result, TopicResult, air_uses
 
 _DASH = "–"
 PAPER = "the paper"
@@ -84,6 +84,20 @@ def ledger_grid(result: Result) -> Grid:
     rows = list(dict.fromkeys([*first, *sorted(found)]))
     lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
     return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))
+
+
+def air_grid(result: Result) -> Grid | None:
+    """What the packets sent were for, and their share of the airtime; None if all carried new messages."""
+    uses = air_uses(result)
+    if not uses:
+        return None
+    delivered = sum(topic.delivered for topic in result.topics)
+    lines = tuple(
+        (use.kind, f"{use.packets:,}", f"{use.share:.1%}", number(each, "{:.2f}"))
+        for use in uses
+        for each in (use.packets / delivered if delivered else None,)
+    )
+    return Grid("What the air was used for", ("Packets", "sent", "of the air used", "per message delivered"), (lines,))
 
 
 def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:

@@ -110,7 +110,7 @@ class Scenario(Experiment, Traffic, AnyLink):
         if self.back is not None:
             self._check_back(self.back)
         if self.reports is not None and (not self.version or self.back is not None):
-            raise ValueError("reports: version 0 has none, and with back they go along; leave reports out")
+            raise ValueError("reports: version 0 has none, and with back they go along; set reports to null")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
         if self.receivers and not self.simulated:

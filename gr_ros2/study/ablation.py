@@ -46,7 +46,11 @@ def variants(scenario: Scenario) -> list[Variant]:
         found.append(Variant("no-compression", ("ros_source.compression=false", "ros_sink.compression=false")))
     if source.packet_rate != 0:
         found.append(Variant("no-pull", ("ros_source.packet_rate=0",)))
-    if source.scheduler == "freshness":
+    if source.version and source.repair != "off":
+        found.append(Variant("no-repair", ("ros_source.repair='off'",)))
+    if scenario.reports is not None:
+        found.append(Variant("no-reports", ("reports=null",)))
+    if not source.version and source.scheduler == "freshness":  # version 1 always has it
         found.append(Variant("no-freshness", ("ros_source.scheduler=paper",)))
     registry = scenario.load_registry().with_options(source.topic_options)
     latest = [topic.name for topic in registry if queue_for(topic.options)[0] == "latest"]
@@ -54,7 +58,8 @@ def variants(scenario: Scenario) -> list[Variant]:
         found.append(Variant("no-latest", tuple(f"ros_source.topic_options.{name}.queue=fifo" for name in latest)))
     if len(found) == 1:
         raise ConfigError(
-            f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, freshness or queue latest"
+            f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, repair, reports, freshness "
+            "or queue latest"
         )
     return found
 
@@ -107,7 +112,6 @@ def worth_grid(runs: Sequence[Run]) -> Grid:
 
 
 def air_bytes(result: Result) -> float | None:
-    """Packet bytes that left the source, PAD and headers included, per message delivered; None if none was."""
-    delivered = sum(topic.delivered for topic in result.topics)
-    packet_len: int = result.config["packet_len"]
-    return result.packets["sent"] * packet_len / delivered if delivered else None
+    """Bytes of all packets sent, PAD and headers included, per message delivered; None if none was."""
+    found: float | None = result.phy.get("bytes_per_message")
+    return found

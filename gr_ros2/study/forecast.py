@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gr_ros2.config import replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
+from gr_ros2.link.events import AirKind
 from gr_ros2.link.freshness import TURN
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
@@ -24,7 +26,7 @@ from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Topic
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.simulate import offered, simulate
+from gr_ros2.run.simulate import Simulated, offered, simulate
 from gr_ros2.setting import AUTO
 
 TRIAL_S = 10.0
@@ -246,7 +248,7 @@ class Planner:
                 "ros_source.compression=true ros_sink.compression=true",
                 replace(base, ros_source=replace(source, compression=True), ros_sink=replace(sink, compression=True)),
             )
-        if source.scheduler != "freshness":
+        if not source.version and source.scheduler != "freshness":
             yield "ros_source.scheduler=freshness", replace(base, ros_source=replace(source, scheduler="freshness"))
         if source.packet_rate == 0:
             yield "ros_source.packet_rate=auto", replace(base, ros_source=replace(source, packet_rate=AUTO))
@@ -274,7 +276,7 @@ class Planner:
             most = sorted(values)[int(0.99 * (len(values) - 1))]
             lens |= {wire.packed_len([-(-most // parts)]) for parts in _PARTS}
         lens.discard(self.scenario.packet_len)
-        usable = range(wire.packed_len([source.min_fragment]), wire.max_packet_len + 1)
+        usable = range(max(wire.packed_len([source.min_fragment]), wire.min_packet_len), wire.max_packet_len + 1)
         return sorted(
             packet_len for packet_len in lens if packet_len in usable and largest <= wire.largest_message(packet_len)
         )
@@ -312,7 +314,7 @@ class Planner:
             own_airtime = phy.airtime(len(sent.data))
             spent += own_airtime
             sent_bytes += len(sent.data)
-            layout = wire.layout(sent.packet, len(sent.data))
+            layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
             padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
@@ -349,7 +351,7 @@ class Planner:
             pad=padded / sent_bytes if sent_bytes else 0.0,
             pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
-            air={kind: count / max(sum(run.stats.sent.values()), 1) for kind, count in run.stats.air.items()},
+            air=_air(run),
         )
 
 
@@ -378,6 +380,13 @@ class _Remembering:
         if payload is None:
             payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)
         return payload
+
+
+def _air(run: Simulated) -> dict[str, float]:
+    """Packets per message sent by their purpose, those of all robots."""
+    packets = {kind: run.packets.get(f"air_{kind}", 0) for kind in get_args(AirKind)}
+    messages = max(sum(run.stats.sent.values()), 1)
+    return {kind: count / messages for kind, count in packets.items()} if any(packets.values()) else {}
 
 
 def _turn(scenario: Scenario) -> int:

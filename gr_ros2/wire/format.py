@@ -55,6 +55,10 @@ class Packet(Protocol):
     @property
     def seq(self) -> int: ...
     @property
+    def numbered(self) -> bool:
+        """Whether it has a number of its own; otherwise it has that of the newest packet of its source."""
+
+    @property
     def qos(self) -> int: ...
     @property
     def hop(self) -> int: ...
@@ -141,8 +145,12 @@ class Format(Protocol):
     def packed_len(self, payload_lens: Sequence[int]) -> int:
         """Bytes of a packet with entries of these payload lengths, without padding."""
 
-    def layout(self, packet: Any, packet_len: int) -> list[Span]:
-        """The fields of a packet, in the order of its bytes."""
+    def layout(self, packet: Any, packet_len: int, size: int | None = None) -> list[Span]:
+        """The fields of a packet, in the order of its bytes.
+
+        :param packet_len: bytes of the longest packet on this link
+        :param size: bytes of this packet, None = as many
+        """
 
     def encode(self, packet: Any, packet_len: int) -> bytes:
         """A packet's bytes.

@@ -96,6 +96,11 @@ class Packet(NamedTuple):
     compressed: bool = False
     encrypted: bool = False
 
+    @property
+    def numbered(self) -> bool:
+        """Every packet has a number of its own."""
+        return True
+
 
 def crc16(data: bytes) -> int:
     """CRC-16 of section 5.2: polynomial 0x1021, init 0, not reflected, no final xor."""
@@ -160,8 +165,8 @@ class FormatV0:
         """Bytes of header, topic ids, entries and CRC. L_pad of section 5.3 is ``packet_len`` minus this number."""
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
-    def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """The fields of a packet, in the order of its bytes."""
+    def layout(self, packet: Packet, packet_len: int, size: int | None = None) -> list[Span]:  # noqa: ARG002
+        """The fields of a packet, in the order of its bytes. All packets have ``packet_len`` bytes."""
         entries = packet.entries
         pad = packet_len - self.packed_len([len(entry.payload) for entry in entries])
         return [

@@ -425,6 +425,11 @@ class Packet(NamedTuple):
         return self.header.number
 
     @property
+    def numbered(self) -> bool:
+        """Whether it is a source packet. A repair or a control packet stands at the newest source packet's number."""
+        return self.standing is None
+
+    @property
     def qos(self) -> int:
         """QoS class of its messages; default if it carries none."""
         return self.header.qos if self.standing is None else 0
@@ -531,19 +536,19 @@ class FormatV1:
         """Bytes of a packet with entries of these payload lengths, without padding."""
         return HEADER_LEN + STANDING_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
 
-    def layout(self, packet: Packet, packet_len: int) -> list[Span]:
-        """The fields of a packet, in the order of its bytes."""
+    def layout(self, packet: Packet, packet_len: int, size: int | None = None) -> list[Span]:
+        """See :meth:`gr_ros2.wire.format.Format.layout`."""
         header, standing = packet.header, packet.standing
         trailer = TAG_LEN if header.sealed else CRC_LEN
         spans = [Span("head", header.size + (standing.size if standing is not None else 0))]
         free = body_room(packet_len, sealed=header.sealed, addressed=header.dst_id != BROADCAST)
         for entry in packet.body:
-            size = len(write_body([entry], free))
-            spans.append(Span("entry" if isinstance(entry, Part) else "control", size, *_shown(entry)))
-            free -= size
+            written = len(write_body([entry], free))
+            spans.append(Span("entry" if isinstance(entry, Part) else "control", written, *_shown(entry)))
+            free -= written
         if packet.combined:
             spans.append(Span("repair", len(packet.combined)))
-        rest = packet_len - trailer - sum(span.size for span in spans)
+        rest = (packet_len if size is None else size) - trailer - sum(span.size for span in spans)
         return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
 
     def encode(self, packet: Packet, packet_len: int) -> bytes:

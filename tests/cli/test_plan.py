@@ -27,7 +27,10 @@ def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixt
 
 
 def test_it_says_what_gets_better_by_how_much_and_what_gets_worse(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["plan", "demo", "--duration", "5"]) == 0
+    plainer = ["version=0", "reports=null", "ros_source.scheduler=paper", "ros_source.compression=false"]
+    plainer += ["ros_sink.compression=false"]
+    options = [word for override in plainer for word in ("--set", override)]
+    assert run(["plan", "demo", "--duration", "5", *options]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if " --set " in line]
     assert lines
     for line in lines:

@@ -104,10 +104,10 @@ def viewer(tmp_path: Path) -> Iterator[Viewer]:
 
 
 @contextmanager
-def program(out: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def program(out: Path, port: int = 0, *more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A long run over OFDM with a dashboard, and where that is."""
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
-    settings += ["phy.sample_rate=5e5", "channel.snr_db=30", "sim.odom_rate=15"]
+    settings += ["phy.sample_rate=5e5", "channel.snr_db=30", "sim.odom_rate=15", *more]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -175,6 +175,27 @@ def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path:
     assert viewer.ledger(ODOM) == {row: count for row, count in topic.ledger.items() if count}
     tiles = viewer.numbers()
     assert (tiles["sent"], tiles["delivered"], tiles["pdr"]) == (topic.sent, topic.delivered, topic.pdr)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_it_shows_what_repair_does(viewer: Viewer, tmp_path: Path) -> None:
+    lossy = ("version=1", "reports={}", "channel.packet_loss=0.3", "channel.snr_db=null", "sim.odom_rate=10")
+    with program(tmp_path / "out", 0, *lossy) as (process, url):
+        viewer.driver.get(url)
+        viewer.wait(lambda: viewer.numbers().get("repaired", 0) > 2, "repaired messages")
+        viewer.wait(lambda: viewer.text(".gap"), "a gap between the last packets")
+        gaps = [int(number) for text in viewer.text(".gap") for number in re.findall(r"(\d+) missing", text)]
+        assert all(0 < gap < 1000 for gap in gaps), "a repair stands at the newest packet's number"
+        tiles = viewer.numbers()
+        assert tiles["air_repair"] > 0
+        assert tiles["air_report"] > 0
+        assert sum(tiles[f"air_{kind}"] for kind in ("new", "repair", "report", "hello")) == pytest.approx(1)
+        assert any("repair" in text for text in viewer.text(".topics .key"))
+        result = stop(process, tmp_path / "out")
+        viewer.wait(viewer.gone, "the page to notice that the program has ended")
+    (topic,) = result.topics
+    assert viewer.numbers()["repaired"] == viewer.ledger(ODOM)["repaired"] == topic.ledger["repaired"] > 2
 
 
 @pytest.mark.slow

@@ -13,9 +13,11 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.link.events import SentPacket
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
+from tests.link.v1.air import Robot, registry
 
 
 def make(recorder: Recorder | None = None, packet_len: int = 64) -> DashboardState:
@@ -236,3 +238,29 @@ def test_an_hour_at_35_hz_takes_no_more_memory_than_ten_minutes() -> None:
     assert len(source.messages) <= UNDER_WAY
     assert len(state._topics[SRC, 0].latencies) == LATENCIES
     assert resident_mb() - early[1] < 8
+
+
+def test_packets_that_stand_at_the_newest_number_are_not_a_turn_ahead() -> None:
+    """Version 1: repairs and reports have no number of their own, and a lost packet may be sent again."""
+    sender, receiver = Robot(SRC, registry()), Robot(5)
+    state = DashboardState(registry(), {}, 64)
+    heard, lost = 0, random.Random(3)
+    for slot in range(400):
+        now = slot / 75
+        if slot % 3 == 0:
+            sender.end.submit(0, slot.to_bytes(2, "little") * 10, now)
+        for robot, other in ((sender, receiver), (receiver, sender)):
+            data = robot.slot(now)
+            for event in other.receive(data, now) if data is not None and lost.random() > 0.3 else ():
+                state.receiver_event(event, now)
+        for event in sender.events:
+            if isinstance(event, SentPacket):
+                state.sender_event(SRC, event)
+        sender.events.clear()
+        shown = state.tick(now).last_packets
+        heard += sum(packet.missing for packet in shown)
+        assert all(packet.missing < 30 for packet in shown)
+    assert heard, "packets were missing"
+    air = state.tick(now).packets
+    assert air["air_repair"] > 0
+    assert air["air_new"] + air["air_repair"] + air["air_report"] + air["air_hello"] == air["sent"]

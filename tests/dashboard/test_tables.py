@@ -70,3 +70,7 @@ def test_a_packet_shows_its_fields_and_what_is_missing() -> None:
 def test_colours_repeat_and_strangers_are_grey() -> None:
     assert colour(0) == colour(16)
     assert colour(-1) not in {colour(place) for place in range(16)}
+
+
+def test_a_link_that_repairs_nothing_says_nothing_of_repair() -> None:
+    assert "repair" not in tiles_html(snapshot(), None, None)

@@ -42,7 +42,7 @@ def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path
     sending, receiving = free_domains()
     out = tmp_path / "out"
     # A busy computer falls behind the radio's clock: then it has room for what waits, and the time to catch up.
-    patient = ["drain_s=60", "ros_source.queue_depth=0", "ros_sink.reassembly_timeout_s=60"]
+    patient = ["drain_s=60", "ros_source.queue_depth=0", "ros_sink.hold_s=60"]
     options = set_options([f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}", *patient])
     with ExitStack() as stack:
         arrived = stack.enter_context(subscriber(receiving, "/rx_robot_1/odom", ODOM))
@@ -70,6 +70,9 @@ def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path
     assert "/robot_1/odom" in done.stdout
     assert "samples/s, chosen to carry 120%" in done.stdout
     assert "PDR" in done.stdout
+    assert sum(topic.ledger.get("repaired", 0) for topic in result.topics) > 0
+    assert "Repair recovered" in done.stdout
+    assert result.packets["air_report"] > 0
 
 
 def test_a_late_joiner_on_the_receiving_graph_gets_the_map() -> None:

@@ -25,8 +25,9 @@ from gnuradio.grc.core.platform import Platform
 from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
 
 from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import RadioError
+from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.ros_link import make_link
 from gr_ros2.grc_path import example, grc_path
 from gr_ros2.link import SCHEDULER
 from gr_ros2.middleware import MIDDLEWARE, Qos
@@ -100,6 +101,49 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
         assert f"{parameter['id']}=${{{parameter['id']}}}" in loaded["templates"]["make"]
     for callback in loaded["templates"]["callbacks"]:
         assert hasattr(BLOCKS[name][0], callback.split("(")[0])
+
+
+def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
+    loaded = description("ros2_link")
+    halves = {"source": (RosSource, SourceConfig), "sink": (RosSink, SinkConfig)}
+    offered = [parameter["id"] for parameter in loaded["parameters"]]
+    wanted = {item.name for _, config in halves.values() for item in fields(config)}
+    assert len(offered) == len(set(offered))
+    assert set(offered) == wanted | {"half_duplex"}
+    values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
+    assert (values["version"], values["compression"], values["repair"]) == ("1", "True", '"auto"')
+    for name in offered:
+        assert f"{name}=${{{name}}}" in loaded["templates"]["make"]
+    assert len(loaded["templates"]["callbacks"]) > 5
+    for callback in loaded["templates"]["callbacks"]:
+        half, _, setter = callback.split("(")[0].partition(".")
+        assert hasattr(halves[half][0], setter)
+
+
+def test_ros_link_is_made_of_its_settings_and_refuses_others() -> None:
+    settings = {"middleware": "memory", "namespace": "/robot_3", "version": 1, "hold_s": 0.5, "repair": "idle"}
+    link = make_link(registry=str(example("topics.csv")), half_duplex=True, **settings)
+    try:
+        assert (link.source.src_id, link.source.config.repair, link.sink.config.hold_s) == (3, "idle", 0.5)
+        assert link.sink.config.robot_id == 3
+        assert link.source.config.version == link.sink.config.version == 1
+        assert link.end.endpoint.settings.half_duplex
+    finally:
+        link.close()
+    with pytest.raises(ConfigError, match="unknown key hold; known are backpressure, "):
+        make_link(**settings, hold=1)
+    with pytest.raises(ConfigError, match=r"hold_s = -1"):
+        make_link(**{**settings, "hold_s": -1})
+
+
+def test_the_paper_has_an_example_with_version_0_and_radios_have_ros_link() -> None:
+    """ROS Source and ROS Sink speak version 0 by default, ROS Link version 1."""
+    kinds = {path.stem: path.read_text() for path in EXAMPLES}
+    assert "id: ros2_source\n" in kinds["direct_loopback"]
+    assert "version: '1'" not in kinds["direct_loopback"]
+    for name in (*ON_THE_AIR, "zmq_radios"):
+        assert "id: ros2_link\n" in kinds[name]
+        assert "id: ros2_source\n" not in kinds[name]
 
 
 def test_the_blocks_are_as_their_settings_say() -> None:
@@ -351,5 +395,6 @@ def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) ->
     finally:
         top.stop()
         top.wait()
-        top.ros2_source_0.close()
-        top.ros2_sink_0.close()
+        for name in ("ros2_source_0", "ros2_sink_0", "ros2_link_1", "ros2_link_2"):
+            if hasattr(top, name):
+                getattr(top, name).close()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 
 import pytest
 
+from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_services import with_header, without_header
-from gr_ros2.middleware.ros_graph import dds_service
+from gr_ros2.middleware.ros_graph import NodeEntities, dds_service
 from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller, Program
 from tests.waiting import wait_for
@@ -91,3 +92,19 @@ def test_the_header_stands_between_encapsulation_and_message() -> None:
     assert with_header(header, payload) == b"\0\1\0\0" + header + b"message!"
     assert without_header(with_header(header, payload)) == (header, payload)
     assert without_header(b"\0\1\0\0" + bytes(15)) is None
+
+
+def test_services_are_announced_with_their_node(graph: DdsMiddleware, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Sequence[NodeEntities]] = []
+    write = ros_graph.participant_entities_info
+    monkeypatch.setattr(
+        ros_graph, "participant_entities_info", lambda *given, **more: told.append(given[1]) or write(*given, **more)
+    )
+    own = graph.serve("/rx_robot_2/add", ADD, lambda *_: None)
+    params = graph.serve("/rx_robot_2/planner/set", ADD, lambda *_: None, "/rx_robot_2/planner")
+    assert [tuple(node) for node in told[-1]] == [
+        ("gr_ros2", "/", [own.reader.guid], [own.writer.guid]),
+        ("planner", "/rx_robot_2", [params.reader.guid], [params.writer.guid]),
+    ]
+    params.close()
+    assert len(told[-1]) == 1

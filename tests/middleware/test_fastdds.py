@@ -14,6 +14,7 @@ from gr_ros2.middleware import Qos, ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.compiled import compiled
 from tests.domains import domain
+from tests.middleware.calling import ADD
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, message, same
 from tests.waiting import wait_for
 
@@ -226,3 +227,23 @@ def test_a_type_has_the_hash_that_the_graph_gives_it(middleware: DdsMiddleware, 
 
         wait_for(told, "our publisher")
         assert told() == [given]
+
+
+def test_clients_and_servers_of_fast_dds_are_refused_by_name(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    taken: list[object] = []
+    there: list[bool] = []
+    middleware.serve("/served", ADD, lambda *request: taken.append(request))
+    middleware.client("/called", ADD, lambda *_: None, there.append)
+    client = peer("pub", "", RELIABLE, names=ros_graph.dds_service("/served", ADD)[0])
+    server = peer("sub", "", RELIABLE, names=ros_graph.dds_service("/called", ADD)[0])
+    wait_for(lambda: client.matched and server.matched, "both to be found")
+
+    def refused() -> bool:
+        client.publish([message(1, 40)])
+        return {"other_rmw:/served", "other_rmw:/called"} <= middleware.counters.keys()
+
+    wait_for(refused, "both to be refused")
+    assert not taken
+    assert not there

@@ -429,3 +429,29 @@ def test_localhost_only_is_what_a_context_begins_with_and_nobody_else(
     start(localhost_only=localhost_only)
     assert found == ["0" if localhost_only is False else "1"]
     assert os.environ["ROS_LOCALHOST_ONLY"] == "1"
+
+
+def test_a_service_is_called_from_another_node_and_replies_later(start: Start) -> None:
+    from rcl_interfaces.srv import ListParameters
+
+    kind, one, two = "rcl_interfaces/srv/ListParameters", start(node_name="one"), start(node_name="two")
+    asked: list[tuple[Any, bytes]] = []
+    answers: list[tuple[int, bytes]] = []
+    there: list[bool] = []
+    server = one.serve("/list", kind, lambda client, payload: asked.append((client, payload)))
+    client = two.client("/list", kind, lambda number, payload: answers.append((number, payload)), there.append)
+    wait_for(lambda: there, "the server to be found")
+    request = bytes(serialize_message(ListParameters.Request(prefixes=["a"], depth=3)))
+    client.call(1, request)
+    client.call(2, request)
+    wait_for(lambda: len(asked) == 2, "the requests")
+    assert {unpadded(payload) for _, payload in asked} == {unpadded(request)}
+    reply = bytes(serialize_message(ListParameters.Response()))
+    for caller, _ in reversed(asked):
+        server.reply(caller, reply)
+    wait_for(lambda: len(answers) == 2, "the replies")
+    assert {number for number, _ in answers} == {1, 2}
+    server.close()
+    wait_for(lambda: there == [True, False], "the server to be missed")
+    assert not one.counters
+    assert not two.counters

@@ -87,14 +87,17 @@ def test_gid_follows_the_distribution(distro: str, size: int) -> None:
 @pytest.mark.parametrize("node_name", ["n", "radio", "four", "gr_ros2"])
 def test_discovery_info_reads_as_the_message_it_is(gid_bytes: int, node_name: str) -> None:
     guids = [bytes([i] * 16) for i in range(4)]
-    data = ros_graph.participant_entities_info(
-        guids[0], node_name, "/robot_1", guids[1:2], guids[2:], gid_bytes=gid_bytes
-    )
+    nodes = [
+        ros_graph.NodeEntities(node_name, "/robot_1", guids[1:2], guids[2:]),
+        ros_graph.NodeEntities("planner", "/rx_robot_2", guids[:1], []),
+    ]
+    data = ros_graph.participant_entities_info(guids[0], nodes, gid_bytes=gid_bytes)
     store = get_typestore(Stores.EMPTY)
     for name, text in HUMBLE_MSGS.items():
         store.register(get_types_from_msg(text.replace("24", str(gid_bytes)).replace("char", "uint8"), name))
     info = store.deserialize_cdr(data, "rmw_dds_common/msg/ParticipantEntitiesInfo")
-    (node,) = info.node_entities_info_seq  # type: ignore[attr-defined]
+    node, other = info.node_entities_info_seq  # type: ignore[attr-defined]
+    assert (other.node_namespace, other.node_name, len(other.reader_gid_seq)) == ("/rx_robot_2", "planner", 1)
     assert (node.node_namespace, node.node_name) == ("/robot_1", node_name)
     assert [bytes(gid.data)[:16] for gid in node.reader_gid_seq] == guids[1:2]
     assert [bytes(gid.data)[:16] for gid in node.writer_gid_seq] == guids[2:]

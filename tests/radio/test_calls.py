@@ -12,12 +12,14 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.errors import ConfigError, MiddlewareError
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.errors import ConfigError, MiddlewareError, RegistryError
+from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.registry import Registry
+from gr_ros2.registry import MAX_TOPICS, Registry
+from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller
 from tests.radio.calling_robots import Robots
 from tests.waiting import wait_for
@@ -104,6 +106,24 @@ def test_calls_that_the_server_leaves_open_end_by_name(robots: Robots) -> None:
     assert len(taken) == 2
 
 
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_the_parameters_of_a_node_are_set_across_the_link(tmp_path: Path) -> None:
+    robots = Robots(tmp_path, "planner,parameters", packet_loss=0.2)
+    asked, answers = b"\0\1\0\0a request of SetParameters", []
+    with robots.stack:
+        near, far = "/rx_robot_2/planner/set_parameters", "/robot_2/planner/set_parameters"
+        kind = "rcl_interfaces/srv/SetParameters"
+        there: list[bool] = []
+        server = robots.graphs[1].serve(far, kind, lambda client, data: server.reply(client, data + b" and its reply"))
+        client = robots.graphs[0].client(near, kind, lambda *answer: answers.append(answer), there.append)
+        wait_for(lambda: there, "the service to appear")
+        assert robots.links[1].stats()["calls"]["reached"] == [near]  # the other five have no server
+        client.call(3, asked)
+        wait_for(lambda: answers, "the reply")
+        assert answers == [(3, asked + b" and its reply")]
+
+
 def _memory(robots: Robots, number: int) -> dict[str, Any]:
     return {"middleware": "memory", "domain_id": robots.graphs[number - 1].domain_id}
 
@@ -121,3 +141,16 @@ def test_a_service_needs_both_directions_and_version_1() -> None:
     link = RobotLink(looped)
     assert link.stats()["calls"] == {}
     link.stop()
+
+
+def test_a_full_registry_has_no_room_for_calls() -> None:
+    full = {f"topic_{number}": "std_msgs/String" for number in range(MAX_TOPICS)}
+    one, two = SourceConfig(robot_id=1, version=1), SinkConfig(version=1)
+    with MemoryMiddleware(domain_id=free_domains(1)[0]) as graph:
+        link = RosLink(Registry.from_rows(full), one, two, middleware=(graph, graph))
+        assert link.calls is None
+        link.close()
+        with pytest.raises(RegistryError, match="241 topics"):
+            RosLink(
+                Registry.from_rows({**dict(list(full.items())[1:]), "add": ADD}), one, two, middleware=(graph, graph)
+            )

@@ -67,8 +67,11 @@ def test_a_run_over_the_engines() -> None:
         "airtime_mean_s": 0.5,
         "airtime_per_message_s": pytest.approx(0.5 * packets / 90),
         "airtime_per_byte_s": pytest.approx(0.5 * packets / 90 / len(_point_stamped(0, 0))),
+        "bytes_per_message": pytest.approx(64 * packets / 90),
     }
-    assert set(recorder.airtime(None).values()) == {None}
+    without = recorder.airtime(None)
+    assert without.pop("bytes_per_message") == pytest.approx(64 * packets / 90)
+    assert set(without.values()) == {None}
 
 
 def test_only_the_topics_asked_for_are_listed() -> None:

@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
-from gr_ros2.record.result import LatenessResult
+from gr_ros2.record.result import LatenessResult, air_uses
 from gr_ros2.report.explain import explanation
+from gr_ros2.report.page import read_runs, write_report
+from gr_ros2.report.table import air_grid
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
 from tests.record.results import RESULT
 from tests.record.runs import empty_trace, make_run
 
@@ -89,3 +93,32 @@ def test_every_row_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
     everything = replace(run.result.topics[0], ledger=dict.fromkeys(ROWS, 1), sent=len(ROWS))
     outcome, *_ = explanation(replace(run.result, topics=(everything,)), run.trace)
     assert all(row.words in outcome for row in LedgerRow)
+
+
+def test_what_repair_did_is_told_and_tabulated(tmp_path: Path) -> None:
+    out = tmp_path / "repaired"
+    settings = ["version=1", "reports={}", "channel.packet_loss=0.2", "time=packets"]
+    outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=4.0), out)
+    result = outcome.result
+    (odom,), packets = result.topics, result.packets
+    repair, air = explanation(result, outcome.trace)[-2:]
+    assert repair.startswith(f"Repair recovered {odom.ledger['repaired']:,} messages (")
+    assert repair.endswith(f"{odom.ledger.get('given_up', 0):,} were given up.")
+    assert f" {packets['air_new']:,} for new messages (" in air
+    assert f" {packets['air_repair']:,} for repair (" in air
+    assert f"{packets['sent'] / odom.delivered:.2f} packets for each message delivered" in air
+    uses = {use.kind: use for use in air_uses(result)}
+    assert sum(use.share for use in uses.values()) == pytest.approx(1)
+    grid = air_grid(result)
+    assert grid is not None
+    assert [line[0] for line in grid.sections[0]] == ["new", "repair", "report", "hello"]
+    page = write_report(read_runs([out]), out)[0].read_text()
+    assert "What the air was used for" in page
+    assert (out / "air.png").is_file()
+
+
+def test_version_0_has_nothing_to_tell_of_repair(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    assert air_uses(run.result) == []
+    assert air_grid(run.result) is None
+    assert "epair" not in " ".join(explanation(run.result, run.trace))

@@ -74,7 +74,12 @@ def test_a_seed_of_its_own_stays() -> None:
 
 def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
     changes = ["ros_source.compression=true", "ros_source.robot_id=1", "ros_sink.robot_id=2", "channel.snr_db=20"]
-    changes += ["back.ros_source.namespace=/robot_2", "back.ros_sink.publisher_depth=7", "phy.sample_rate=2e5"]
+    changes += [
+        "reports=null",
+        "back.ros_source.namespace=/robot_2",
+        "back.ros_sink.publisher_depth=7",
+        "phy.sample_rate=2e5",
+    ]
     there, back = load_scenario("demo", changes, seed=5).directions()
     assert there == load_scenario("demo", [change for change in changes if not change.startswith("back")], seed=5)
     assert back.back is None

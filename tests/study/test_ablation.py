@@ -23,7 +23,10 @@ def named(name: str, *overrides: str) -> list[str]:
 def test_each_part_that_is_on_has_a_variant() -> None:
     assert named("six-topics-paced") == ["whole", "no-compression", "no-pull", "no-freshness", "no-latest"]
     assert named("paper-ofdm-paced") == ["whole", "no-compression", "no-pull", "no-freshness"]
-    assert named("demo", "ros_source.packet_rate=0", "ros_source.topic_options.odom.depth=1") == ["whole", "no-latest"]
+    version_0 = ("version=0", "reports=null", "ros_source.compression=false", "ros_source.scheduler=paper")
+    depth_1 = "ros_source.topic_options.odom.depth=1"
+    assert named("demo", *version_0, "ros_source.packet_rate=0", depth_1) == ["whole", "no-latest"]
+    assert named("demo") == ["whole", "no-compression", "no-pull", "no-repair", "no-reports"]
     with pytest.raises(ConfigError, match="scenario paper-ofdm: nothing to switch off"):
         named("paper-ofdm")
 

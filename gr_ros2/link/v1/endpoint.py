@@ -179,7 +179,7 @@ class Endpoint:
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
         """Start or stop announcing a service to the other robots. At the start, services are not announced."""
-        if self.outbox.offer(topic_id, offered=offered):
+        if self.outbox.offer(topic_id, offered=offered) and self._started:
             self.outbox.ask(TABLE_TOPIC, self._now)
             self._talk.hurry(self._now)
 

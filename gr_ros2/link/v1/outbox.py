@@ -9,8 +9,8 @@ the free bytes of the packet; it is not fixed beforehand.
 
 *Lifetime.* The topic decides how long a message is worth repairing. With ``latest``, it is until a newer message has
 left whole. With a lifespan, it is until that has passed. Otherwise it is until ``depth`` newer messages have left, or
-enough newer ones to fill a repair. Receivers that report say when they have a message; then only the publishers' depth
-limits the lifetime.
+enough newer ones to fill a repair, and not longer after the next message than a receiver waits for it. Receivers that
+report say when they have a message; then only the publishers' depth limits the lifetime.
 
 Invariants: the messages of a topic begin one after the other, each after the one before has left whole; every message
 ends in being sent or in a Refused with its row.
@@ -54,6 +54,12 @@ SETTLING_S = 1.0
 it yet."""
 STARTING_S = 2.0
 """s from the start during which the table is repaired even if no receiver reports."""
+WORTH = 0.85
+"""Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
+receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
+REPORTED_DEPTH = 160
+"""Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
+known."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -423,7 +429,10 @@ class Outbox:
         if queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = self._depths.get(topic_id, 0) or 10 * most
+            most = self._depths.get(topic_id, 0) or REPORTED_DEPTH
+        elif lives:
+            before, _ = lives[-1]
+            before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
         lives.append((message.life, message.index))
         self._packets_of[topic_id] += message.index
         while len(lives) > 1 and (len(lives) > most or (self._packets_of[topic_id] > GROUP and not self.reported)):

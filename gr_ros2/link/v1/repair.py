@@ -314,8 +314,8 @@ class RepairWindow:
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
         """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
 
-        :param held: whether a combination has to wait, at this time in s; only asked if there is one. One that has a
-            packet in it that is known to be lost does not wait
+        :param held: whether a repair has to wait, at this time in s; only asked if there is one. A thrifty sender has
+            few repairs under way: what a report names as lost does not wait then
         """
         slots = self._slots
         slots[0] *= _DECAY
@@ -325,15 +325,17 @@ class RepairWindow:
         self._retire(now)
         if not self._records:
             return None
-        if len(self._receivers) == 1 and (again := self._lost(now)) is not None:
-            self.counts["resent"] += 1
+        thrifty = self.mode == "thrifty"
+        if thrifty and (again := self._lost(now)) is not None:
             return again
         window = self._window(now)
-        if not window or (self.mode == "thrifty" and not self._worth(window, now)):
+        if not window or (thrifty and not self._worth(window, now)):
             return None
-        if held(now) and not self._named(window):
+        if held(now) and not (thrifty and self._named(window)):
             slots[1] -= 1  # repair cannot use this slot
             return None
+        if not thrifty and (again := self._lost(now)) is not None:
+            return again
         return self._combination(window, now)
 
     def _named(self, window: list[Sent]) -> bool:
@@ -364,6 +366,8 @@ class RepairWindow:
 
     def _lost(self, now: float) -> Sent | None:
         """The newest live packet that the only receiver lacks and that has not been sent again since."""
+        if len(self._receivers) != 1:
+            return None
         (peer,) = self._receivers.values()
         while self._resend:
             number = -heappop(self._resend)
@@ -372,6 +376,7 @@ class RepairWindow:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     record.at = now
+                    self.counts["resent"] += 1
                     self._once.discard(number)
                     return record
         return None

@@ -58,6 +58,29 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert one.end.sent.air["repair"] == 0
 
 
+def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_loss() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+
+    def reports(seconds: float) -> int:
+        """How many reports leave in so many seconds of odometry."""
+        before, end = two.end.sent.air["report"], air.now + seconds
+        while air.now < end:
+            one.end.submit(ODOM, text(0), air.now)
+            air.run(0.03)
+        return two.end.sent.air["report"] - before
+
+    assert reports(2.0) >= 16
+    reports(10.0)
+    assert reports(5.0) <= 12
+    assert one.end.sent.air["repair"] == 0
+    air.lost = lambda sender, _: sender is one
+    one.end.submit(ODOM, text(0), air.now)
+    air.run(3 * SLOT_S)
+    air.lost = lambda *_: False
+    assert reports(1.0) >= 8
+
+
 @pytest.mark.parametrize("half_duplex", [False, True])
 def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
     one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
@@ -358,6 +381,15 @@ def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_
     one.end.offer(0, offered=False)
     air.run(1.0)
     assert not two.end.rows(1)
+
+
+def test_a_service_that_is_there_from_the_start_is_announced_though_packets_are_lost() -> None:
+    for seed in range(5):
+        one, two = Robot(1, Registry.from_rows({"add": "example_interfaces/srv/AddTwoInts"}).with_calls()), Robot(2)
+        one.end.offer(0, offered=True)
+        air = Air(one, two, loss=0.5, seed=seed)
+        air.run(10.0, lambda: bool(two.end.rows(1)))  # noqa: B023 - called at once
+        assert [row.name for row in two.end.rows(1).values()] == ["add"]
 
 
 def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from bench.repair import genie, run
+from bench.repair import BUSY_HZ, genie, run
 from gr_ros2.link.v1.sealing import Keys
 from tests.link.v1.air import KEY
 
@@ -41,6 +41,12 @@ def test_thrifty() -> None:
     assert outcome.packets <= 1.65
     quiet = run(loss=0.0, back=0.0, repair="thrifty", seed=SEED)
     assert quiet.air["repair"] == 0
+
+
+@pytest.mark.parametrize(("back", "least"), [(None, 0.97), (0.2, 0.995)])
+def test_a_link_with_few_idle_slots(back: float | None, least: float) -> None:
+    """55 messages/s on 75 packets/s."""
+    assert run(hz=BUSY_HZ, loss=0.2, back=back, seed=SEED).pdr[0] >= least
 
 
 @pytest.mark.parametrize("receivers", [1, 5])
