@@ -143,7 +143,11 @@ def make_endpoint(
     to_air = from_air = codec
     if codec is None:
         to_air = None if source is None else message_codec(source, rows)
-        from_air = None if sink is None else message_codec(sink, registry.with_options(sink.topic_options))
+        from_air = (
+            None
+            if sink is None
+            else message_codec(sink, registry.with_options(sink.topic_options, announced=sink.version != 0))
+        )
     version = source.version if source is not None else 0 if sink is None else sink.version
     if not version:
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
