@@ -16,10 +16,12 @@ from bench.rows import Row, table
 BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
+    "repair_runs": "bench.repair_runs",
     "saturated": "bench.saturated",
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
     "port": "bench.port",
+    "live": "bench.live",
     "direct": "bench.runs",
     "fast": "bench.runs",
     "ofdm": "bench.runs",

@@ -14,6 +14,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +36,9 @@ from gr_ros2.setting import Auto
 from gr_ros2.wire import BROADCAST
 
 _T = TypeVar("_T")
+
+SHORTEST_WAIT_S = 2e-4
+"""s for which the sending thread sleeps at least."""
 
 
 def settings(
@@ -142,7 +146,11 @@ def make_endpoint(
     to_air = from_air = codec
     if codec is None:
         to_air = None if source is None else message_codec(source, rows)
-        from_air = None if sink is None else message_codec(sink, registry.with_options(sink.topic_options))
+        from_air = (
+            None
+            if sink is None
+            else message_codec(sink, registry.with_options(sink.topic_options, announced=sink.version != 0))
+        )
     version = source.version if source is not None else 0 if sink is None else sink.version
     if not version:
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
@@ -203,15 +211,34 @@ class LiveEnd:
     """An endpoint that the blocks of one flowgraph share, and the one lock that protects it.
 
     :param make: makes the endpoint, given its observer
-    :ivar work: notified when a packet may leave
+    :ivar work: notified when a packet may leave; who sleeps there says so in ``sleeps_until``
+    :ivar sleeps_until: time in s at which the sending thread looks again by itself; -inf while it is awake
     :ivar observer: called with each event of the sending half, while the lock is held
     """
 
     def __init__(self, make: Callable[[Callable[[SenderEvent], None]], Endpoint]) -> None:
         self.lock = threading.Lock()
         self.work = threading.Condition(self.lock)
+        self.sleeps_until = -inf
         self.observer: Callable[[SenderEvent], None] | None = None
         self.endpoint = make(self._tell)
+
+    def wake(self) -> None:
+        """Wake the sending thread if a packet may leave before it looks again; the caller holds the lock.
+
+        A needless wake-up takes as much time as several packets.
+        """
+        if self.sleeps_until > -inf:
+            at = self.endpoint.next_departure()
+            if at is not None and at < self.sleeps_until:
+                self.work.notify()
+
+    def sleep(self, now: float) -> None:
+        """Wait, as the sending thread, until a packet may leave; the caller holds the lock."""
+        at = self.endpoint.next_departure()
+        self.sleeps_until = inf if at is None else at
+        self.work.wait(None if at is None else max(SHORTEST_WAIT_S, at - now))
+        self.sleeps_until = -inf
 
     def _tell(self, event: SenderEvent) -> None:
         if self.observer is not None:

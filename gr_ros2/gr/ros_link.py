@@ -24,7 +24,7 @@ from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
-from gr_ros2.registry import Registry
+from gr_ros2.registry import MAX_TOPICS, Registry
 from gr_ros2.setting import AUTO
 
 
@@ -60,7 +60,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         rows = read_registry(registry, needed=not source.version)
         start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
         rng = random.Random(seed)
-        calls = source.version != 0
+        calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
         self.end = LiveEnd(
             lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
         )
@@ -69,7 +69,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
         self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
         self.calls: LiveCalls | None = None
-        """The services that cross the link; None with version 0."""
+        """The services that cross the link; None with version 0, and where topics leave no room for calls."""
         if calls:
             self.calls = LiveCalls(self.end, self.source, self.sink)
         for port in ("pdus", "credit"):

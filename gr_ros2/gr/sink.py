@@ -90,7 +90,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self.registry = rows
         if rows:
             check_outputs(rows, self.config)
-            self.registry = rows.with_options(self.config.topic_options)
+            self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
         if end is None:
             start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))

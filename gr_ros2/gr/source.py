@@ -43,7 +43,6 @@ _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_sta
 _BATCH = 16
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
 _JOIN_S = 1.0
-_SHORTEST_WAIT_S = 2e-4
 
 
 class RosSource(gr.basic_block):  # type: ignore[misc]
@@ -94,7 +93,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
             )
         end.observer = self._observe
-        self._end = end.endpoint
+        self._live, self._end = end, end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self.clock = clock
@@ -384,8 +383,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             self._end.submit(topic_id, whole or payload, self.clock())
-            if not self._end.out_of_credit:  # a needless wake-up of the pump costs as much as a packet
-                self._work.notify()
+            self._live.wake()
 
     def _take_losses(self) -> None:
         """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
@@ -396,7 +394,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
             self._end.credit(max(0, packets))
-            self._work.notify()
+            self._live.wake()
 
     def _pump(self) -> None:
         while self._running:
@@ -419,8 +417,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if packets:
                 self._room.notify_all()
             elif self._running:
-                at = self._end.next_departure()
-                self._work.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
+                self._live.sleep(self.clock())
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:

@@ -38,8 +38,13 @@ _PACKET_COST = 150
 """Bytes of bookkeeping that are counted per packet held."""
 _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
-_REPORT_S = 0.1
-"""s after which a report is due, even about a single packet."""
+_REPORT_S, _CALM_S = 0.1, 0.5
+"""s after which a report is due, even about a single packet: at first and after a loss, and at most."""
+_CALM = 1 / 128
+"""Share of lost packets up to which reports become rarer: a report costs both ends as much as a message."""
+_SLOWER = 1.1
+"""By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
+must not grow faster."""
 _SNR_SMOOTHING = 0.25
 """Share of a new packet in the reported SNR: one preamble gives the SNR only to 1 dB."""
 _SNR_CHANGE_DB = 1.5
@@ -132,6 +137,8 @@ class Inbox:
         self._missed = False
         """Whether a packet went missing since the last report."""
         self._reported_at = 0.0
+        self._pause = _REPORT_S
+        """s after which the next report is due."""
         self._old_turn = False
         if rows:
             self._know(rows)
@@ -230,11 +237,11 @@ class Inbox:
     def report_due(self, now: float) -> float:
         """When the next report is due, as long as there are packets since the last one."""
         half = self._settings.half_duplex
-        if ((self._missed or self._snr_changed) and not half) or self._unreported >= self._settings.report_every * (
-            4 if half else 1
-        ):
+        every = self._settings.report_every * (4 if half else 1)
+        most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
+        if ((self._missed or self._snr_changed) and not half) or self._unreported >= most:
             return now
-        return self._reported_at + _REPORT_S
+        return self._reported_at + self._pause
 
     @property
     def report_helps(self) -> bool:
@@ -243,6 +250,8 @@ class Inbox:
 
     def report(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
+        calm = not self._missed and self.loss < _CALM and self.counts["packets"] > MAP
+        self._pause = min(self._pause * _SLOWER, _CALM_S) if calm else _REPORT_S
         self._unreported = 0
         self._missed = False
         self._reported_at = now

@@ -58,6 +58,29 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert one.end.sent.air["repair"] == 0
 
 
+def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_loss() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+
+    def reports(seconds: float) -> int:
+        """How many reports leave in so many seconds of odometry."""
+        before, end = two.end.sent.air["report"], air.now + seconds
+        while air.now < end:
+            one.end.submit(ODOM, text(0), air.now)
+            air.run(0.03)
+        return two.end.sent.air["report"] - before
+
+    assert reports(2.0) >= 16
+    reports(10.0)
+    assert reports(5.0) <= 12
+    assert one.end.sent.air["repair"] == 0
+    air.lost = lambda sender, _: sender is one
+    one.end.submit(ODOM, text(0), air.now)
+    air.run(3 * SLOT_S)
+    air.lost = lambda *_: False
+    assert reports(1.0) >= 8
+
+
 @pytest.mark.parametrize("half_duplex", [False, True])
 def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
     one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
@@ -400,3 +423,11 @@ def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) 
     air.run(1.0)
     assert two.delivered()[-1] == text(20)
     assert len(delivered) >= 15
+
+
+def test_the_destination_changes_between_robots_and_not_to_all_of_them() -> None:
+    one = Robot(1, registry(), dst_id=3).end
+    one.reconfigure(dst_id=2)
+    with pytest.raises(ConfigError, match=r"dst_id = 255: a change between .* needs a restart"):
+        one.reconfigure(dst_id=255)
+    assert one.settings.dst_id == 2
