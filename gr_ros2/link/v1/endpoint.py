@@ -232,7 +232,10 @@ class Endpoint:
         changes = {name: value for name, value in changes.items() if name in LIVE_SETTINGS}
         settings = replace(self.settings, **changes)
         if (settings.dst_id == BROADCAST) != (self.settings.dst_id == BROADCAST):
-            raise ConfigError(f"dst_id = {settings.dst_id}: packets stay addressed, or broadcast, until the next start")
+            raise ConfigError(
+                f"dst_id = {settings.dst_id}: a change between one robot and all robots (255) needs a restart of the "
+                "link: packets to one robot have a longer header, and repairs combine packets with equal room"
+            )
         self.settings = settings
         self.outbox.reconfigure(settings)
         if "packet_rate" in changes:
