@@ -16,6 +16,7 @@ from bench.rows import Row, table
 BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
+    "repair_runs": "bench.repair_runs",
     "saturated": "bench.saturated",
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
