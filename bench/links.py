@@ -23,12 +23,9 @@ from gr_ros2.study.ablation import air_bytes
 from gr_ros2.study.forecast import Planner
 
 WHOLE_S, PART_S, PLAIN_S = 38.0, 15.0, 8.0
-PLAIN = [
-    "ros_source.compression=false",
-    "ros_sink.compression=false",
-    "ros_source.scheduler=paper",
-    "ros_source.packet_rate=0",
-]
+PACED = ["ros_source.compression=false", "ros_sink.compression=false", "ros_source.scheduler=paper"]
+"""What turns a scenario of version 0 into a plain one."""
+PLAIN = [*PACED, "ros_source.packet_rate=0"]
 PLAIN += ["ros_source.topic_options={}", "ros_source.queue_depth=0", "drain_s=0"]
 """What turns a scenario into plain version 0, unpaced."""
 WANTED = ["ros_source.compression=true", "ros_sink.compression=true", "ros_source.scheduler=freshness"]
@@ -102,8 +99,9 @@ def _recorded_topics(settings: Sequence[str]) -> Iterator[Row]:
 def _carries_everything() -> Iterator[Row]:
     """In turn, twice each; the better p50 counts, since a busy computer only adds to it."""
     runs: dict[str, list[dict[str, TopicResult]]] = {"plain": [], "wanted": []}
-    for what, settings in [("plain", []), ("wanted", WANTED)] * 2:
-        runs[what].append(_by_name(_run("demo", PLAIN_S, settings)))
+    lossless = ["version=0", "reports=null", "channel.packet_loss=0"]
+    for what, settings in [("plain", PACED), ("wanted", WANTED)] * 2:
+        runs[what].append(_by_name(_run("demo", PLAIN_S, [*lossless, *settings])))
     for what, both in runs.items():
         topics = [topic for run in both for topic in run.values()]
         sent, delivered = (sum(getattr(topic, key) for topic in topics) for key in ("sent", "delivered"))

@@ -234,16 +234,19 @@ class Registry(Sequence[Topic]):
         taken = set(choice.of(topic.name.lstrip("/") for topic in self))
         return [topic for topic in self if topic.name.lstrip("/") in taken]
 
-    def with_options(self, options: Mapping[str, TopicOptions]) -> Registry:
+    def with_options(self, options: Mapping[str, TopicOptions], *, announced: bool = False) -> Registry:
         """The same rows, with configured options instead of the registry's own. Only settings that differ from the
         default replace the registry's.
 
+        :param announced: whether options may also be of topics that other robots announce; those change nothing here
         :raises ConfigError: for a topic that is not registered, unless the registry is empty
         """
         if not self:
             return self
         topics = list(self._topics)
         for name, override in options.items():
+            if announced and name.lstrip("/") not in self._by_name:
+                continue
             topic = self.named(name)
             changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
             changed = {key: value for key, value in changed.items() if value != getattr(DEFAULT_OPTIONS, key)}
@@ -296,10 +299,10 @@ def check_outputs(registry: Registry, sink: SinkConfig) -> None:
     """Refuse settings with which a sink could not publish what it receives.
 
     :raises ConfigError: if a topic would be published under a name that ROS does not allow, or two topics of different
-        types under one name, or if ``topic_options`` has a topic that is not registered
+        types under one name; with version 0 also if ``topic_options`` has a topic that is not registered
     """
     types = dict.fromkeys(sink.merged_topics, _TF_TYPE)
-    for topic in registry.with_options(sink.topic_options):
+    for topic in registry.with_options(sink.topic_options, announced=sink.version != 0):
         name = topic.republished(sink.namespace_format, _LONGEST_ID)
         remedy = "change its publish_as, or namespace_format"
         if fault := topic_fault(name):

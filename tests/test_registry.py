@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import TopicOptions
+from gr_ros2.config import SinkConfig, TopicOptions
 from gr_ros2.errors import ConfigError, RegistryError
-from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type
+from gr_ros2.registry import MAX_TOPICS, Registry, Topic, check_outputs, normalize_type
 
 ODOM = "nav_msgs/msg/Odometry"
 
@@ -312,3 +312,14 @@ def test_calls_have_a_row_of_their_own_behind_the_others(tmp_path: Path) -> None
     full = Registry.from_rows({f"t{number}": "std_msgs/String" for number in range(MAX_TOPICS)})
     with pytest.raises(RegistryError, match="241 topics"):
         full.with_calls()
+
+
+def test_options_may_be_of_topics_that_others_announce() -> None:
+    registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    options = {"odom": TopicOptions(depth=3), "/scan": TopicOptions(depth=4)}
+    assert [topic.options.depth for topic in registry.with_options(options, announced=True)] == [3]
+    with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
+        registry.with_options(options)
+    check_outputs(registry, SinkConfig(topic_options=options, version=1))
+    with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
+        check_outputs(registry, SinkConfig(topic_options=options))

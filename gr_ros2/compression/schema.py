@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from struct import Struct
 from typing import Any
 
@@ -84,7 +84,7 @@ class Types:
         self._own: dict[str, Typesdict] = {}
         for name, text in (definitions or {}).items():
             try:
-                found = get_types_from_msg(text, name)
+                found = _parsed(text, name)
             except TypesysError:
                 continue
             if any(kind not in humble or humble[kind][1] != members for kind, (_, members) in found.items()):
@@ -126,6 +126,12 @@ def _node(types: Typesdict, kind: Any, above: tuple[str, ...]) -> Node:
         raise KeyError("an array of no elements")  # any number of them would take 0 bytes
     node, count = _node(types, element, above), length if node_type is Nodetype.ARRAY else None
     return Repeat(node, count, count is None or is_open(node))
+
+
+@lru_cache(maxsize=1024)
+def _parsed(text: str, name: str) -> Typesdict:
+    """The types of a definition, which callers do not change. Parsing takes milliseconds, and each codec needs some."""
+    return get_types_from_msg(text, name)
 
 
 @cache

@@ -188,14 +188,14 @@ class LiveCalls:
         """Make a server of ours for a service of another robot."""
         name = self._name(src_id, topic)
         try:
-            LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
+            LOOP_GUARD.add_output(self._sink, self._sink.graph, (src_id, topic.topic_id), name)
             graph = _with_services(self._sink.middleware, name)
             taker = partial(self._request, src_id, topic)
             # ros2 param and ros2 lifecycle look for the node before they call its services.
             node = name.rpartition("/")[0] if topic.of_node else ""
             self._servers[src_id, topic.topic_id] = graph.serve(name, topic.type_name, taker, node)
         except GrRos2Error as error:
-            self._tell_first(f"not_served:{name}", error)
+            self._tell_first("not_served", error)  # without the name: another robot chooses as many as it likes
 
     def _request(self, src_id: int, topic: Topic, client: Hashable, payload: bytes) -> None:
         service = Service(src_id, self._robots[src_id].boot, topic.topic_id, self._name(src_id, topic))

@@ -90,7 +90,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self.registry = rows
         if rows:
             check_outputs(rows, self.config)
-            self.registry = rows.with_options(self.config.topic_options)
+            self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
         if end is None:
             start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
@@ -269,7 +269,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 topic = announced(row, self.config.topic_options)
                 name = topic.republished(self.config.namespace_format, event.src_id)
                 if topic.is_topic:
-                    LOOP_GUARD.add_output(self, self._graph, name)
+                    LOOP_GUARD.add_output(self, self._graph, key, name)
                 if fault := topic_fault(name):
                     raise ConfigError(f"topic {name!r}: {fault}")
             except ConfigError as error:

@@ -14,7 +14,7 @@ COLOURS = (
 """Colours of topics and runs, in their order. Colour-blind readers can distinguish them as well as is possible with
 sixteen colours."""
 
-AIR_COLOURS = {"new": "#2a9d5c", "repair": "#1d6b3f", "report": "#e69f00", "hello": "#9db8d9"}
+AIR_COLOURS = {"new": "#2a9d5c", "repair": "#56b4e9", "report": "#e69f00", "hello": "#9db8d9"}
 """Colours of what packets are for."""
 
 

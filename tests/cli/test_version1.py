@@ -11,6 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli.main import run
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.record.result import read_result
 from tests.run.test_replay import COUNT, make_bag
 from tests.study.sweeps import write_sweep_file
 
@@ -86,3 +87,18 @@ def test_a_plan_forecasts_repair_and_reports(capsys: pytest.CaptureFixture[str])
     assert report > 0
     assert everything == pytest.approx(new + repair + report, abs=0.2)
     assert re.search(r"/robot_1/odom .* (1\.00|0\.99) ", printed)
+
+
+def test_the_demo_speaks_version_1_unless_told_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    demo = ["demo", "--duration", "0.5", "--no-report", "--set", "time=samples"]
+    assert run([*demo, "--out", str(tmp_path / "new")]) == 0
+    last = capsys.readouterr().out.split("The median latency")[1]
+    assert re.search(r"Repair recovered \d+ messages|No message needed repair", " ".join(last.split()))
+    assert run([*demo, "--out", str(tmp_path / "old"), "--version", "0"]) == 0
+    assert "Packets sent" not in capsys.readouterr().out
+    new, old = (read_result(tmp_path / name) for name in ("new", "old"))
+    assert (new.config["version"], old.config["version"]) == (1, 0)
+    assert new.config["ros_source"]["compression"]
+    assert new.config["reports"] is not None
+    assert old.config["reports"] is None
+    assert any("lost_fragments" in topic.ledger for topic in old.topics)

@@ -143,6 +143,25 @@ def test_a_service_needs_both_directions_and_version_1() -> None:
     link.stop()
 
 
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_a_service_that_cannot_be_offered_is_counted_and_the_others_are_offered(tmp_path: Path) -> None:
+    robots = Robots(tmp_path, f"topic,type,publish_as\nadd,{ADD}")
+    with robots.stack:
+        near = {**_memory(robots, 1), "topic_options": {"other": {"publish_as": "/robot_1/own"}}}
+        (tmp_path / "own.csv").write_text(f"own,{ADD}\n")
+        (tmp_path / "services.csv").write_text(f"add,{ADD}\nother,{ADD}\n")
+        for number in (1, 2):
+            robots.links[number].stop()
+        robots.start(1, registry=str(tmp_path / "own.csv"), ros_sink=near)
+        robots.start(2)
+        for name in (FAR, "/robot_2/other"):
+            Adder(robots.graphs[1], name)
+        wait_for(lambda: robots.links[2].stats()["calls"]["offered"] == [FAR, "/robot_2/other"], "both servers")
+        wait_for(lambda: robots.counted(1).get("not_served"), "a loop to be refused")
+        wait_for(lambda: robots.links[1].stats()["calls"]["reached"] == [NEAR], "the other service")
+
+
 def test_a_full_registry_has_no_room_for_calls() -> None:
     full = {f"topic_{number}": "std_msgs/String" for number in range(MAX_TOPICS)}
     one, two = SourceConfig(robot_id=1, version=1), SinkConfig(version=1)
