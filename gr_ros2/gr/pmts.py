@@ -1,7 +1,6 @@
-"""Fast conversion of packets to PDUs and back.
+"""Packets to PDUs with metadata.
 
-Invariants: a PDU is a PMT pair of a dictionary and a u8vector. For any object, ``packet_of`` returns bytes or a named
-reason why there are none. Metadata is for people and other blocks; it is never trusted here.
+Invariant: metadata is for people and other blocks; no block of this package reads it.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from typing import Any
 
 import pmt
 
-from gr_ros2.phy.pdus import octets, u8vector
+from gr_ros2.phy.pdus import u8vector
 from gr_ros2.wire import Packet
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
@@ -37,16 +36,6 @@ class PduMaker:
             metadata = self._metadata[header] = _header_metadata(header)
         metadata = pmt.dict_add(metadata, _WALL, pmt.from_double(wall))
         return pmt.cons(metadata, u8vector(data))
-
-
-def packet_of(pdu: Any) -> tuple[bytes, str]:
-    """The bytes of a PDU and '', or no bytes and the reason: ``not_a_pair`` or ``not_u8``."""
-    if not pmt.is_pair(pdu):
-        return b"", "not_a_pair"
-    vector = pmt.cdr(pdu)
-    if not pmt.is_u8vector(vector):
-        return b"", "not_u8"
-    return octets(vector), ""
 
 
 def _header_metadata(header: tuple[int, ...]) -> Any:

@@ -22,7 +22,6 @@ from gr_ros2.errors import ConfigError, GrRos2Error, SealError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
-from gr_ros2.gr.pmts import packet_of
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
@@ -32,7 +31,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
-from gr_ros2.phy.pdus import PDUS
+from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 from gr_ros2.setting import AUTO
@@ -126,6 +125,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         """Number of PDUs that this block has finished with, whatever the result."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._handle)
+        PduPort.readable_by(self)
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, "gr_ros2_sink")
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
@@ -299,12 +299,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             "age_s": None if delivered_at is None else self._clock() - delivered_at + latency,
         }
 
-    def _handle(self, pdu: Any) -> None:
+    def _handle(self, message: Any) -> None:
+        packets, problem = packets_of(message)
         try:
-            self._take(pdu)
+            if problem:
+                self._refuse(problem)
+            else:
+                self._take(packets)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
-        self.handled += 1
+        self.handled += max(len(packets), 1)
 
     def _failed(self, error: Exception) -> None:
         """Count an unexpected error, and log the first one."""
@@ -314,17 +318,19 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if first:
             self._log.error("ros2_sink: %s", error, exc_info=error)
 
-    def _take(self, pdu: Any) -> None:
-        data, problem = packet_of(pdu)
-        if problem:
-            with self._lock:
-                self._counters[problem] += 1
-                first = self._counters[problem] == 1
-            if first:
-                self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
-            return
+    def _refuse(self, problem: str) -> None:
+        """Count a message that is not a packet, and log the first one."""
         with self._lock:
-            events = self._end.receive(data, self._clock())
+            self._counters[problem] += 1
+            first = self._counters[problem] == 1
+        if first:
+            self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
+
+    def _take(self, packets: Iterable[bytes]) -> None:
+        events: list[ReceiverEvent] = []
+        with self._lock:
+            for data in packets:
+                events += self._end.receive(data, self._clock())
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
             if self._end.answers and not self._end.out_of_credit:
@@ -360,14 +366,14 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
-        with self._lock:
-            self._published[key] += 1
-            self._delivered_at[key] = self._clock()
         stamped = self._stamped.get(topic.type_name)
         if stamped is None:
             stamped = self._stamped[topic.type_name] = has_header(topic.type_name)
-        if stamped:
-            self._measure(key, event.payload)
+        with self._lock:
+            self._published[key] += 1
+            self._delivered_at[key] = self._clock()
+            if stamped:
+                self._measure(key, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
         return event
@@ -402,14 +408,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return publisher
 
     def _measure(self, key: tuple[int, int], payload: bytes) -> None:
+        """Note the latency of a message; the caller holds the lock."""
         now = self._sim_time if self.config.use_sim_time else time.time()
         stamp = leading_time(payload)
         if now is not None and stamp is not None:
-            with self._lock:
-                if key not in self._latency:
-                    self._forget_the_gone()
-                    self._latency[key] = LatencyWindow()
-                self._latency[key].add(now - stamp)
+            window = self._latency.get(key)
+            if window is None:
+                self._forget_the_gone()
+                window = self._latency[key] = LatencyWindow()
+            window.add(now - stamp)
 
     def _forget_the_gone(self) -> None:
         """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""

@@ -33,7 +33,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
-from gr_ros2.phy.pdus import CREDIT, PDUS
+from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
 from gr_ros2.setting import AUTO, Auto
@@ -114,8 +114,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
-        self.message_port_register_out(PDUS)
-        self._publish = self.message_port_pub  # stored: each look-up would pass through two proxies
+        self._port = PduPort(self)
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
         namespace, words = self.config.namespace, self.config.topics
@@ -172,7 +171,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def start(self) -> bool:
         shorten_switch_interval()
         self._thread_state.keep()
-        self._unread = pmt.is_null(self.message_subscribers(PDUS))
+        self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         with self._lock:
@@ -421,11 +420,15 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:
-        wall = time.time()
-        for sent in packets:
-            if self.config.debug:
+        if self.config.debug:
+            for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-            self._publish(PDUS, self._pdus.pdu(sent.packet, sent.data, wall))
+        if self._port.bundles:
+            self._port.send([sent.data for sent in packets])
+        else:
+            wall = time.time()
+            for sent in packets:
+                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:

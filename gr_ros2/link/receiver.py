@@ -53,6 +53,7 @@ class Receiver:
         self.config = config
         self.registry = registry.with_options(config.topic_options)
         self.stats = ReceiverStats()
+        self._latched = {topic.topic_id for topic in self.registry if topic.latched}
         self._codec = codec
         self._sources: dict[int, _Source] = {}
         self._partials = Partials()
@@ -176,7 +177,7 @@ class Receiver:
                 payload = self._codec.decode(topic_id, payload)
             except CodecError as error:
                 return [self._undone(packet, topic_id, entry_id, ROWS[error.row])]
-        if self.registry[topic_id].latched:
+        if topic_id in self._latched:
             if source.latched.get(topic_id) == payload:
                 self.stats.repeats += 1
                 return []

@@ -8,8 +8,7 @@ fixed yet. The sender executes the last plan or asks for another one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.config import SourceConfig
@@ -18,8 +17,7 @@ from gr_ros2.registry import Registry
 from gr_ros2.wire import Format
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(NamedTuple):
     """The next packet: from each message, in this order, one further fragment.
 
     :param picks: messages to take one fragment of; a message may occur several times

@@ -69,6 +69,8 @@ class Sender:
         self._largest = V0.largest_message(config.packet_len)
         self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry, V0)
         self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
+        self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
+        """Topics whose newest message is kept for robots that join late."""
         self._with_deadline = self._deadlines()
         self._capped = any(topic.options.max_rate for topic in self.registry)
         self._plan: Plan | None = None
@@ -92,7 +94,7 @@ class Sender:
 
         :raises ConfigError: for a topic id that is not in the registry
         """
-        if not 0 <= topic_id < len(self.registry):
+        if topic_id not in self._queues:
             raise ConfigError(f"topic id {topic_id} is not in the registry of {len(self.registry)} topics")
         serial = self._serial
         self._serial += 1
@@ -105,13 +107,12 @@ class Sender:
         if len(payload) > self._largest:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
             return
-        topic = self.registry[topic_id]
-        options = topic.options
+        options = self.registry[topic_id].options
         message = Outgoing(serial, topic_id, payload, QOS_NAMES.index(options.qos), now, options.weight)
         if dropped := self._queues[topic_id].admit(message, self.depth(topic_id)):
             self._drop(dropped)
         self._changed(now)
-        if topic.latched:
+        if topic_id in self._keeps:
             self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.config.repeat_s
 

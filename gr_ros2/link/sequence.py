@@ -7,9 +7,9 @@ bits; after a reset positions start so far ahead that no earlier packet appears 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from dataclasses import dataclass
 from enum import Enum
 from math import inf
+from typing import NamedTuple
 
 from gr_ros2.wire import unwrap
 from gr_ros2.wire.v0 import V0
@@ -71,8 +71,7 @@ class Pace:
         return count * (last_time - first_time) / max(last - first, 1)
 
 
-@dataclass(slots=True)
-class Placed:
+class Placed(NamedTuple):
     """A packet's place: its arrival kind, its position, and how many packets are newly missing before it.
 
     ``missing`` is None where the number is not known: the sender may have restarted, or its numbers may have wrapped
@@ -101,6 +100,8 @@ class SequenceTracker:
         position = unwrap(seq, newest - _REMEMBERED, V0.number_bits)
         step = position - newest
         seen = self._recent.get(position)
+        if step == 1 and seen is None:
+            return self._accept(Placed(Arrival.NEXT, position), data, now, 1)
         if seen == data and newest - position < RECENT_PACKETS:
             return Placed(Arrival.DUPLICATE, position)
         elapsed = now - self._last_time

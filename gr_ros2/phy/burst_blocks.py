@@ -24,7 +24,7 @@ from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
-from gr_ros2.phy.pdus import PDUS, octets, pdu_of
+from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive
@@ -143,16 +143,23 @@ class TakesPackets(KeptAlive):
         block: Any = self
         block.message_port_register_in(PDUS)
         block.set_msg_handler(PDUS, self._take)
+        PduPort.readable_by(self)
 
     @abstractmethod
     def take_packet(self, packet: bytes) -> None:
         """Process a packet."""
 
     def _take(self, message: Any) -> None:
-        vector = pmt.cdr(message) if pmt.is_pair(message) else message
-        if pmt.is_u8vector(vector) and pmt.length(vector) in self._lengths:
-            self.take_packet(octets(vector))
-            return
+        packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
+        if problem:
+            self._refuse()
+        for packet in packets:
+            if len(packet) in self._lengths:
+                self.take_packet(packet)
+            else:
+                self._refuse()
+
+    def _refuse(self) -> None:
         self.refused += 1
         if self.refused == 1:
             block: Any = self
@@ -239,7 +246,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._damaged = 0
         self._failed = False
         self._snr_db: float | None = None
-        self.message_port_register_out(PDUS)
+        self._port = PduPort(self)
 
     @property
     def damaged(self) -> int:
@@ -256,7 +263,9 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return np.empty(0, np.complex64) if engine is None else engine.points
 
     def start(self) -> bool:
-        self._engine = ReceiverProcess(self._modem, self._publish) if self._own_process else BurstReceiver(self._modem)
+        self._port.find_readers()
+        send = self._port.send
+        self._engine = ReceiverProcess(self._modem, send) if self._own_process else BurstReceiver(self._modem)
         return super().start()
 
     def stop(self) -> bool:
@@ -264,8 +273,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        for packet in self._packets(input_items[0]):
-            self._publish(packet)
+        self._port.send(self._packets(input_items[0]))
         return len(input_items[0])
 
     def _packets(self, samples: Samples) -> list[bytes]:
@@ -284,6 +292,3 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         if isinstance(self._engine, ReceiverProcess):
             self._engine.close()
         self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
-
-    def _publish(self, packet: bytes) -> None:
-        self.message_port_pub(PDUS, pdu_of(packet))

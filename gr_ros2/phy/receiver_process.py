@@ -45,10 +45,10 @@ class ReceiverProcess:
     """A :class:`BurstReceiver` in another process.
 
     :param modem: modulation and frames
-    :param deliver: called with each packet, in a thread of its own
+    :param deliver: called with the packets of each report, in a thread of its own
     """
 
-    def __init__(self, modem: BurstModem, deliver: Callable[[bytes], None]) -> None:
+    def __init__(self, modem: BurstModem, deliver: Callable[[list[bytes]], None]) -> None:
         self._modem = modem
         self._deliver = deliver
         self._report = _Report([], 0, np.empty(0, np.complex64), None)
@@ -127,8 +127,7 @@ class ReceiverProcess:
             except (EOFError, OSError, pickle.UnpicklingError):  # the process ended, perhaps in the middle of a report
                 return
             self._report = report
-            for packet in report.packets:
-                self._deliver(packet)
+            self._deliver(report.packets)
 
 
 def _start(reports: int) -> Any:

@@ -22,13 +22,12 @@ from gnuradio import gr
 from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
-from gr_ros2.gr.pmts import packet_of
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from gr_ros2.phy.pdus import PDUS, pdu_of
+from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
@@ -324,11 +323,11 @@ class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         self.set_msg_handler(PDUS, self._write)
 
     def _write(self, pdu: Any) -> None:
-        packet, reason = packet_of(pdu)
+        packets, reason = packets_of(pdu)
         try:
             if reason:
                 self.refused += 1
-            else:
+            for packet in packets:
                 self._tun.write(packet)
         except OSError:
             self.refused += 1

@@ -197,14 +197,19 @@ class FormatV0:
         flags = packet.qos << _QOS_SHIFT | packet.compressed << 1 | packet.encrypted
         try:
             header = _header.pack(flags, packet.src_id, packet.dst_id, packet.seq, packet.hop << 4 | count)
-            parts = [header, _pack_topic_ids(entries)]
+            parts = [header, b""]
+            topic_ids = 0
             for entry in entries:
                 if not 0 <= entry.index < entry.total <= _MAX_TOTAL:
                     raise EncodeError(f"index {entry.index} of total {entry.total}; index < total <= {_MAX_TOTAL}")
+                if not 0 <= entry.topic_id <= 15:
+                    raise EncodeError(f"topic id {entry.topic_id} is not in 0..15")
+                topic_ids = topic_ids << 4 | entry.topic_id
                 parts.append(_entry_header.pack(entry.entry_id, entry.index, entry.total, len(entry.payload)))
                 parts.append(entry.payload)
         except struct_error as error:
             raise EncodeError(f"a field of {packet} is out of range ({error})") from error
+        parts[1] = (topic_ids << 4 * (count & 1)).to_bytes((count + 1) // 2, "big")
         body = b"".join(parts)
         room = packet_len - _CRC_LEN
         if len(body) > room:
@@ -266,12 +271,3 @@ class FormatV0:
 
 
 V0 = FormatV0()
-
-
-def _pack_topic_ids(entries: tuple[Entry, ...]) -> bytes:
-    ids = [entry.topic_id for entry in entries]
-    if min(ids) < 0 or max(ids) > 15:
-        raise EncodeError(f"topic ids {ids} are not all in 0..15")
-    if len(ids) % 2:
-        ids.append(0)
-    return bytes([high << 4 | low for high, low in zip(ids[::2], ids[1::2], strict=True)])

@@ -1,19 +1,17 @@
-"""PDUs and back: any bytes survive, any garbage is named."""
+"""PDUs with metadata: any bytes survive."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-import numpy as np
 import pmt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.gr.pmts import PduMaker, packet_of
+from gr_ros2.gr.pmts import PduMaker
+from gr_ros2.phy.pdus import packets_of
 from gr_ros2.wire.v0 import Packet
 
 PACKET = Packet(1, 255, 0, 1, ())
@@ -21,7 +19,7 @@ PACKET = Packet(1, 255, 0, 1, ())
 
 @given(st.binary(min_size=14, max_size=4095))
 def test_bytes_survive(data: bytes) -> None:
-    assert packet_of(PduMaker().pdu(PACKET, data, 0.0)) == (data, "")
+    assert packets_of(PduMaker().pdu(PACKET, data, 0.0)) == ([data], "")
 
 
 @given(st.binary(min_size=14, max_size=300))
@@ -43,21 +41,3 @@ def test_remembered_metadata_is_bounded() -> None:
     for number in range(10_000):
         maker.pdu(Packet(number >> 8, 255, number & 255, 1, ()), bytes(14), 0.0)
     assert len(maker._metadata) <= 4096
-
-
-@pytest.mark.parametrize(
-    ("garbage", "reason"),
-    [
-        (pmt.PMT_NIL, "not_a_pair"),
-        (pmt.intern("x"), "not_a_pair"),
-        (pmt.from_long(3), "not_a_pair"),
-        (pmt.init_u8vector(3, [1, 2, 3]), "not_a_pair"),
-        (pmt.cons(pmt.PMT_NIL, pmt.PMT_NIL), "not_u8"),
-        (pmt.cons(pmt.make_dict(), pmt.intern("x")), "not_u8"),
-        (pmt.cons(pmt.make_dict(), pmt.init_s16vector(3, [1, 2, 3])), "not_u8"),
-        (pmt.cons(pmt.make_dict(), pmt.to_pmt(np.zeros(4, np.float32))), "not_u8"),
-        (pmt.cons(pmt.make_dict(), pmt.init_u8vector(0, [])), ""),
-    ],
-)
-def test_garbage_is_named(garbage: Any, reason: str) -> None:
-    assert packet_of(garbage) == (b"", reason)

@@ -40,7 +40,7 @@ class Elsewhere:
 
     def __init__(self, phy: BurstPhy) -> None:
         self.packets: list[bytes] = []
-        self.receiver = ReceiverProcess(phy.modem, self.packets.append)
+        self.receiver = ReceiverProcess(phy.modem, self.packets.extend)
 
     def kill(self) -> None:
         self.receiver._process.kill()
