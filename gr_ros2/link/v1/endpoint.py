@@ -77,8 +77,8 @@ FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
-_POLL_S = 0.02
-"""s after which a thrifty sender that is in doubt checks again."""
+_POLL_S, _CALM_POLL_S = 0.02, 0.1
+"""s after which a thrifty sender that is in doubt checks again; the second one while no receiver loses packets."""
 
 
 class Endpoint:
@@ -365,7 +365,8 @@ class Endpoint:
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
         if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
-            doubt = min(now + _POLL_S, self.window.next_doubt(now))
+            poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
+            doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
         return max(min(leaving), self._pace.slot)
 
