@@ -27,6 +27,7 @@ BENCHMARKS = {
     "ofdm": "bench.runs",
     "recording": "bench.runs",
     "links": "bench.links",
+    "rate": "bench.rate",
     "receivers": "bench.receivers",
     "half_points": "bench.receivers",
     "rates": "bench.phys",
@@ -37,7 +38,7 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "drive", "sweep", "hostile")
+LONG = ("half_points", "rate", "drive", "sweep", "hostile")
 """Many minutes: only when named."""
 
 
