@@ -93,8 +93,8 @@ class Hold:
         self._airtime = 0.0
         self._skipped = 0
         """Number of consecutive repairs that left without waiting, because waiting does not help."""
-        self._in_vain = 0
-        """Number of waits in a row that gained nothing."""
+        self._in_vain = 1
+        """Number of waits in a row that gained nothing; 1 at first, since none has gained anything yet."""
 
     def submitted(self, topic_id: int, now: float) -> None:
         """Note that a message of a topic has come."""
