@@ -16,6 +16,7 @@ from bench.rows import Row, table
 BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
+    "repair_runs": "bench.repair_runs",
     "saturated": "bench.saturated",
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
@@ -26,6 +27,7 @@ BENCHMARKS = {
     "ofdm": "bench.runs",
     "recording": "bench.runs",
     "links": "bench.links",
+    "rate": "bench.rate",
     "receivers": "bench.receivers",
     "half_points": "bench.receivers",
     "rates": "bench.phys",
@@ -36,7 +38,7 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "drive", "sweep", "hostile")
+LONG = ("half_points", "rate", "drive", "sweep", "hostile")
 """Many minutes: only when named."""
 
 

@@ -61,7 +61,7 @@ def race(
     written = write_race(found, out)
     console.print(as_table(race_grid(found)))
     for line in notes(found):
-        console.print(line, soft_wrap=True)
+        console.print(line, soft_wrap=True, markup=False)
     console.print(f"\nWritten to {out}: {', '.join(path.name for path in written)}", soft_wrap=True)
     if found.error is not None:
         raise found.error

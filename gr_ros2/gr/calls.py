@@ -188,7 +188,7 @@ class LiveCalls:
         """Make a server of ours for a service of another robot."""
         name = self._name(src_id, topic)
         try:
-            LOOP_GUARD.add_output(self._sink, self._sink.graph, name)
+            LOOP_GUARD.add_output(self._sink, self._sink.graph, (src_id, topic.topic_id), name)
             graph = _with_services(self._sink.middleware, name)
             taker = partial(self._request, src_id, topic)
             # ros2 param and ros2 lifecycle look for the node before they call its services.

@@ -12,7 +12,7 @@ import re
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from math import inf
 from pathlib import Path
@@ -25,6 +25,7 @@ from gr_ros2.keys import read_key_file
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.rate import Rung
 from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.neighbours import Save
@@ -101,6 +102,7 @@ class Start:
     :param reports: whether the robots from which it receives can also receive from it
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
+    :param ladder: the rungs of an adaptive rate, see :attr:`gr_ros2.phy.Phy.ladder`; () for a fixed rate
     """
 
     boot: int = 1
@@ -110,6 +112,7 @@ class Start:
     reports: bool = False
     half_duplex: bool = False
     any_length: bool = False
+    ladder: Sequence[Rung] = ()
 
 
 def make_endpoint(
@@ -167,6 +170,7 @@ def make_endpoint(
         heard=start.heard,
         save=start.save,
         observer=observer,
+        ladder=start.ladder,
     )
 
 
@@ -297,8 +301,10 @@ class LoopGuard:
         self._lock = threading.Lock()
         self._sources: weakref.WeakKeyDictionary[Any, tuple[Graph, frozenset[str]]] = weakref.WeakKeyDictionary()
         self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
-        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Graph, set[str]]] = weakref.WeakKeyDictionary()
-        """Topics that senders have announced, under the names that sinks give them."""
+        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Graph, dict[tuple[int, int], str]]] = (
+            weakref.WeakKeyDictionary()
+        )
+        """Topics that senders have announced, under the names that sinks give them, by sender and topic id."""
 
     def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
         """:raises ConfigError: for a loop with an existing sink"""
@@ -317,9 +323,10 @@ class LoopGuard:
                     check_loop(names, config, registry)
             self._sinks[block] = (graph, config, registry)
 
-    def add_output(self, block: Any, graph: Graph, name: str) -> None:
+    def add_output(self, block: Any, graph: Graph, key: tuple[int, int], name: str) -> None:
         """Note a topic that a sink is about to publish because a sender has announced it.
 
+        :param key: sender and topic id, which have only one name at a time
         :raises ConfigError: for a loop: a source on the same graph subscribes to it
         """
         with self._lock:
@@ -329,13 +336,13 @@ class LoopGuard:
                         f"loop: the sink would publish {name}, which a source on the same graph subscribes; change "
                         "namespace_format, publish_as or domain_id"
                     )
-            self._outputs.setdefault(block, (graph, set()))[1].add(name)
+            self._outputs.setdefault(block, (graph, {}))[1][key] = name
 
     def returns(self, graph: Graph, name: str) -> bool:
         """Whether a topic of a graph has come by radio: a sink publishes it, or one of another process may do so."""
         with self._lock:
             sinks = [(config, registry) for other, config, registry in self._sinks.values() if graph.same_as(other)]
-            if any(name in names for other, names in self._outputs.values() if graph.same_as(other)):
+            if any(name in names.values() for other, names in self._outputs.values() if graph.same_as(other)):
                 return True
         formats = {config.namespace_format for config, _ in sinks} | {SinkConfig().namespace_format}
         if any(_made_by(form, name) for form in formats):

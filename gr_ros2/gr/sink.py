@@ -269,7 +269,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 topic = announced(row, self.config.topic_options)
                 name = topic.republished(self.config.namespace_format, event.src_id)
                 if topic.is_topic:
-                    LOOP_GUARD.add_output(self, self._graph, name)
+                    LOOP_GUARD.add_output(self, self._graph, key, name)
                 if fault := topic_fault(name):
                     raise ConfigError(f"topic {name!r}: {fault}")
             except ConfigError as error:

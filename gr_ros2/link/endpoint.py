@@ -130,8 +130,16 @@ class Endpoint(Protocol):
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
-        """Take the bytes of one packet; the events it causes, in order."""
+    @property
+    def rung(self) -> int:
+        """With an adaptive rate, the rung of the last packet from ``next_packet`` (:mod:`gr_ros2.link.rate`);
+        otherwise 0."""
+
+    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
+        """Take the bytes of one packet; the events it causes, in order.
+
+        :param snr_db: SNR of this packet, dB; None where it is not measured
+        """
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
@@ -274,7 +282,12 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         return None if self._sender is None else self._sender.next_packet(now)
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
+    @property
+    def rung(self) -> int:
+        """See :class:`Endpoint`."""
+        return 0
+
+    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:  # noqa: ARG002
         """See :class:`Endpoint`."""
         return [] if self._receiver is None else self._receiver.receive(data, now)
 

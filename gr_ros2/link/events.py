@@ -147,7 +147,8 @@ and requests."""
 class SentPacket(NamedTuple):
     """A packet that left the sender: its bytes, their meaning, and the messages to which its entries belong, in order.
 
-    ``entries`` are those of messages that are sent for the first time; a repair has none.
+    ``entries`` are those of messages that are sent for the first time; a repair has none. ``rung`` is that of the
+    adaptive rate (:mod:`gr_ros2.link.rate`), 0 where the rate is fixed.
     """
 
     data: bytes
@@ -155,6 +156,7 @@ class SentPacket(NamedTuple):
     entries: tuple[SentEntry, ...]
     now: float
     kind: AirKind = "new"
+    rung: int = 0
 
 
 SenderEvent = Accepted | Refused | Missed | SentPacket

@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import ChannelConfig, Kernels, build
 from gr_ros2.errors import ConfigError
+from gr_ros2.link.rate import Rung
 
 Samples = npt.NDArray[np.complex64]
 LENGTH_TAG = "burst_len"
@@ -114,6 +115,16 @@ class Phy(ABC):
     def pad_all(self) -> None:  # noqa: B027 - most PHYs have nothing to do
         """From now on :attr:`any_length` is False. Needed where all bursts must have the same length."""
 
+    @property
+    def ladder(self) -> tuple[Rung, ...]:
+        """The rungs of an adaptive rate, the most robust one first; () for a fixed rate."""
+        return ()
+
+    @property
+    def rungs(self) -> tuple[Phy, ...]:
+        """The PHY of each rung, with its rate fixed; this PHY alone where the rate is fixed."""
+        return (self,)
+
     @abstractmethod
     def airtime_samples(self, packet_len: int | None = None) -> int:
         """Samples one packet occupies on the air, gap included; 0 for a PHY without samples.
@@ -121,12 +132,13 @@ class Phy(ABC):
         :param packet_len: its bytes, None = the longest; ignored if :attr:`any_length` is False
         """
 
-    def airtime(self, packet_len: int | None = None) -> float:
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
         """Seconds one packet occupies on the air, gap included.
 
         :param packet_len: its bytes, as in :meth:`airtime_samples`
+        :param rung: index of its rung in :attr:`rungs`
         """
-        return self.airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
+        return self.rungs[rung].airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
 
     @abstractmethod
     def burst_power(self) -> float:

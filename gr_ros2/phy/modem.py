@@ -52,7 +52,7 @@ class ModemPhy(Phy):
     def airtime_samples(self, packet_len: int | None = None) -> int:  # noqa: ARG002
         return 0
 
-    def airtime(self, packet_len: int | None = None) -> float:
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:  # noqa: ARG002 - one rate
         length = self.packet_len if packet_len is None else packet_len
         bits = BITS * (length + self.options.overhead_bytes)
         return float(self.options.overhead_s + bits / self.options.bit_rate)

@@ -12,14 +12,18 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
+from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.link.rate import Rung
+from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import OfdmModem
+from gr_ros2.phy.ofdm_rate import RUNGS, rung_of
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
 from gr_ros2.setting import AUTO, Auto
+
+RungName = Literal["bpsk-cc", "qpsk-cc", "8psk-cc", "16qam-cc", "64qam-cc", "16qam", "64qam"]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -39,6 +43,10 @@ class OfdmOptions(BurstOptions):
     :param detection_threshold: of the preamble's metric (Schmidl and Cox), 0.05..0.95, from which on samples are looked
         at closely; auto = what noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their
         0.9, which need 5 to 7 dB more SNR; at a lower one these lose packets without any noise
+    :param rate: ``adaptive`` = the sender chooses modulation and code of each packet by what its receivers report
+        (version 1 with reports, simulated time); ``payload_modulation`` and ``fec`` are then left out
+    :param rungs: names of the modulations and codes that ``adaptive`` may choose from, the most robust one first;
+        auto = all: bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc, 16qam, 64qam
     :param gap: zero samples after each packet, up to 100000; auto = 32, with stock two symbols. The stock receiver
         needs one symbol and half an FFT length, below which it keeps the last packet waiting for the next, and is
         refused; ours needs 16
@@ -51,6 +59,8 @@ class OfdmOptions(BurstOptions):
     pilots: Annotated[tuple[int, ...] | Auto, Field(title="Pilot carriers")] = AUTO
     scramble: Annotated[bool, Field(title="Scrambling")] = False
     detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | Auto = AUTO
+    rate: Literal["fixed", "adaptive"] = "fixed"
+    rungs: Annotated[tuple[RungName, ...], Field(min_length=1)] | Auto = AUTO
 
 
 class OfdmPhy(BurstPhy):
@@ -76,6 +86,7 @@ class OfdmPhy(BurstPhy):
             )
         edge = None if chosen.carriers == AUTO else chosen.carriers
         pilots = None if chosen.pilots == AUTO else chosen.pilots
+        self._rungs = self._adaptive(options) if chosen.rate == "adaptive" else ()
         self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, edge, pilots)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
@@ -86,6 +97,32 @@ class OfdmPhy(BurstPhy):
             mask = layout.mask(packet_len + layout.fill(packet_len) + CRC_LEN)
             frames = self.frames(order="little", multiple=layout.multiple, mask=mask)
             self.modem: OfdmModem = OfdmModem(frames, layout, None if threshold == AUTO else threshold)
+
+    def _adaptive(self, options: dict[str, Any]) -> tuple[OfdmPhy, ...]:
+        """The PHYs of the rungs."""
+        chosen, default = self.options, OfdmOptions()
+        for name in ("payload_modulation", "fec", "detection_threshold"):
+            value = getattr(chosen, name)
+            if value != getattr(default, name) and (name != "detection_threshold" or value == "stock"):
+                raise ConfigError(
+                    f"phy ofdm: {name} = {value!r} with rate: adaptive, which chooses modulation and code for our own "
+                    "receiver; leave it out, or set rate to fixed"
+                )
+        fixed = {**options, "rate": "fixed", "rungs": AUTO}
+        made = (dict(zip(("payload_modulation", "fec"), RUNGS[name][:2], strict=True)) for name in self._names())
+        return tuple(OfdmPhy(self.packet_len, self.sample_rate, **{**fixed, **rung}) for rung in made)
+
+    def _names(self) -> tuple[str, ...]:
+        chosen: OfdmOptions = self.options
+        return tuple(RUNGS) if chosen.rungs == AUTO else chosen.rungs
+
+    @property
+    def ladder(self) -> tuple[Rung, ...]:
+        return tuple(rung_of(name, phy) for name, phy in zip(self._names(), self._rungs, strict=False))
+
+    @property
+    def rungs(self) -> tuple[Phy, ...]:
+        return self._rungs or (self,)
 
     def _checked_stock(self) -> StockFrame:
         chosen, symbol = self.options, self.layout.symbol_samples
@@ -134,7 +171,15 @@ class OfdmPhy(BurstPhy):
             idle_spinning_threads()
 
     def transmitter(self) -> PacketTransmitter:
+        self._refuse_adaptive()
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
     def receiver(self, own_process: bool = False) -> PacketReceiver:
+        self._refuse_adaptive()
         return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)
+
+    def _refuse_adaptive(self) -> None:
+        if self._rungs:
+            raise PhyError(
+                "phy ofdm: rate = 'adaptive' runs in simulated time only, as yet; set time to packets, or rate to fixed"
+            )

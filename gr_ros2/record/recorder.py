@@ -43,8 +43,8 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
-        self._lengths: Counter[tuple[AirKind, int]] = Counter()
-        """Number of packets sent, by what they were for and their length in bytes."""
+        self._lengths: Counter[tuple[AirKind, int, int]] = Counter()
+        """Number of packets sent, by what they were for, their length in bytes and their rung."""
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -61,7 +61,7 @@ class Recorder:
         """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
-            self._lengths[event.kind, len(event.data)] += 1
+            self._lengths[event.kind, len(event.data), event.rung] += 1
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
@@ -102,23 +102,23 @@ class Recorder:
         self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
         return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
 
-    def airtime(self, of_length: Callable[[int | None], float] | None) -> dict[str, Any]:
+    def airtime(self, of_packet: Callable[[int | None, int], float] | None) -> dict[str, Any]:
         """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
         per byte delivered; of the packets of each :data:`gr_ros2.link.events.AirKind`, where there were several; and
         the bytes of all packets sent per message delivered.
 
         To be called after :meth:`finish`.
 
-        :param of_length: s that a packet of this many bytes takes, or the longest packet for None; None stands for a
-            PHY without samples
+        :param of_packet: s that a packet of this many bytes, sent with this rung, takes, or the longest packet for
+            None; None stands for a PHY without samples
         """
         longest = total = mean = None
-        sent_bytes = sum(length * count for (_, length), count in self._lengths.items())
+        sent_bytes = sum(length * count for (_, length, _), count in self._lengths.items())
         spent: Counter[str] = Counter()
-        if of_length is not None:
-            longest = of_length(None)
-            for (kind, length), count in self._lengths.items():
-                spent[kind] += of_length(length) * count  # type: ignore[assignment]
+        if of_packet is not None:
+            longest = of_packet(None, 0)
+            for (kind, length, rung), count in self._lengths.items():
+                spent[kind] += of_packet(length, rung) * count  # type: ignore[assignment]
             total = float(spent.total())
             mean = total / self._lengths.total() if total else longest
         return {

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.gr.ends import Start
+from gr_ros2.link.rate import Rung
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import BROADCAST
@@ -19,13 +20,14 @@ Halves = tuple[SourceConfig | None, SinkConfig | None]
 """The settings of an end's sending half and of its receiving half; None for a half that it does not have."""
 
 
-def start_of_run(ways: Sequence[Scenario], *, any_length: bool) -> Start:
+def start_of_run(ways: Sequence[Scenario], *, any_length: bool, ladder: Sequence[Rung] = ()) -> Start:
     """The start of every end of a run.
 
     :param ways: one scenario per direction
     :param any_length: whether the PHY carries shorter packets in less time
+    :param ladder: see :attr:`gr_ros2.phy.Phy.ladder`
     """
-    return Start(ways[0].seed + 1, reports=_answered(ways), any_length=any_length)
+    return Start(ways[0].seed + 1, reports=_answered(ways), any_length=any_length, ladder=ladder)
 
 
 def halves_of_ends(ways: Sequence[Scenario]) -> list[Halves]:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.gr.ends import Start, make_endpoint
@@ -28,6 +28,7 @@ from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
@@ -58,16 +59,30 @@ class Offered:
 
 @dataclass(frozen=True, slots=True)
 class AirtimeEnded:
-    """A packet whose airtime is over. Whether it arrives is decided later."""
+    """A packet whose airtime is over. Whether it arrives is decided later.
+
+    :param rung: with an adaptive rate, the rung that it was sent with
+    """
 
     data: bytes
+    rung: int = 0
+
+
+class Arrival(NamedTuple):
+    """A packet that came out of a receiver.
+
+    :param snr_db: as the receiver measured it, dB; None where that is not simulated
+    """
+
+    data: bytes
+    snr_db: float | None = None
 
 
 TimedEvent = tuple[float, "LinkDirection | Branch", SenderEvent | ReceiverEvent | AirtimeEnded]
 """Time of the event, s after the start; its direction or further receiver; and the event itself."""
-Airtime = Callable[[int | None], float]
-"""s that a packet of this many bytes is on the air; None stands for the longest packet."""
-Medium = Callable[[bytes, float], Iterable[bytes]]
+Airtime = Callable[[int | None, int], float]
+"""s that a packet of this many bytes, sent with this rung, is on the air; None stands for the longest packet."""
+Medium = Callable[[AirtimeEnded, float], Iterable[Arrival]]
 """From a packet whose airtime is over, and the time now, to the packets that come out of the receiver."""
 
 
@@ -154,13 +169,16 @@ def simulate(
     topics = {src_id: source_names(scenario, registry).values()}
     recorder = Recorder(registry, {src_id: scenario.ros_source.namespace}, topics)
     losses = PduLosses(scenario.channel)
+    if phy.ladder:
+        raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
     ends = make_ends([scenario], registry, codec, any_length=phy.any_length)
     way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime, messages or offered(scenario, registry))
-    way.air = lambda data, now: [data] if losses.passes(now) else ()
+    way.air = lambda packet, now: [Arrival(packet.data)] if losses.passes(now) else ()
     ways = [way]
     if scenario.reports is not None:
         heard = PduLosses(scenario.reports.channel)
-        ways += report_ways(scenario, ends[:2], phy.airtime, [lambda data, now: [data] if heard.passes(now) else ()])
+        back: Medium = lambda packet, now: [Arrival(packet.data)] if heard.passes(now) else ()  # noqa: E731
+        ways += report_ways(scenario, ends[:2], phy.airtime, [back])
     for timed_event in EventLoop(ways).run():
         tell(recorder, timed_event, overhead_s)
         if on_packet is not None and isinstance(timed_event[2], SentPacket):
@@ -198,15 +216,21 @@ class End:
 
 
 def make_ends(
-    ways: Sequence[Scenario], registry: Registry, codec: MessageCodec | None = None, *, any_length: bool = False
+    ways: Sequence[Scenario],
+    registry: Registry,
+    codec: MessageCodec | None = None,
+    *,
+    any_length: bool = False,
+    ladder: Sequence[Rung] = (),
 ) -> list[End]:
     """The ends of a link, see :func:`gr_ros2.run.ends.halves_of_ends`.
 
     :param ways: one scenario per direction
     :param codec: of all messages; None makes one where ``compression`` is on
     :param any_length: whether the PHY carries shorter packets in less time
+    :param ladder: the rungs of an adaptive rate; () for a fixed rate
     """
-    start = start_of_run(ways, any_length=any_length)
+    start = start_of_run(ways, any_length=any_length, ladder=ladder)
     return [_end(registry, halves, codec, start, ways[0].seed) for halves in halves_of_ends(ways)]
 
 
@@ -230,9 +254,9 @@ class Branch:
         self.air = air
         self.number = number
 
-    def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
+    def arrive(self, arrival: Arrival, now: float) -> Iterator[TimedEvent]:
         """Give the end a packet that has arrived there."""
-        for event in self.receiver.endpoint.receive(data, now):
+        for event in self.receiver.endpoint.receive(arrival.data, now, arrival.snr_db):
             yield now, self, event
 
 
@@ -280,12 +304,13 @@ class LinkDirection:
         self._messages = messages
         self._coming = next(messages, None)
         self._airtime = airtime
-        self._clock: AirtimeClock[bytes] | None = AirtimeClock(airtime(None)) if airtime(None) else None
+        longest = airtime(None, 0)
+        self._clock: AirtimeClock[AirtimeEnded] | None = AirtimeClock(longest) if longest else None
         self._paced = self._clock is not None
         self._drain = scenario.drain_s
         self._until = scenario.duration_s
         self._delay_s = delay_s
-        self._delayed: deque[tuple[float, bytes]] = deque()
+        self._delayed: deque[tuple[float, AirtimeEnded]] = deque()
         if self._paced:
             self.sender.endpoint.use_credit()
 
@@ -303,9 +328,9 @@ class LinkDirection:
         yield from self._told(now)
         self.due = self._next(now)
 
-    def arrive(self, data: bytes, now: float) -> Iterator[TimedEvent]:
+    def arrive(self, arrival: Arrival, now: float) -> Iterator[TimedEvent]:
         """Give the receiving end a packet that has arrived there."""
-        for event in self.receiver.endpoint.receive(data, now):
+        for event in self.receiver.endpoint.receive(arrival.data, now, arrival.snr_db):
             yield now, self, event
 
     def wake(self, now: float) -> None:
@@ -317,22 +342,22 @@ class LinkDirection:
 
     def _let_through(self, now: float) -> Iterator[TimedEvent]:
         if self._clock is not None:
-            for data in self._clock.due(now):
-                self._delayed.append((now + self._delay_s, data))
+            for packet in self._clock.due(now):
+                self._delayed.append((now + self._delay_s, packet))
             while self._delayed and self._delayed[0][0] <= now:
                 yield from self._land(self._delayed.popleft()[1], now)
             credits = self._clock.grants(now)
             if self._paced:
                 self.sender.endpoint.credit(credits)
 
-    def _land(self, data: bytes, now: float) -> Iterator[TimedEvent]:
+    def _land(self, packet: AirtimeEnded, now: float) -> Iterator[TimedEvent]:
         if self.air is None:
-            yield now, self, AirtimeEnded(data)
+            yield now, self, packet
         else:
-            for arrived in self.air(data, now):
+            for arrived in self.air(packet, now):
                 yield from self.arrive(arrived, now)
             for branch in self.branches:
-                for arrived in branch.air(data, now):
+                for arrived in branch.air(packet, now):
                     yield from branch.arrive(arrived, now)
 
     def _submit(self, now: float) -> None:
@@ -343,12 +368,14 @@ class LinkDirection:
             self._coming = next(self._messages, None)
 
     def _send(self, now: float) -> Iterator[TimedEvent]:
-        while (data := self.sender.endpoint.next_packet(now)) is not None:
+        endpoint = self.sender.endpoint
+        while (data := endpoint.next_packet(now)) is not None:
+            packet = AirtimeEnded(data, endpoint.rung)
             if self._clock is not None:
-                self._clock.offer(data, now, self._airtime(len(data)))
+                self._clock.offer(packet, now, self._airtime(len(data), packet.rung))
             else:
                 yield from self._told(now)
-                yield from self._land(data, now)
+                yield from self._land(packet, now)
 
     def _told(self, now: float) -> Iterator[TimedEvent]:
         for event in self.sender.told:

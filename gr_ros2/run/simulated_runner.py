@@ -27,6 +27,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import ReceiverResult, Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
+from gr_ros2.run.ladder_air import LadderAir
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.loss_table import packet_losses
 from gr_ros2.run.observers import LiveRun, RunObservers
@@ -34,6 +35,7 @@ from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import (
     AirtimeEnded,
+    Arrival,
     Branch,
     End,
     EventLoop,
@@ -91,7 +93,8 @@ def run_simulated(
         link_observers = Observers[LinkObserver]()
         recorded = link_observers.add(recorder, needed=True)
         link_observers.add(run_observers)
-        ends = make_ends(ways, registry, any_length=all(phy.any_length for phy in phys))
+        any_length = all(phy.any_length for phy in phys)
+        ends = make_ends(ways, registry, any_length=any_length, ladder=phys[0].ladder)
         directions = [
             _Direction(way, registry, phy, (first, second))
             for way, phy, (first, second) in zip(ways, phys, (ends[:2], ends[1::-1]), strict=False)
@@ -154,7 +157,7 @@ class _PendingPacket:
     """
 
     data: bytes
-    arrived: list[bytes] | None = None
+    arrived: list[Arrival] | None = None
 
 
 class _Air:
@@ -169,7 +172,11 @@ class _Air:
         self.lost_by_phy: Counter[str] = Counter()
         self.batches: BatchChannel | None = None
         self._measured: PduLosses | None = None
-        if scenario.time == "samples" and phy.has_samples:
+        self._ladder: LadderAir | None = None
+        if phy.ladder:
+            self._ladder = LadderAir(phy, channel, samples=scenario.time == "samples")
+            self.lost_by_phy = self._ladder.lost
+        elif scenario.time == "samples" and phy.has_samples:
             from gr_ros2.phy.measure import BatchChannel  # with GNU Radio
 
             self.batches = BatchChannel(phy, channel)
@@ -177,22 +184,24 @@ class _Air:
             self._measured = PduLosses(packet_losses(phy, channel))
             self.lost_by_phy = self._measured.dropped
 
-    def pass_one(self, data: bytes, now: float) -> Iterator[bytes]:
+    def pass_one(self, packet: AirtimeEnded, now: float) -> Iterator[Arrival]:
         """The packets that arrive after one packet was sent, for ends whose next packet depends on that."""
-        if self._measured is not None:
-            arrived = [data] if self._measured.passes(now) else []
+        if self._ladder is not None:
+            arrived = self._ladder.through(packet.data, packet.rung, now)
+        elif self._measured is not None:
+            arrived = [Arrival(packet.data)] if self._measured.passes(now) else []
         else:
-            (arrived,) = self.through([data])
-        yield from (packet for packet in arrived if self.losses.passes(now))
+            (arrived,) = self.through([packet.data])
+        yield from (arrival for arrival in arrived if self.losses.passes(now))
 
-    def through(self, sent: Sequence[bytes]) -> list[list[bytes]]:
+    def through(self, sent: Sequence[bytes]) -> list[list[Arrival]]:
         """What comes out of the flowgraph for each of some packets, without the losses of ``losses``."""
         assert self.batches is not None
-        arrived: list[list[bytes]] = [[] for _ in sent]
+        arrived: list[list[Arrival]] = [[] for _ in sent]
         for place, packet in self.batches.send(sent):
-            arrived[place].append(packet)
-        for data, packets in zip(sent, arrived, strict=True):
-            self.lost_by_phy["phy"] += data not in packets
+            arrived[place].append(Arrival(packet))
+        for data, arrivals in zip(sent, arrived, strict=True):
+            self.lost_by_phy["phy"] += Arrival(data) not in arrivals
         return arrived
 
 
@@ -229,9 +238,9 @@ class _Direction:
 
     def arrive(self, pending: _PendingPacket, now: float) -> Iterator[TimedEvent]:
         """What came out of the flowgraph for a packet, without the packets that a setting of the channel drops."""
-        for data in pending.arrived or ():
+        for arrival in pending.arrived or ():
             if self._air.losses.passes(now):
-                yield from self.way.arrive(data, now)
+                yield from self.way.arrive(arrival, now)
 
     def counters(self) -> dict[str, Any]:
         """What each part counted. ``channel``: packets lost in the PHY, and packets dropped by each setting."""

@@ -9,7 +9,7 @@ from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
 
-from gr_ros2.errors import EncodeError, EntryBoundsError
+from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError
 
 _HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
 
@@ -17,9 +17,12 @@ _heard = Struct(">BI")
 _hello = Struct(">IIBI")
 _mark = Struct(">BI")
 _report = Struct(">BHHQB")
+_LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
+"""Range of a reported SNR, dB, and its steps per dB."""
 HELLO_LEN = 2 + _hello.size
 MARK_LEN = _mark.size
 REPORT_LEN = 2 + _report.size
+"""Bytes of a report without SNR. With it, a report has one more."""
 HEARD_LEN = 2 + _heard.size
 
 
@@ -79,6 +82,7 @@ class Report(NamedTuple):
     :param arrived: bit i says that packet ``number - i`` is here, 64 bits
     :param settled: no packet older than the map is needed
     :param loss: recent share of packets lost, 0..127 in 1/128
+    :param snr_db: SNR of the newest packets that arrived, -40..60 dB in steps of 0.5; None where it is not measured
     """
 
     src_id: int
@@ -87,6 +91,7 @@ class Report(NamedTuple):
     arrived: int
     settled: bool
     loss: int
+    snr_db: float | None = None
 
     def describe(self) -> str:
         """The entry in words."""
@@ -94,6 +99,7 @@ class Report(NamedTuple):
         return (
             f"report, of robot {self.src_id} (boot ends in {self.boot:04x}), number {self.number}, "
             f"arrived {self.arrived:016x}{older}, loss {self.loss / 128:.0%}"
+            + ("" if self.snr_db is None else f", SNR {self.snr_db:g} dB")
         )
 
 
@@ -116,6 +122,11 @@ class Heard(NamedTuple):
 Control = Hello | Ask | Report | Heard
 
 
+def reportable(snr_db: float) -> float:
+    """An SNR as a report can tell it."""
+    return min(max(round(snr_db * _SNR_STEPS) / _SNR_STEPS, _LEAST_SNR_DB), _MOST_SNR_DB)
+
+
 def write_control(entry: Control) -> bytes:
     """The bytes of an entry.
 
@@ -123,10 +134,14 @@ def write_control(entry: Control) -> bytes:
     """
     try:
         if isinstance(entry, Report):
-            source, boot, number, arrived, settled, loss = entry
+            source, boot, number, arrived, settled, loss, snr_db = entry
             if not 0 <= loss < 128:
                 raise EncodeError(f"loss {loss} of a report is not in 0..127")
             name, data = _REPORT, _report.pack(source, boot, number, arrived, settled << 7 | loss)
+            if snr_db is not None:
+                if not _LEAST_SNR_DB <= snr_db <= _MOST_SNR_DB:
+                    raise EncodeError(f"SNR {snr_db} dB of a report is not in {_LEAST_SNR_DB}..{_MOST_SNR_DB}")
+                data += bytes((round((snr_db - _LEAST_SNR_DB) * _SNR_STEPS),))
         elif isinstance(entry, Hello):
             marks = b"".join(_mark.pack(*mark) for mark in entry.marks)
             name, data = _HELLO, _hello.pack(*entry[:4]) + marks
@@ -143,6 +158,7 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | N
     """Where the entry after the one at ``position`` begins, and the entry itself; None for an unknown kind.
 
     :raises EntryBoundsError: it runs past ``end``, or its length is not a multiple of the size of its items
+    :raises EntryKindError: a report of an SNR out of range
     """
     name = body[position]
     start = position + 2
@@ -151,10 +167,13 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | N
     stop = start + body[position + 1]
     size = stop - start
     if name == _REPORT:
-        if size != _report.size:
+        if size not in (_report.size, _report.size + 1):
             raise EntryBoundsError(f"a report of {size} bytes")
         source, boot, number, arrived, tail = _report.unpack_from(body, start)
-        return stop, Report(source, boot, number, arrived, tail > 127, tail & 127)
+        snr_db = _LEAST_SNR_DB + body[stop - 1] / _SNR_STEPS if size > _report.size else None
+        if snr_db is not None and snr_db > _MOST_SNR_DB:
+            raise EntryKindError(f"a report of an SNR of {snr_db:g} dB")
+        return stop, Report(source, boot, number, arrived, tail > 127, tail & 127, snr_db)
     if name == _HELLO:
         if size < _hello.size or (size - _hello.size) % _mark.size:
             raise EntryBoundsError(f"a hello of {size} bytes")

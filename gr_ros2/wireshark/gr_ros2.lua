@@ -77,6 +77,7 @@ local f = {
     report_arrived = ProtoField.uint64("gr_ros2.report.arrived", "Map of what arrived", base.HEX),
     report_settled = ProtoField.bool("gr_ros2.report.settled", "Nothing older is wanted", 8, nil, 0x80),
     report_loss = ProtoField.uint8("gr_ros2.report.loss", "Packets lost lately, of 128", base.DEC, nil, 0x7F),
+    report_snr = ProtoField.float("gr_ros2.report.snr", "SNR (dB)"),
     heard_src_id = ProtoField.uint8("gr_ros2.heard.src_id", "Has heard robot"),
     heard_boot = ProtoField.uint32("gr_ros2.heard.boot", "Of this boot number"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
@@ -293,6 +294,7 @@ end
 
 local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
 local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 13, 5, 14, 5
+local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
 local CRC32_TABLE = {}
@@ -373,7 +375,7 @@ local function dissect_control(buffer, tree, at, limit)
     local sizes = {
         hello = size >= HELLO_LEN and (size - HELLO_LEN) % MARK_LEN == 0,
         ask = size >= 2,
-        report = size == REPORT_LEN,
+        report = size == REPORT_LEN or size == REPORT_LEN + 1,
         heard = size == HEARD_LEN,
     }
     if sizes[name] == false then
@@ -393,6 +395,13 @@ local function dissect_control(buffer, tree, at, limit)
         item:add(f.report_arrived, buffer(start + 5, 8))
         item:add(f.report_settled, buffer(start + 13, 1))
         item:add(f.report_loss, buffer(start + 13, 1))
+        if size > REPORT_LEN then
+            if buffer(start + 14, 1):uint() > MAX_SNR then
+                item:add_proto_expert_info(refused.kind)
+                return nil
+            end
+            item:add(f.report_snr, buffer(start + 14, 1), buffer(start + 14, 1):uint() / 2 - 40)
+        end
     elseif name == "heard" then
         item:add(f.heard_src_id, buffer(start, 1))
         item:add(f.heard_boot, buffer(start + 1, 4))

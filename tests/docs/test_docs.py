@@ -166,7 +166,7 @@ def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fill(folder: Path) -> None:
-    demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=samples")
+    demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=packets")
     ours(*demo, "--out", "clean", folder=folder)
     for name in ("noisy", "results/a", "results/b"):
         shutil.copytree(folder / "clean", folder / name)
@@ -202,10 +202,10 @@ def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, t
     if words[-2:-1] == ["--out"] or "--out" in words:
         shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
     shorter = list(SHORTER.get(words[1], ()))  # of several settings of one name the last holds
-    if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time="} & {
+    if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time"} & {
         re.split("=", word)[0] for word in words
     }:
-        shorter += ["--set", "time=samples"]
+        shorter += ["--set", "time=packets"]
     if words[1] in ("run", "demo") and block.page not in REPORTING:
         shorter += ["--no-report"]
     if "--dashboard" in words:

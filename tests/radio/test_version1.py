@@ -124,6 +124,8 @@ def test_either_end_may_start_again(ends: list[dict[str, Any]], tmp_path: Path) 
     with robot(1, ends[0], tmp_path) as one:
         for first in (10, 20):
             with robot(2, ends[1], tmp_path) as two:
+                # It has heard this start of robot 1 before, so it takes messages from the first hello on.
+                wait_for(lambda: two.link.sink._end.knows(1), "a hello")
                 said = one.say(first)
                 wait_for(lambda: two.heard[-1:] == said, "a message to a robot that has come")  # noqa: B023
                 said = one.say(first + 1)

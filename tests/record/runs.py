@@ -95,7 +95,7 @@ def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = Tru
         config={"name": scenario, "description": "made <by> hand", "time": "real" if paced else "unthrottled"},
         topics=topics,
         packets=recorder.ledger.packets(),
-        phy={"name": "ofdm", "sample_rate": 1e5, **recorder.airtime(lambda _: AIRTIME_S)},
+        phy={"name": "ofdm", "sample_rate": 1e5, **recorder.airtime(lambda *_: AIRTIME_S)},
         counters={"source": {"packets": 1}},
     )
     trace = recorder.trace(T0, T0 + DURATION_S, {"/robot_1/odom": "/rx_robot_1/odom"})

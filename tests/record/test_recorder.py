@@ -62,7 +62,7 @@ def test_a_run_over_the_engines() -> None:
     assert (messages.row != "delivered").nonzero()[0].tolist() == list(range(20, 30))
     assert set(messages.row[20:30]) == {"lost_fragments"}
     packets = recorder.ledger.packets()["sent"]
-    assert recorder.airtime(lambda _: 0.5) == {
+    assert recorder.airtime(lambda *_: 0.5) == {
         "airtime_s": 0.5,
         "airtime_mean_s": 0.5,
         "airtime_per_message_s": pytest.approx(0.5 * packets / 90),
@@ -81,7 +81,7 @@ def test_only_the_topics_asked_for_are_listed() -> None:
         "/robot_1/raw",
     ]
     assert [topic.topic for topic in Recorder(REGISTRY, {1: ""}, topic_ids={1: [1]}).finish(1, 1)] == ["/fix"]
-    assert Recorder(REGISTRY, {1: ""}).airtime(lambda _: 1.0)["airtime_per_message_s"] is None
+    assert Recorder(REGISTRY, {1: ""}).airtime(lambda *_: 1.0)["airtime_per_message_s"] is None
 
 
 def test_what_does_not_deserialize_has_no_position_and_is_counted() -> None:

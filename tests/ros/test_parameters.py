@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ from gr_ros2.config import ChannelConfig, SinkConfig, SourceConfig, build
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 from gr_ros2.setting import meanings
-from gr_ros2.settings_file import parse_override
+from gr_ros2.settings_file import parse_override, settled
 
 LINK = {
     "registry": "topics.csv",
@@ -93,6 +94,30 @@ def test_what_ros_shows_is_what_ros_may_give() -> None:
 def test_texts_survive(text: str) -> None:
     (override,) = overrides({"ros_sink.frame_prefix": text})
     assert parse_override(override) == (("ros_sink", "frame_prefix"), text)
+
+
+def test_what_version_1_takes_is_the_same_as_parameters_in_yaml_and_in_python() -> None:
+    """As ``-p key:=fleet.key -p ros_source.topics:="auto, -camera/*" …`` gives them; a list of texts is one too."""
+    given = {
+        "key": "fleet.key",
+        "seal": "authenticate",
+        "registry": "",
+        "ros_source.repair": "idle",
+        "ros_source.expected_loss": 0.05,
+    }
+    file = {
+        **{"key": "fleet.key", "seal": "authenticate", "registry": ""},
+        "ros_source": {"robot_id": 1, "repair": "idle", "expected_loss": 0.05, "topics": ["auto", "-camera/*"]},
+        "phy": {"name": "direct"},
+    }
+    for topics in ("auto, -camera/*", ["auto", "-camera/*"]):
+        start = {"phy": {"name": "direct"}, "ros_source": {"robot_id": 1}}
+        values = settled(start, Path(), overrides({**given, "ros_source.topics": topics}))
+        assert link_from(values) == link_from(file)
+    shown = flat(link_from(file))
+    assert shown["ros_source.topics"].value == ["auto", "-camera/*"]
+    assert not shown["ros_source.topics"].strict, "a text may stand where a list is shown"
+    assert (shown["key"].value, shown["ros_source.repair"].rule) == ("fleet.key", "one of idle, thrifty, off, auto")
 
 
 def test_nested_and_optional_settings() -> None:

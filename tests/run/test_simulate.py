@@ -16,7 +16,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
+from gr_ros2.run.simulate import Arrival, End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
 
 
 class Sized:
@@ -189,8 +189,8 @@ class Answering(EndpointV0):
 
     answers = True
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
-        events = super().receive(data, now)
+    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
+        events = super().receive(data, now, snr_db)
         for event in events:
             if isinstance(event, Delivered):
                 self.submit(event.topic_id, len(event.payload).to_bytes(4, "big"), now)
@@ -207,12 +207,12 @@ def test_an_end_may_answer_what_it_hears() -> None:
     other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
     ways = [
         LinkDirection(
-            there, (one, other), lambda _: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
+            there, (one, other), lambda *_: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
         ),
-        LinkDirection(back, (other, one), lambda _: 0.01, iter(())),
+        LinkDirection(back, (other, one), lambda *_: 0.01, iter(())),
     ]
     for way in ways:
-        way.air = lambda data, now: [data]  # noqa: ARG005
+        way.air = lambda packet, now: [Arrival(packet.data)]  # noqa: ARG005
     heard = [(now, event) for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]
     assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]

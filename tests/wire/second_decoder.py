@@ -175,8 +175,10 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
             raise Refused("entry_bounds")
         return {"ask": content[0], "topic_ids": list(content[1:])}
     if kind == 0xFA:
-        if len(content) != 14:
+        if len(content) not in (14, 15):
             raise Refused("entry_bounds")
+        if len(content) == 15 and content[14] > 200:
+            raise Refused("entry_kind")
         tail = content[13]
         return {
             "report": content[0],
@@ -185,6 +187,7 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
             "arrived": number(5, 13),
             "settled": tail >= 128,
             "loss": tail % 128,
+            "snr_db": content[14] / 2 - 40 if len(content) == 15 else None,
         }
     if kind == 0xFB:
         if len(content) != 5:

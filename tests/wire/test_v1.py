@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import WireError
+from gr_ros2.errors import EncodeError, WireError
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Ask, Heard, Hello, Report
 from gr_ros2.wire.table import Row, read_table, write_table
@@ -31,12 +31,13 @@ def parts(draw: st.DrawFn) -> Part:
     return Part(draw(st.integers(0, v1.TABLE_TOPIC)), payload, back, offset, last, draw(st.booleans()))
 
 
+SNRS = st.none() | st.integers(0, 200).map(lambda steps: steps / 2 - 40)
 marks = st.lists(st.tuples(U8, U32), max_size=7).map(tuple)
 controls = (
     st.builds(Hello, U32, U32, U8, U32, marks)
     | st.builds(Ask, U8, st.binary(min_size=1, max_size=9))
     | st.builds(Heard, U8, U32)
-    | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127))
+    | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127), SNRS)
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)
 
@@ -67,9 +68,8 @@ def packets(draw: st.DrawFn) -> tuple[Packet, int, bool]:
     standing = draw(standings(control=True)) if kind == "control" else None
     inside = draw(entries)
     used = len(v1.write_body(inside, 1 << 20))
-    room = (
-        used - draw(st.integers(0, 1)) if _last_says_its_length(inside) else used
-    )  # without its length byte, it just fits
+    # Without the length byte of its last entry, it just fits.
+    room = used - draw(st.integers(0, 1)) if _last_says_its_length(inside) else used
     packet_len = max(room + draw(st.just(0) | st.integers(0, 20)), 2) + header.size + v1.STANDING_LEN + v1.CRC_LEN
     return Packet(header, inside, standing), packet_len, fixed
 
@@ -248,3 +248,9 @@ def test_any_table_reads_or_is_refused_by_name(data: bytes) -> None:
         assert error.kind in {"entry_bounds", "entry_kind"}
         return
     assert read_table(write_table(table)) == table
+
+
+@pytest.mark.parametrize("snr_db", [-40.5, 60.5, float("inf"), float("nan")])
+def test_an_snr_out_of_range_is_not_reported(snr_db: float) -> None:
+    with pytest.raises(EncodeError, match="SNR"):
+        v1.write_body([Report(1, 2, 3, 4, False, 5, snr_db)], 40)

@@ -36,6 +36,7 @@ from gr_ros2.link.events import (
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
+from gr_ros2.link.rate import RateController, Rung
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.hold import Hold
@@ -49,7 +50,6 @@ from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
-    REPORT_LEN,
     Ask,
     Control,
     Heard,
@@ -77,8 +77,8 @@ FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
 """Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
-_POLL_S = 0.02
-"""s after which a thrifty sender that is in doubt checks again."""
+_POLL_S, _CALM_POLL_S = 0.02, 0.1
+"""s after which a thrifty sender that is in doubt checks again; the second one while no receiver loses packets."""
 
 
 class Endpoint:
@@ -93,6 +93,8 @@ class Endpoint:
     :param heard: what ``save`` stored before this start
     :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
+    :param ladder: the rungs of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
+    :ivar rung: rung of the last packet, 0 with a fixed rate
     """
 
     def __init__(
@@ -108,8 +110,11 @@ class Endpoint:
         heard: Mapping[int, tuple[int, int]] | None = None,
         save: Save | None = None,
         observer: Callable[[SenderEvent], None] | None = None,
+        ladder: Sequence[Rung] = (),
     ) -> None:
         self.settings = settings
+        self.rung = 0
+        self._rate = RateController(ladder) if ladder else None
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
         self.received = ReceiverStats()
@@ -232,7 +237,10 @@ class Endpoint:
         changes = {name: value for name, value in changes.items() if name in LIVE_SETTINGS}
         settings = replace(self.settings, **changes)
         if (settings.dst_id == BROADCAST) != (self.settings.dst_id == BROADCAST):
-            raise ConfigError(f"dst_id = {settings.dst_id}: packets stay addressed, or broadcast, until the next start")
+            raise ConfigError(
+                f"dst_id = {settings.dst_id}: a change between one robot and all robots (255) needs a restart of the "
+                "link: packets to one robot have a longer header, and repairs combine packets with equal room"
+            )
         self.settings = settings
         self.outbox.reconfigure(settings)
         if "packet_rate" in changes:
@@ -315,11 +323,11 @@ class Endpoint:
 
     # ---- receiving
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
-        """Take the bytes of one packet; the events it causes, in order."""
+    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         self._now = max(self._now, now)
         self._repair_at = -inf
-        self._receive(data, now)
+        self._receive(data, now, snr_db)
         events, self._events = self._events, []
         return events
 
@@ -330,7 +338,7 @@ class Endpoint:
             self._report_all(neighbour.inbox.handle_timeout(now))
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now - self.settings.give_up_s):
-            self.window.forget(gone.src_id)
+            self._forget(gone.src_id)
             self._report_all([Gone(gone.src_id, gone.boot)])
         self.outbox.reported = self.window.reported
         events, self._events = self._events, []
@@ -357,7 +365,8 @@ class Endpoint:
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
         if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
-            doubt = min(now + _POLL_S, self.window.next_doubt(now))
+            poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
+            doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
         return max(min(leaving), self._pace.slot)
 
@@ -408,9 +417,9 @@ class Endpoint:
         entries: list[Entry] = list(filling.parts)
         free = self._room - filling.used
         for neighbour in due:
-            if free >= REPORT_LEN:
+            if free >= neighbour.inbox.report_len:
+                free -= neighbour.inbox.report_len
                 entries.append(neighbour.inbox.report(now))
-                free -= REPORT_LEN
                 self._unheard = 0
             else:
                 self._unheard += 1
@@ -489,9 +498,9 @@ class Endpoint:
         entries: list[Entry] = []
         free = self._room
         for neighbour in due:
-            if free >= REPORT_LEN:
+            if free >= neighbour.inbox.report_len:
+                free -= neighbour.inbox.report_len
                 entries.append(neighbour.inbox.report(now))
-                free -= REPORT_LEN
         for ask in self._talk.asks(self.neighbours, now):
             if free >= 3 + len(ask.topic_ids):
                 entries.append(ask)
@@ -505,8 +514,16 @@ class Endpoint:
         stats = self.sent
         stats.air[kind] += 1
         stats.packets += 1
-        self._tell(SentPacket(data, packet, parts, now, kind))
+        if self._rate is not None:
+            self._choose_rung(kind, now)
+        self._tell(SentPacket(data, packet, parts, now, kind, self.rung))
         return data
+
+    def _choose_rung(self, kind: AirKind, now: float) -> None:
+        """Choose the rung of the packet that leaves. Hellos are also for robots that are not known yet."""
+        assert self._rate is not None
+        rung = self._rate.sent(None if self.settings.dst_id == BROADCAST else self.settings.dst_id, now)
+        self.rung = 0 if kind == "hello" else rung
 
     def _padded(self, body: bytes, clear: bytes) -> bytes:
         return body.ljust(self._end_of_body - len(clear), b"\0")
@@ -523,11 +540,13 @@ class Endpoint:
 
     # ---- what arrives
 
-    def _receive(self, data: bytes, now: float) -> None:
+    def _receive(self, data: bytes, now: float, snr_db: float | None = None) -> None:
         try:
             opened = self._open(data, now)
             if opened is None:
                 return
+            if snr_db is not None:
+                opened.neighbour.inbox.measured(snr_db)
             self._use(data, opened, now)
         except WireError as error:
             self.received.rejected[error.kind] += 1
@@ -585,10 +604,12 @@ class Endpoint:
         neighbour = opened.neighbour
         if opened.replaced is not None:
             self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
-        self.window.forget(neighbour.src_id)
+        self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears:
             self.window.meet(neighbour.src_id, now)
+            if self._rate is not None:
+                self._rate.meet(neighbour.src_id)
             self.outbox.reported = True
         if self.settings.hears:
             self._talk.met(neighbour.src_id, neighbour.boot, now)
@@ -609,9 +630,17 @@ class Endpoint:
             sender = self._sender.src_id
             self.window.report(sender, number, entry.arrived, settled=entry.settled, loss=loss, now=now)
             self.outbox.reported = True
+            if self._rate is not None and entry.snr_db is not None:
+                self._rate.report(sender, entry.snr_db, loss, now)
         elif isinstance(entry, Ask) and entry.src_id == own:
             for topic_id in entry.topic_ids:
                 self.outbox.ask(topic_id, now)
+
+    def _forget(self, src_id: int) -> None:
+        """A receiver is gone, or has started again."""
+        self.window.forget(src_id)
+        if self._rate is not None:
+            self._rate.forget(src_id)
 
     def _inbox(self, src_id: int, boot: int, first: int, room: int) -> Inbox:
         return Inbox(

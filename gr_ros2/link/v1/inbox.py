@@ -27,7 +27,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, PROMPT, SPAN
-from gr_ros2.wire.control import Control, Report
+from gr_ros2.wire.control import REPORT_LEN, Control, Report, reportable
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table
 from gr_ros2.wire.v1 import TABLE_TOPIC, Entry, Part, read_body
@@ -45,6 +45,10 @@ _CALM = 1 / 128
 _SLOWER = 1.1
 """By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
 must not grow faster."""
+_SNR_SMOOTHING = 0.25
+"""Share of a new packet in the reported SNR: one preamble gives the SNR only to 1 dB."""
+_SNR_CHANGE_DB = 1.5
+"""Change of the SNR that is reported at once."""
 _WAITING = 256
 """Number of messages of unknown topics that are kept until the table arrives."""
 
@@ -94,6 +98,9 @@ class Inbox:
         """CRC-32 of the table of topics that is known."""
         self.loss = 0.0
         """Recent share of lost packets."""
+        self.snr_db: float | None = None
+        """SNR of the newest packets, dB; None where it is not measured."""
+        self._reported_db: float | None = None
         self._settings = settings
         self._room = room
         self._control = control
@@ -232,7 +239,7 @@ class Inbox:
         half = self._settings.half_duplex
         every = self._settings.report_every * (4 if half else 1)
         most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
-        if (self._missed and not half) or self._unreported >= most:
+        if ((self._missed or self._snr_changed) and not half) or self._unreported >= most:
             return now
         return self._reported_at + self._pause
 
@@ -261,7 +268,24 @@ class Inbox:
                 arrived |= 1 << back
         settled = self._wanted > base - MAP
         loss = min(round(self.loss * 128), 127)
-        return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss)
+        snr_db = self._reported_db = None if self.snr_db is None else reportable(self.snr_db)
+        return Report(self.src_id, self.boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss, snr_db)
+
+    @property
+    def report_len(self) -> int:
+        """Bytes of a report."""
+        return REPORT_LEN + (self.snr_db is not None)
+
+    @property
+    def _snr_changed(self) -> bool:
+        """Whether the SNR differs so much from the last one reported that the sender should know."""
+        if self.snr_db is None:
+            return False
+        return self._reported_db is None or abs(self.snr_db - self._reported_db) > _SNR_CHANGE_DB
+
+    def measured(self, snr_db: float) -> None:
+        """Note the SNR of a packet, dB."""
+        self.snr_db = snr_db if self.snr_db is None else self.snr_db + _SNR_SMOOTHING * (snr_db - self.snr_db)
 
     @property
     def unreported(self) -> int:

@@ -14,8 +14,8 @@ times as many in separate groups of 64.
 
 *Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
 then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
-reports are rare, it cannot know that so soon: it sends about as many repairs as losses are to be expected, before a
-report names them.
+reports are rare or take long, it cannot know that so soon: it sends about as many repairs as losses are to be expected,
+before a report names them.
 
 *Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
 reduced to ``FEW`` packets, and to those of the newest message.
@@ -62,6 +62,8 @@ _PATIENCE_S = 0.2
 """s that are added to the time for a report, unless the receiver reports every packet at once."""
 _MARGIN = 1.2
 """Factor on the longest recent delay of a report."""
+_SOON = 2
+"""Mean times between two new packets within which a report must come to be waited for."""
 
 
 @dataclass(slots=True, eq=False)
@@ -119,6 +121,8 @@ class Receiver:
     loss: float = 0.0
     newest: int = -1
     interval: float = 0.0
+    prompt: bool = False
+    """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
     waits: bool = False
     """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
@@ -130,11 +134,6 @@ class Receiver:
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it."""
         return min(self.delays) if self.delays else 0.0
-
-    @property
-    def prompt(self) -> bool:
-        """Whether it reports every packet at once, so that a report that does not come says something."""
-        return self.loss >= PROMPT and bool(self.answers)
 
     @property
     def answer(self) -> float:
@@ -193,6 +192,8 @@ class RepairWindow:
         """The time until which a repair may be on its way without a report about it, and its window."""
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
+        self._period = 0.0
+        """Mean time between two of them, s."""
         self._once: set[int] = set()
         """Those of them that were neither sent again nor combined: what a report says arrived when it was sent."""
         self._slots = [0.0, 0.0]
@@ -205,6 +206,8 @@ class RepairWindow:
         :param data: the packet as it was sent
         :param lives: lifetimes of the messages in it; () for a packet that is not worth repairing
         """
+        if self.newest in self._times:
+            self._period += (now - self._times[self.newest] - self._period) / 8
         self.newest = number
         self._times[number] = now
         self._times.pop(number - _TIMES, None)
@@ -251,6 +254,8 @@ class RepairWindow:
             if loss >= PROMPT and number > peer.newest and number in self._once:
                 peer.answers.append(now - sent_at)
         peer.newest = max(peer.newest, number)
+        soon = bool(peer.answers) and max(peer.answers) * _MARGIN <= _SOON * self._period
+        peer.prompt = loss >= PROMPT and soon
         records, bit, delay = self._records, peer.bit, peer.delay
         peer.waits = False
         for back in range(MAP):

@@ -423,3 +423,11 @@ def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) 
     air.run(1.0)
     assert two.delivered()[-1] == text(20)
     assert len(delivered) >= 15
+
+
+def test_the_destination_changes_between_robots_and_not_to_all_of_them() -> None:
+    one = Robot(1, registry(), dst_id=3).end
+    one.reconfigure(dst_id=2)
+    with pytest.raises(ConfigError, match=r"dst_id = 255: a change between .* needs a restart"):
+        one.reconfigure(dst_id=255)
+    assert one.settings.dst_id == 2

@@ -257,6 +257,12 @@ def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
     assert sender.next(0.53) is None
 
 
+def test_reports_that_take_long_are_not_waited_for() -> None:
+    sender = prompt(4, delay=0.25)
+    sender.sent(5, body(5), b"packet 5", (Life(),), 0.7)
+    assert isinstance(sender.next(0.7), Repair)
+
+
 def test_the_delay_of_a_report_is_not_measured_on_what_was_repaired() -> None:
     sender = prompt(4)
     sender.sent(5, body(5), b"packet 5", (Life(),), 0.5)

@@ -1,0 +1,120 @@
+"""The adaptive rate of `ofdm` beside each of its rungs alone, in simulated time: at constant SNRs, and where it fades.
+
+Messages fill one packet of 220 B each. The receiver reports over a way back of its own, whose reports come 5 ms after
+their airtime. A rung alone is the same link with a ladder of this one rung.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+from bench.rows import Row
+from gr_ros2.link.events import Delivered
+from gr_ros2.phy.ofdm_rate import RUNGS
+from gr_ros2.run.ladder_air import LadderAir
+from gr_ros2.run.load import make_phy
+from gr_ros2.run.scenario import scenario_from
+from gr_ros2.run.simulate import EventLoop, LinkDirection, Medium, Offered, make_ends, report_ways
+from gr_ros2.settings_file import find_registry
+
+PACKET_LEN, MESSAGE_LEN = 220, 205
+SNRS_DB = range(31)
+FASTEST = 1400.0
+"""messages/s, more than the fastest rung carries."""
+WARM_UP_S, MEASURED_S = 1.0, 3.0
+MEAN_DB, DOPPLER_HZ, FADING_S = 10.0, 2.0, 20.0
+HOLD_S = 0.2
+"""s that a message waits for an earlier one that may yet be repaired."""
+LOADS = tuple(round(100 * 1.05**step) for step in range(30))
+"""messages/s that are tried in the fading channel."""
+PDR = 0.99
+NEAR, GAIN = 0.9, 1.5
+
+
+def carried(rungs: tuple[str, ...], channel: dict[str, float], load: float, seconds: float) -> tuple[float, float]:
+    """Messages delivered per second after the warm-up, and share of the messages delivered.
+
+    :param rungs: names of the rungs from which the rate is chosen
+    :param load: messages/s offered
+    """
+    scenario = scenario_from(
+        {
+            "name": "rate",
+            "registry": find_registry("odom", Path()),
+            "time": "packets",
+            "version": 1,
+            "packet_len": PACKET_LEN,
+            "ros_source": {"robot_id": 1, "queue_depth": 1000, "topic_options": {"odom": {"queue": "fifo"}}},
+            "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive", "rungs": rungs}},
+            "channel": channel,
+            "ros_sink": {"hold_s": HOLD_S if not channel.get("doppler_hz") else 1.0},
+            "reports": {"delay_s": 0.005},
+            "duration_s": seconds,
+            "drain_s": 1.0,
+        }
+    )
+    registry = scenario.load_registry()
+    phy = make_phy(scenario, registry)
+    ends = make_ends([scenario], registry, any_length=phy.any_length, ladder=phy.ladder)
+    way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime, messages(load, seconds))
+    way.air = passing(LadderAir(phy, scenario.channel, samples=False))
+    back = LadderAir(phy, scenario.channel, samples=False)
+    ways = [way, *report_ways(scenario, ends, phy.airtime, [passing(back)])]
+    times = [now for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
+    late = sum(WARM_UP_S <= now < seconds for now in times)
+    return late / (seconds - WARM_UP_S), len(times) / int(load * seconds)
+
+
+def messages(load: float, seconds: float) -> Iterator[Offered]:
+    """Messages at equal distances."""
+    for number in count():
+        if (at := number / load) >= seconds:
+            return
+        yield Offered(at, 0, number.to_bytes(4, "big") + bytes(MESSAGE_LEN - 4))
+
+
+def passing(air: LadderAir) -> Medium:
+    """The channel as a direction takes it."""
+    return lambda packet, now: air.through(packet.data, packet.rung, now)
+
+
+def constant() -> list[tuple[int, float, dict[str, float]]]:
+    """For each SNR in dB: messages/s delivered with the adaptive rate, and with each rung alone."""
+    seconds = WARM_UP_S + MEASURED_S
+    found = []
+    for snr_db in SNRS_DB:
+        alone = {name: carried((name,), {"snr_db": snr_db}, FASTEST, seconds)[0] for name in RUNGS}
+        found.append((snr_db, carried(tuple(RUNGS), {"snr_db": snr_db}, FASTEST, seconds)[0], alone))
+    return found
+
+
+def most(rungs: tuple[str, ...]) -> float:
+    """The highest load, messages/s, of which at least ``PDR`` is delivered in the fading channel."""
+    within = 0.0
+    for load in LOADS:
+        fading = [{"snr_db": MEAN_DB, "doppler_hz": DOPPLER_HZ, "seed": seed} for seed in (1, 2)]
+        pdr = min(carried(rungs, channel, load, FADING_S)[1] for channel in fading)
+        if pdr < PDR:
+            break
+        within = load
+    return within
+
+
+def rate() -> list[Row]:
+    """The adaptive rate against the best of its rungs."""
+    rows = []
+    for snr_db, adaptive, alone in constant():
+        best = max(alone, key=alone.__getitem__)
+        if alone[best]:
+            note = f"{adaptive:.0f} messages/s; best {best}, {alone[best]:.0f}"
+            rows.append(
+                Row(f"rate at {snr_db} dB, of the best rung's", adaptive / alone[best], "", "≥", NEAR, "{:.2f}", note)
+            )
+    loads = {name: most((name,)) for name in RUNGS}
+    best = max(loads, key=loads.__getitem__)
+    adaptive = most(tuple(RUNGS))
+    note = f"{adaptive:.0f} messages/s at PDR ≥ {PDR}; best {best}, {loads[best]:.0f}"
+    what = f"rate, Rayleigh {DOPPLER_HZ:g} Hz, {MEAN_DB:g} dB, of the best rung's"
+    return [*rows, Row(what, adaptive / loads[best] if loads[best] else float("inf"), "", "≥", GAIN, "{:.2f}", note)]

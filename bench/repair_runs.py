@@ -1,0 +1,72 @@
+"""What repair delivers in a scenario, as `gr-ros2 run` runs it in simulated time: the table of `bench.repair`, on the
+air of a radio. A packet leaves as soon as the air is free, and a repair on the air cannot be interrupted.
+
+Odometry comes at 35 Hz from the simulator, and from a recording if there is one.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+from bench.repair import ODOMETRY
+from bench.rows import Row
+from gr_ros2.record.result import Result
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
+
+RECORDING = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
+"""Odometry at 10 Hz, played at 35 Hz: 34 s."""
+SPEED = 3.5
+
+
+def repair_runs() -> list[Row]:
+    """Odometry over the radio of paper-ofdm-paced."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        registry = Path(folder, "odom.csv")
+        registry.write_text("odom,nav_msgs/msg/Odometry\n", encoding="utf-8")
+        rows += _rows("simulated", {})
+        if RECORDING.is_dir():
+            rows += _rows("recorded", {"source": f"bag:{RECORDING}", "bag_speed": SPEED, "registry": str(registry)})
+    return rows
+
+
+def run(settings: dict[str, Any], loss: float, burst: float, repair: str, *, back: bool) -> Result:
+    """One run; equal arguments give equal numbers."""
+    channel: dict[str, Any] = {"packet_loss": loss}
+    if burst > 1:
+        leave = 1 / burst
+        channel = {"burst_loss": {"p_good_to_bad": leave * loss / (1 - loss), "p_bad_to_good": leave}}
+    reports = {"reports": {"channel": channel}} if back else {}
+    options = {**settings, **reports, "version": 1, "time": "packets", "channel": channel}
+    return run_scenario(load_scenario("paper-ofdm-paced", [f"ros_source.repair={repair}"], **options)).result
+
+
+def _rows(source: str, settings: dict[str, Any]) -> list[Row]:
+    rows: list[Row] = []
+
+    def add(name: str, value: float, unit: str, sense: Literal["≥", "≤"], target: float) -> None:
+        form = "{:,.0f}" if unit == "ms" else "{:.4f}"
+        rows.append(Row(f"run: {source} odometry, {name}", value, unit, sense, target, form))
+
+    for loss, burst, one_way, reports, _, p99 in ODOMETRY:
+        name = f"{loss:.0%} lost" + (" in bursts of 3" if burst > 1 else "")
+        for way, least in (("one-way", one_way), ("with reports", reports)):
+            (odom,) = run(settings, loss, burst, "idle", back=way != "one-way").topics
+            add(f"{name}, {way}: PDR", odom.pdr or 0.0, "", "≥", least)
+            if p99 is not None:
+                add(f"{name}, {way}: p99", (odom.latency_s.p99 or 0.0) * 1e3, "ms", "≤", p99)
+    for loss in (0.0, 0.2):
+        result = run(settings, loss, 1.0, "thrifty", back=True)
+        (odom,) = result.topics
+        repaired = result.packets["air_repair"] / odom.sent
+        if not loss:
+            add("0% lost, thrifty: repairs a message", repaired, "", "≤", 0.0)
+            continue
+        packets = result.packets["air_new"] / odom.sent + repaired
+        add("20% lost, thrifty: PDR", odom.pdr or 0.0, "", "≥", 0.998)
+        add("20% lost, thrifty: p99", (odom.latency_s.p99 or 0.0) * 1e3, "ms", "≤", 250)
+        add("20% lost, thrifty: packets a message", packets, "", "≤", 1.65)
+    return rows

@@ -1,0 +1,126 @@
+"""The rate that the air allows: nearly the best rung at every SNR, calm at the edges, robust where nothing is known."""
+
+from __future__ import annotations
+
+import random
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.link.rate import MOST_SILENT_S, SETTLED, RateController, Rung
+
+LADDER = tuple(
+    Rung(name, airtime_s, half_db, 0.4)
+    for name, airtime_s, half_db in (
+        ("bpsk, cc", 0.0080, 0.0),
+        ("qpsk, cc", 0.0042, 3.0),
+        ("16qam, cc", 0.0023, 9.0),
+        ("64qam, cc", 0.0017, 14.5),
+        ("64qam", 0.0010, 23.0),
+    )
+)
+REPORT_S = 0.02
+
+
+def settled(snr_db: float, *, reports: int = 200, noise_db: float = 0.0, seed: int = 0) -> list[int]:
+    """The rung after each of some reports of a constant SNR, measured with some error."""
+    draw = random.Random(seed)
+    rate = RateController(LADDER)
+    rate.meet(7)
+    rungs = [0]
+    for number in range(reports):
+        now = number * REPORT_S
+        rate.report(7, snr_db + draw.gauss(0, noise_db), 1 - LADDER[rungs[-1]].pdr(snr_db), now)
+        rungs.append(rate.sent(7, now))
+    return rungs
+
+
+@given(st.floats(-5, 35))
+def test_the_rung_is_nearly_the_best_at_every_snr(snr_db: float) -> None:
+    best = max(rung.goodput(snr_db) for rung in LADDER)
+    assert LADDER[settled(snr_db)[-1]].goodput(snr_db) >= 0.9 * best
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-5, 35), st.integers(0, 10_000))
+def test_at_an_edge_the_rung_hardly_changes_though_the_snr_is_measured_with_errors(snr_db: float, seed: int) -> None:
+    later = settled(snr_db, noise_db=0.3, reports=1000, seed=seed)[500:]
+    assert sum(one != two for one, two in pairwise(later)) <= 16
+    assert max(later) - min(later) <= 1
+
+
+def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
+    rate = RateController(LADDER)
+    rate.meet(7)
+    rung = 0
+    for number in range(200):
+        rate.report(7, 11.0, 0.5 if rung > 1 else 0.0, number * REPORT_S)  # this radio needs 2 dB more for 16-QAM
+        rung = rate.sent(7, number * REPORT_S)
+    assert rung <= 2
+    assert rate.sent(7, 200 * REPORT_S) >= 1
+
+
+def test_a_packet_for_everybody_serves_the_weakest() -> None:
+    rate = RateController(LADDER)
+    for robot in (1, 2):
+        rate.meet(robot)
+    for number in range(100):
+        now = number * REPORT_S
+        rate.report(1, 30.0, 0.0, now)
+        rate.report(2, 5.0, 0.0, now)
+    assert (rate.sent(1, now), rate.sent(2, now), rate.sent(None, now)) == (4, 1, 1)
+    rate.meet(3)
+    assert rate.sent(None, now) == 0, "nothing is known of the third"
+    rate.forget(3)
+    rate.forget(2)
+    assert rate.sent(None, now) == 4
+
+
+def test_a_robot_that_falls_silent_gets_the_most_robust_rung() -> None:
+    rate = RateController(LADDER)
+    rate.meet(7)
+    for number in range(100):
+        rate.report(7, 30.0, 0.0, number * REPORT_S)
+    now = 99 * REPORT_S
+    assert rate.sent(7, now) == 4
+    assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "nothing was sent that it could have reported"
+    for _ in range(20):
+        rate.sent(7, now + MOST_SILENT_S / 2)
+    assert rate.sent(7, now + MOST_SILENT_S / 2) == 0
+    for _ in range(SETTLED):
+        rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
+    assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "it is heard again"
+    assert rate.sent(7, now + 2 * MOST_SILENT_S) == 0
+
+
+def test_nobody_known_gets_the_most_robust_rung() -> None:
+    rate = RateController(LADDER)
+    assert rate.sent(None, 0.0) == rate.sent(9, 0.0) == 0
+
+
+@pytest.mark.parametrize("ladder", [(), LADDER[::-1], (LADDER[0], LADDER[0])])
+def test_a_ladder_goes_up(ladder: tuple[Rung, ...]) -> None:
+    with pytest.raises(ConfigError, match="ladder"):
+        RateController(ladder)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from("rsmf"), st.integers(0, 3), st.floats(-40, 60), st.floats(0, 1), st.floats(0, 2)),
+        max_size=60,
+    )
+)
+def test_any_course_of_events_gives_a_rung_of_the_ladder(events: list[tuple[str, int, float, float, float]]) -> None:
+    rate, now = RateController(LADDER), 0.0
+    for kind, robot, snr_db, loss, wait in events:
+        now += wait
+        if kind == "r":
+            rate.report(robot, snr_db, loss, now)
+        elif kind == "m":
+            rate.meet(robot)
+        elif kind == "f":
+            rate.forget(robot)
+        assert rate.sent(None, now) <= rate.sent(robot, now) < len(LADDER) or not rate.sent(robot, now)

@@ -1,0 +1,107 @@
+"""Endpoints with an adaptive rate: receivers report the SNR, and each packet is sent as its receivers need it."""
+
+from __future__ import annotations
+
+from gr_ros2.link.events import SenderEvent, SentPacket
+from gr_ros2.link.rate import Rung
+from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.registry import Registry
+from gr_ros2.wire import BROADCAST
+from gr_ros2.wire.control import Report
+
+LADDER = (Rung("slow", 0.01, 0.0, 0.4), Rung("middle", 0.005, 8.0, 0.4), Rung("fast", 0.0025, 16.0, 0.4))
+TOPICS = Registry.from_rows([("odom", "nav_msgs/msg/Odometry")])
+STEP_S = 0.01
+
+
+class Fleet:
+    """A sender and its receivers, which hear each other at an SNR of their own; None: not at all."""
+
+    def __init__(self, snrs: dict[int, float | None], dst_id: int = BROADCAST) -> None:
+        self.snrs = snrs
+        self.sent: list[SentPacket] = []
+        self.now = 0.0
+        settings = Settings(1, packet_len=64, fixed=False, dst_id=dst_id, packet_rate=0)
+        self.sender = Endpoint(TOPICS, settings, boot=5, observer=self._observe, ladder=LADDER)
+        self.receivers = {
+            number: Endpoint(
+                None,
+                Settings(
+                    number,
+                    packet_len=64,
+                    fixed=False,
+                ),
+                boot=5,
+            )
+            for number in snrs
+        }
+
+    def _observe(self, event: SenderEvent) -> None:
+        if isinstance(event, SentPacket):
+            self.sent.append(event)
+
+    def run(self, messages: int) -> list[int]:
+        """Send messages; returns the rungs of the packets that carried them."""
+        before = len(self.sent)
+        for _ in range(messages):
+            self.now += STEP_S
+            self.sender.submit(0, bytes(30), self.now)
+            for _ in range(3):
+                data = self.sender.next_packet(self.now)
+                for number, receiver in self.receivers.items():
+                    snr_db = self.snrs[number]
+                    if snr_db is None:
+                        continue
+                    if data is not None:
+                        receiver.receive(data, self.now, snr_db)
+                    if (answer := receiver.next_packet(self.now)) is not None:
+                        self.sender.receive(answer, self.now, 10.0)
+        return [event.rung for event in self.sent[before:] if event.kind == "new"]
+
+
+def test_the_rung_follows_the_weakest_receiver_that_reports() -> None:
+    fleet = Fleet({2: 30.0, 3: 30.0})
+    assert fleet.run(100)[-1] == 2
+    fleet.snrs[3] = 10.0
+    assert fleet.run(50)[-1] == 1
+    fleet.snrs[3] = 25.0
+    assert fleet.run(200)[-1] == 2
+
+
+def test_a_receiver_that_falls_silent_is_served_at_the_most_robust_rung_until_it_is_given_up() -> None:
+    fleet = Fleet({2: 30.0, 3: 30.0})
+    assert fleet.run(100)[-1] == 2
+    fleet.snrs[3] = None
+    assert fleet.run(200)[-1] == 0
+    fleet.sender.handle_timeout(fleet.now)
+    fleet.now += fleet.sender.settings.give_up_s
+    fleet.run(1)
+    fleet.sender.handle_timeout(fleet.now)
+    assert fleet.run(200)[-1] == 2
+
+
+def test_a_packet_to_one_robot_is_sent_as_this_one_needs_it() -> None:
+    fleet = Fleet({2: 30.0, 3: 2.0}, dst_id=2)
+    assert fleet.run(100)[-1] == 2
+
+
+def test_hellos_are_for_everybody_and_reports_tell_the_snr() -> None:
+    fleet = Fleet({2: 30.0})
+    fleet.run(300)
+    assert {event.rung for event in fleet.sent if event.kind == "hello"} == {0}
+    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours)
+    report = inbox.report(fleet.now)
+    assert isinstance(report, Report)
+    assert report.snr_db == 30.0
+
+
+def test_without_a_ladder_nothing_is_chosen_and_without_an_snr_none_is_reported() -> None:
+    sender = Endpoint(TOPICS, Settings(1, packet_len=64, packet_rate=0), boot=5)
+    receiver = Endpoint(None, Settings(2, packet_len=64), boot=5)
+    sender.submit(0, bytes(30), 0.0)
+    while (data := sender.next_packet(0.0)) is not None:
+        receiver.receive(data, 0.0)
+        assert sender.rung == 0
+    (neighbour,) = receiver.neighbours
+    assert neighbour.inbox.report(0.0).snr_db is None

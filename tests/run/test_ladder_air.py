@@ -1,0 +1,149 @@
+"""The adaptive rate in simulated time: the channel of each rung, and scenarios from the settings to the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.config import ChannelConfig
+from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.run.ladder_air import LadderAir, RayleighFading, limits
+from gr_ros2.run.load import make_phy
+from gr_ros2.run.observers import RunObservers
+from gr_ros2.run.scenario import Scenario, scenario_from
+from gr_ros2.run.simulate import simulate
+from gr_ros2.run.simulated_runner import run_simulated
+from gr_ros2.settings_file import find_registry
+
+
+class Rungs:
+    """Counts the packets with messages by their rung."""
+
+    name = "rungs"
+    instruments = False
+
+    def __init__(self) -> None:
+        self.sent: list[int] = []
+
+    def run_started(self, _run: Any) -> None:
+        pass
+
+    def run_ended(self, _result: Any) -> None:
+        pass
+
+    def sender_event(self, _src_id: int, event: SenderEvent) -> None:
+        if isinstance(event, SentPacket) and event.kind == "new":
+            self.sent.append(event.rung)
+
+    def receiver_event(self, _event: ReceiverEvent, _now: float) -> None:
+        pass
+
+
+def adaptive(snr_db: float, **settings: Any) -> Scenario:
+    """Odometry over `ofdm` with an adaptive rate and reports."""
+    return scenario_from(
+        {
+            "name": "adaptive",
+            "registry": find_registry("odom", Path()),
+            "sim": {"odom_rate": 50},
+            "time": "packets",
+            "version": 1,
+            "packet_len": 220,
+            "ros_source": {"namespace": "/robot_1", "compression": True},
+            "ros_sink": {"compression": True},
+            "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive"}},
+            "channel": {"snr_db": snr_db},
+            "reports": {"delay_s": 0.005},
+            "duration_s": 2.0,
+            **settings,
+        }
+    )
+
+
+def ladder_phy(**options: Any) -> Phy:
+    phy: Phy = PHY.load("ofdm")(220, 1e6, rate="adaptive", **options)
+    return phy
+
+
+def test_each_rung_takes_less_air_and_needs_more_snr() -> None:
+    phy = ladder_phy()
+    airtimes = [phy.airtime(220, rung) for rung in range(len(phy.ladder))]
+    assert airtimes == [rung.airtime_s for rung in phy.ladder] == sorted(airtimes, reverse=True)
+    assert [rung.half_db for rung in phy.ladder] == sorted(rung.half_db for rung in phy.ladder)
+    assert phy.airtime() == airtimes[0]
+    assert phy.airtime(24, 6) < phy.airtime(24, 0)
+
+
+@pytest.mark.parametrize(("rung", "name"), list(enumerate(rung.name for rung in ladder_phy().ladder)))
+def test_half_of_the_packets_of_a_rung_arrive_where_its_model_says(rung: int, name: str) -> None:
+    phy = ladder_phy()
+    model = phy.ladder[rung]
+    for snr_db in (model.half_db - 1.5, model.half_db - 0.5, model.half_db + 0.5, model.half_db + 2.5):
+        air = LadderAir(phy, ChannelConfig(snr_db=snr_db), samples=False)
+        pdr = np.mean([bool(air.through(b"x", rung, 0.0)) for _ in range(2000)])
+        assert pdr == pytest.approx(model.pdr(snr_db), abs=0.15), name
+        assert air.lost["phy"] == round((1 - pdr) * 2000)
+    low, high = limits(model)
+    assert not LadderAir(phy, ChannelConfig(snr_db=low - 0.1), samples=False).through(b"x", rung, 0.0)
+    assert LadderAir(phy, ChannelConfig(snr_db=high + 30), samples=False).through(b"x", rung, 0.0)
+
+
+def test_packets_may_pass_through_the_modem_of_their_rung() -> None:
+    air = LadderAir(ladder_phy(), ChannelConfig(snr_db=9.0), samples=True)
+    arrived = [bool(air.through(bytes(220), rung, 0.0)) for rung in (0, 2, 5)]
+    assert arrived == [True, True, False]
+
+
+def test_fading_is_that_of_rayleigh_and_a_function_of_time() -> None:
+    times = np.arange(0, 2000, 0.37)
+    gains = np.array([RayleighFading(2.0, seed).gain_db(now) for seed in range(3) for now in times])
+    powers = 10 ** (gains / 10)
+    assert powers.mean() == pytest.approx(1.0, abs=0.05)
+    for level in (0.05, 0.1, 0.5, 1.0):
+        assert (powers < level).mean() == pytest.approx(1 - np.exp(-level), abs=0.03)
+    one = RayleighFading(2.0, 1)
+    assert one.gain_db(1.0) == RayleighFading(2.0, 1).gain_db(1.0) != RayleighFading(2.0, 2).gain_db(1.0)
+    assert abs(one.gain_db(1.0) - one.gain_db(1.001)) < 1
+
+
+@pytest.mark.parametrize(("snr_db", "rung"), [(0.0, 0), (4.0, 1), (14.0, 4), (28.0, 6)])
+def test_a_scenario_is_sent_at_the_rate_that_its_channel_allows(snr_db: float, rung: int) -> None:
+    rungs = Rungs()
+    observers = RunObservers([rungs], threaded=False)
+    result = run_simulated(adaptive(snr_db), run_observers=observers).result
+    assert result.topics[0].pdr == 1.0
+    late = rungs.sent[len(rungs.sent) // 2 :]
+    assert max(set(late), key=late.count) == rung
+    phy = ladder_phy()
+    assert result.phy["airtime_s"] == phy.airtime()
+    assert result.phy["airtime_mean_s"] < phy.airtime()
+
+
+def test_without_reports_everything_is_sent_at_the_most_robust_rung() -> None:
+    rungs = Rungs()
+    observers = RunObservers([rungs], threaded=False)
+    scenario = adaptive(28.0, reports=None)
+    result = run_simulated(scenario, run_observers=observers).result
+    assert set(rungs.sent) == {0}
+    assert result.topics[0].pdr == 1.0
+
+
+def test_what_an_adaptive_rate_cannot_have_is_said_in_a_line() -> None:
+    for options in ({"payload_modulation": "qpsk"}, {"fec": "cc"}, {"detection_threshold": "stock"}):
+        with pytest.raises(ConfigError, match="rate: adaptive"):
+            ladder_phy(**options)
+    with pytest.raises(ConfigError, match="has one tap"):
+        LadderAir(ladder_phy(), ChannelConfig(snr_db=9.0, doppler_hz=2.0, taps=(1.0, 0.5)), samples=False)
+    for make in (ladder_phy().transmitter, ladder_phy().receiver):
+        with pytest.raises(PhyError, match="simulated time only"):
+            make()
+    scenario = adaptive(9.0)
+    with pytest.raises(ConfigError, match="a forecast has one rate"):
+        simulate(scenario, phy=make_phy(scenario, scenario.load_registry()))
