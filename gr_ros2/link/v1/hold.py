@@ -11,7 +11,8 @@ if it would delay the message that is due next.
 - repairs are owed: each new packet that leaves adds a share that covers the losses, each wait adds a little, and each
   repair subtracts one. On a link where no repair fits between two messages, repairs go at this rate;
 - waiting does not help. Where the PHY has slots of its own, a message waits for the end of a slot whether a repair is
-  in it or not. After each wait that gained nothing, more repairs go without waiting than after the one before.
+  in it or not. After two waits in a row that gained nothing, some repairs go without waiting, and more after each
+  further one.
 
 Invariant: a wait lasts two airtimes at most, and after ``1 / WAITED`` waits a repair leaves.
 """
@@ -33,7 +34,8 @@ _STEADY = 1 / 4
 """A topic is periodic if its intervals deviate from their mean by at most this part of it."""
 _FEW = 3
 """Number of intervals from which on a topic may be called periodic."""
-_MOST_SKIPPED = 1024
+_MOST_IN_VAIN = 6
+"""Waits in vain that are counted: at most 4^5 repairs go without waiting before the next one waits."""
 _GAIN = 1 / 16
 """Part of a packet's airtime that a wait must gain to be worth it."""
 
@@ -91,8 +93,8 @@ class Hold:
         self._airtime = 0.0
         self._skipped = 0
         """Number of consecutive repairs that left without waiting, because waiting does not help."""
-        self._skip = 0
-        """Number of repairs that leave without waiting before the next one waits."""
+        self._in_vain = 1
+        """Number of waits in a row that gained nothing; 1 at first, since none has gained anything yet."""
 
     def submitted(self, topic_id: int, now: float) -> None:
         """Note that a message of a topic has come."""
@@ -134,7 +136,7 @@ class Hold:
         if end - due <= OVERLAP * airtime:
             return now
         if self._would_end == inf:
-            if self._skipped < self._skip:
+            if self._in_vain > 1 and self._skipped < 4 ** (self._in_vain - 1):
                 self._skipped += 1
                 return now
             self._would_end, self._airtime = end, airtime
@@ -145,7 +147,7 @@ class Hold:
         """Note that a wait is over, and how many s a message gained by it."""
         self._would_end = inf
         self._skipped = 0
-        self._skip = 0 if gained > _GAIN * self._airtime else min(4 * self._skip + 4, _MOST_SKIPPED)
+        self._in_vain = 0 if gained > _GAIN * self._airtime else min(self._in_vain + 1, _MOST_IN_VAIN)
 
     def _next(self, now: float) -> tuple[float, float]:
         """When the next message is due, and until when it is waited for."""
