@@ -65,7 +65,8 @@ class Ax25Kiss(Kiss):
     """
 
     def __init__(self, longest: int, dropped: Counter[str] | None, options: KissOptions) -> None:
-        super().__init__(longest + HEADER_LEN, dropped, port=options.tnc_port)
+        super().__init__(longest, dropped, port=options.tnc_port)
+        self._most += 2 * HEADER_LEN
         self._header = ui_header(options.destination, options.callsign)
         self._destination = options.destination
 

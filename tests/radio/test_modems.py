@@ -55,6 +55,8 @@ def test_udp_with_losses(tmp_path: Path) -> None:
         robot(1, ends[0], tmp_path, channel={"packet_loss": 0.2, "seed": 1}) as one,
         robot(2, ends[1], tmp_path, channel={"packet_loss": 0.2, "seed": 2}) as two,
     ):
+        for link, other in ((one.link, 2), (two.link, 1)):
+            wait_for(lambda: link.sink._end.knows(other), "a hello")  # noqa: B023 - called at once
         talk(one, two, 0, 20)
         assert one.link.stats()["sink"]["repaired"] + two.link.stats()["sink"]["repaired"] > 0
         assert counters(one)["frames_out"] > 0
