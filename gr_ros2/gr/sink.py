@@ -32,11 +32,10 @@ from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
-from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
+from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 from gr_ros2.setting import AUTO
 
-_JOIN_S = 1.0
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
 _COUNTED = (
@@ -105,8 +104,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._timer_due = threading.Condition(self._lock)
         self._timer_idle = False
         self._running = False
-        self._thread: threading.Thread | None = None
-        self._thread_state = ThreadState()
+        self._thread = BlockThread()
         self._counters: Counter[str] = Counter()
         self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
         self._transforms: MergedTransforms | None = None
@@ -168,22 +166,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._advertise((src_id, topic_id))
 
     def start(self) -> bool:
-        shorten_switch_interval()
-        self._thread_state.keep()
         with self._lock:
             self._running = True
-        self._thread = threading.Thread(target=self._watch_timeouts, name="gr-ros2-sink", daemon=True)
-        self._thread.start()
+        self._thread.start(self._watch_timeouts, "gr-ros2-sink")
         return True
 
     def stop(self) -> bool:
         with self._lock:
             self._running = False
             self._timer_due.notify_all()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
-        self._thread_state.release()
+        self._thread.stop()
         return True
 
     def close(self) -> None:

@@ -34,7 +34,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PduPort
-from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
+from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
 from gr_ros2.setting import AUTO, Auto
 from gr_ros2.topic_choice import TopicChoice
@@ -42,7 +42,6 @@ from gr_ros2.topic_choice import TopicChoice
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 16
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
-_JOIN_S = 1.0
 
 
 class RosSource(gr.basic_block):  # type: ignore[misc]
@@ -104,8 +103,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._room = threading.Condition(self._lock)
         self._running = False
         self._closed = False
-        self._thread: threading.Thread | None = None
-        self._thread_state = ThreadState()
+        self._thread = BlockThread()
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.emitted = 0
@@ -169,15 +167,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._end.use_credit()
 
     def start(self) -> bool:
-        shorten_switch_interval()
-        self._thread_state.keep()
         self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         with self._lock:
             self._running = True
-        self._thread = threading.Thread(target=self._pump, name=f"gr-ros2-source-{self.src_id}", daemon=True)
-        self._thread.start()
+        self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found)
         return True
@@ -188,10 +183,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._running = False
             self._take_losses()
             self._work.notify_all()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
-        self._thread_state.release()
+        self._thread.stop()
         return True
 
     def close(self) -> None:

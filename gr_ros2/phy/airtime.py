@@ -18,9 +18,8 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS
-from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
+from gr_ros2.phy.threads import BlockThread
 
-_JOIN_S = 1.0
 _ONE = pmt.from_long(1)
 
 
@@ -55,8 +54,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._times = times
         self._changed = threading.Condition()
         self._running = False
-        self._thread: threading.Thread | None = None
-        self._thread_state = ThreadState()
+        self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.message_port_register_out(CREDIT)
@@ -68,22 +66,16 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return self._clock.backlog
 
     def start(self) -> bool:
-        shorten_switch_interval()
-        self._thread_state.keep()
         with self._changed:
             self._running = True
-        self._thread = threading.Thread(target=self._run, name="gr-ros2-airtime", daemon=True)
-        self._thread.start()
+        self._thread.start(self._run, "gr-ros2-airtime")
         return True
 
     def stop(self) -> bool:
         with self._changed:
             self._running = False
             self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
-        self._thread_state.release()
+        self._thread.stop()
         return True
 
     def _arrive(self, pdu: Any) -> None:

@@ -16,7 +16,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.config import ChannelConfig, Kernels, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.errors import ConfigError, PhyError
 from gr_ros2.link.rate import Rung
 
 Samples = npt.NDArray[np.complex64]
@@ -198,3 +198,29 @@ class Phy(ABC):
             down the ROS side; it takes a second to start, and packets come a moment after their samples
         :raises PhyError: for a PHY without samples
         """
+
+
+class PacketPhy(Phy):
+    """A PHY without samples: its packets cross as messages.
+
+    :param sample_rate: ignored
+    """
+
+    has_samples = False
+    crossing: ClassVar[str]
+    """How packets cross instead, for errors."""
+
+    def __init__(self, packet_len: int, sample_rate: float = 0.0, **options: Any) -> None:
+        super().__init__(packet_len, sample_rate, **options)
+
+    def airtime_samples(self, packet_len: int | None = None) -> int:  # noqa: ARG002
+        return 0
+
+    def burst_power(self) -> float:
+        return 0.0
+
+    def transmitter(self) -> PacketTransmitter:
+        raise PhyError(f"phy {self.name} has no transmitter; {self.crossing}")
+
+    def receiver(self, own_process: bool = False) -> PacketReceiver:  # noqa: ARG002
+        raise PhyError(f"phy {self.name} has no receiver; {self.crossing}")

@@ -13,9 +13,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import ThreadState, shorten_switch_interval
-
-_JOIN_S = 1.0
+from gr_ros2.phy.threads import BlockThread
 
 
 class PacketDelay(gr.basic_block):  # type: ignore[misc]
@@ -27,29 +25,22 @@ class PacketDelay(gr.basic_block):  # type: ignore[misc]
         self._waiting: deque[tuple[float, Any]] = deque()
         self._changed = threading.Condition()
         self._running = False
-        self._thread: threading.Thread | None = None
-        self._thread_state = ThreadState()
+        self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.set_msg_handler(PDUS, self._take)
 
     def start(self) -> bool:
-        shorten_switch_interval()
-        self._thread_state.keep()
         with self._changed:
             self._running = True
-        self._thread = threading.Thread(target=self._run, name="gr-ros2-delay", daemon=True)
-        self._thread.start()
+        self._thread.start(self._run, "gr-ros2-delay")
         return True
 
     def stop(self) -> bool:
         with self._changed:
             self._running = False
             self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
-        self._thread_state.release()
+        self._thread.stop()
         return True
 
     def _take(self, pdu: Any) -> None:

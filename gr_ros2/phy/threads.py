@@ -136,6 +136,34 @@ class ThreadState:
             ctypes.pythonapi.PyGILState_Release(self._state)
 
 
+class BlockThread:
+    """A thread that a Python block runs from its ``start`` to its ``stop``.
+
+    Meanwhile the thread in which GNU Radio calls the block keeps its Python state, see :class:`ThreadState`.
+    """
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+        self._state = ThreadState()
+
+    def start(self, run: Callable[[], None], name: str) -> None:
+        """Call this in the block's ``start``, once ``run`` would not return at once.
+
+        :param run: what the thread does; not kept beyond its end, since blocks must not refer to themselves
+        """
+        shorten_switch_interval()
+        self._state.keep()
+        self._thread = threading.Thread(target=run, name=name, daemon=True)
+        self._thread.start()
+
+    def stop(self, patience_s: float = 1.0) -> None:
+        """Wait until ``run`` has returned. Call this in the block's ``stop``, after ``run`` has been told to return."""
+        if self._thread is not None:
+            self._thread.join(patience_s)
+            self._thread = None
+        self._state.release()
+
+
 class KeepsThreadState:
     """Mix-in with start and stop for a Python block that needs nothing else there; list it before GNU Radio's class."""
 

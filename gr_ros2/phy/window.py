@@ -14,7 +14,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.pdus import CREDIT
-from gr_ros2.phy.threads import shorten_switch_interval
+from gr_ros2.phy.threads import BlockThread
 
 WINDOW = 32
 """Packets in progress: enough to keep the flowgraph busy between two polls of its progress."""
@@ -22,7 +22,6 @@ WINDOW = 32
 _SHARE = 4
 """A grant is at least this part of the window."""
 _POLL_S = 0.001
-_JOIN_S = 1.0
 
 
 class CreditWindow(gr.basic_block):  # type: ignore[misc]
@@ -40,21 +39,17 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
         self._progress = progress
         self._window = window
         self._stopped = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread = BlockThread()
         self.message_port_register_out(CREDIT)
 
     def start(self) -> bool:
-        shorten_switch_interval()
         self._stopped.clear()
-        self._thread = threading.Thread(target=self._run, name="gr-ros2-window", daemon=True)
-        self._thread.start()
+        self._thread.start(self._run, "gr-ros2-window")
         return True
 
     def stop(self) -> bool:
         self._stopped.set()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
+        self._thread.stop()
         return True
 
     def _run(self) -> None:

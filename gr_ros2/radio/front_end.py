@@ -69,14 +69,13 @@ class FrontEnd(ABC):
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
-        if not self.carries(type(phy)) and self.carries_packets:
+        if not self.carries(type(phy)):
             raise ConfigError(
                 f"front_end {self.name}: takes packets for a modem of a known bit rate, which phy {phy.name} does not "
                 "have; set phy to {name: modem, options: {bit_rate: …}}"
-            )
-        if not self.carries(type(phy)):
-            raise ConfigError(
-                f"front_end {self.name}: phy {phy.name} has no samples to carry; choose another phy, or front_end sim"
+                if self.carries_packets
+                else f"front_end {self.name}: phy {phy.name} has no samples to carry; choose another phy, or front_end "
+                "sim"
             )
         if not self.any_length:
             phy.pad_all()

@@ -22,12 +22,13 @@ from gnuradio import gr
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
-from gr_ros2.phy.threads import ThreadState
+from gr_ros2.phy.threads import BlockThread
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import FrontEnd
 
 _RETRY_S = 1.0
 _JOIN_S = 5.0
+"""s that ``stop`` waits: longer than an attempt to connect takes."""
 _WAITING = 64
 """Packets that may wait for a connection that takes no more."""
 _CHUNK = 4096
@@ -141,30 +142,21 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         self._ends = socket.socketpair()
         for end in self._ends:
             end.setblocking(False)
-        self._running = False
         self._stopped = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._thread_state = ThreadState()
+        self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.set_msg_handler(PDUS, self._arrive)
 
     def start(self) -> bool:
-        self._thread_state.keep()
-        self._running = True
         self._stopped.clear()
-        self._thread = threading.Thread(target=self._run, name=f"gr-ros2-{self._called}", daemon=True)
-        self._thread.start()
+        self._thread.start(self._run, f"gr-ros2-{self._called}")
         return True
 
     def stop(self) -> bool:
-        self._running = False
         self._stopped.set()
         self._wake()
-        if self._thread is not None:
-            self._thread.join(_JOIN_S)
-            self._thread = None
-        self._thread_state.release()
+        self._thread.stop(_JOIN_S)
         return True
 
     def close(self) -> None:
@@ -189,7 +181,7 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
             return  # full, so the thread will wake anyway; or closed
 
     def _run(self) -> None:
-        while self._running:
+        while not self._stopped.is_set():
             connection = self._connection or self._again()
             if connection is None:
                 self._stopped.wait(_RETRY_S)
@@ -225,7 +217,7 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         with selectors.DefaultSelector() as selector:
             selector.register(self._ends[0], _READ)
             selector.register(connection.fileno(), _READ, connection)
-            while self._running:
+            while not self._stopped.is_set():
                 selector.modify(connection.fileno(), _READ | (_WRITE if connection.unsent else 0), connection)
                 for key, events in selector.select():
                     if key.data is None:
