@@ -2,9 +2,10 @@
 
 Invariants: a packet is the payload of one broadcast data frame (IEEE 802.11-2020, 9.3.2) with an LLC/SNAP header (IEEE
 802) and an FCS, so every output packet equals the packet sent; a frame has the length of its packet; a whole frame that
-is not ours is counted and dropped. The module's blocks encode, modulate, synchronise and decode. Stock blocks of GNU
-Radio between them are connected as in the module's ``wifi_phy_hier``. The sampled band is the channel: 10 MS/s for
-802.11p, 20 MS/s for 802.11a and g.
+is not ours is counted and dropped. The module's blocks encode, map, synchronise, equalise and decide. Stock blocks of
+GNU Radio between them are connected as in the module's ``wifi_phy_hier``. Decoding is here, with GNU Radio's Viterbi
+decoder: that of the module reads beyond the end of a frame. The sampled band is the channel: 10 MS/s for 802.11p, 20
+MS/s for 802.11a and g.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ import zlib
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fractions import Fraction
+from functools import lru_cache
 from math import log10
 from statistics import median
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pmt
-from gnuradio import blocks, digital, fft, gr
+from gnuradio import blocks, digital, fft, filter, gr
 from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -30,14 +33,15 @@ from gr_ros2.phy import PHY
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
 from gr_ros2.phy.burst_blocks import STOCK, TakesPackets
+from gr_ros2.phy.fec import Bits, Convolutional
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, pdu_of
+from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.theory import convolutional_success, qam_bit_error
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit
 
 MAX_PSDU = 1528
-"""Bytes of the longest frame that the module decodes, header and FCS included."""
+"""Bytes of the longest frame that the module sends with any encoding, header and FCS included."""
 _HEADER_LEN, _FCS_LEN = 32, 4
 MAX_PACKET = MAX_PSDU - _HEADER_LEN - _FCS_LEN
 _DATA, _BROADCAST = b"\x08\x00\x00\x00", b"\xff" * 6
@@ -60,7 +64,14 @@ _SMALLEST_BUFFER = 32768
 """Bytes that GNU Radio gives every buffer by default."""
 _UNKNOWN_CARRIER = 1e15
 """Hz. The module divides a carrier offset by the carrier to compute a clock offset; this makes it 0."""
-_HEAD, _SNR = pmt.intern("frame bytes"), pmt.intern("snr")
+_RESIDUE = 0x2144DF1C
+"""CRC-32 of a whole frame, FCS included."""
+_KEPT = {(1, 2): (1, 1), (2, 3): (1, 1, 1, 0), (3, 4): (1, 1, 1, 0, 0, 1)}
+"""By code rate: which bits of the rate 1/2 code are sent (IEEE 802.11-2020, figure 17-9)."""
+_DECIDED = 10.0
+"""Magnitude of a hard decision as a soft bit."""
+_DECODERS = 64
+"""Decoders kept, one for each length of a frame."""
 _LOOKED_BACK = 16
 """Packets whose SNRs are averaged (median)."""
 _SHORT = np.sqrt(13 / 6) * (1 + 1j) * np.array([1, -1, 1, -1, -1, 1, 0, -1, -1, 1, 1, 1, 1])
@@ -85,6 +96,12 @@ class Encoding(NamedTuple):
     def symbols(self, packet_len: int) -> int:
         """Symbols with data of a packet of ``packet_len`` bytes."""
         return -(-data_bits(packet_len) // self.symbol_bits)
+
+    @property
+    def rate(self) -> tuple[int, int]:
+        """Code rate."""
+        share = Fraction(self.symbol_bits, self.carrier_bits * _CARRIERS)
+        return share.numerator, share.denominator
 
     def samples(self, packet_len: int) -> int:
         """Samples of its frame."""
@@ -127,7 +144,7 @@ class WifiOptions:
         much. The receiver reads it in each frame
     :param equalizer: how the receiver estimates the channel: ``ls`` = from the preamble, ``lms`` = follows it by the
         decided symbols, ``comb`` = from the pilots, ``sta`` = averages over time and carriers. ``comb`` reports no SNR
-    :param gap: zero samples after each packet, 400..100000; fewer would keep the last packet in the receiver
+    :param gap: zero samples after each packet, 360..100000; fewer would keep the last packet in the receiver
     :param lengths: ``any`` = a packet is as long on the air as its bytes need; ``fixed`` = all have ``packet_len``
         bytes. The same at both ends
     :param detection_threshold: part of the preamble's autocorrelation from which on a frame is looked at, 0.3..0.9; the
@@ -143,7 +160,7 @@ class WifiOptions:
         "bpsk-1/2", "bpsk-3/4", "qpsk-1/2", "qpsk-3/4", "16qam-1/2", "16qam-3/4", "64qam-2/3", "64qam-3/4"
     ] = "bpsk-1/2"
     equalizer: Literal["ls", "lms", "comb", "sta"] = "ls"
-    gap: Annotated[int, Field(ge=400, le=100_000, title="Gap after a packet (samples)")] = 600
+    gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] = 400
     lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
     detection_threshold: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
     network: Annotated[Address, Field(title="Network (BSSID)")] = "02:67:72:2d:72:32"
@@ -199,10 +216,9 @@ class WifiPhy(Phy):
         """For hard decisions, and a channel estimated from the two long training symbols, as the module does it."""
         # Noise is in all 64 carriers, power in 52; the estimate has half the noise of a symbol and adds it.
         snr = 10 ** (snr_db / 10) * _FFT / _USED / 1.5
-        carrier_bits, symbol_bits = self.encoding.carrier_bits, self.encoding.symbol_bits
         header = convolutional_success((1, 2), qam_bit_error(1, snr), _SIGNAL_BITS)
-        wrong, rate = qam_bit_error(carrier_bits, snr), (symbol_bits, carrier_bits * _CARRIERS)
-        return header * convolutional_success(rate, wrong, data_bits(self.packet_len))
+        wrong = qam_bit_error(self.encoding.carrier_bits, snr)
+        return header * convolutional_success(self.encoding.rate, wrong, data_bits(self.packet_len))
 
     def runs_on(self) -> str:
         return STOCK
@@ -248,14 +264,51 @@ def training() -> list[list[complex]]:
     return [symbol.tolist() for symbol in (short, short, early, long)]
 
 
-def polarity() -> list[int]:
-    """The pilots' signs, symbol by symbol (equation 17-25): x^7 + x^4 + 1, all ones at the start."""
-    state, signs = 0x7F, []
-    for _ in range(127):
-        bit = (state >> 6 ^ state >> 3) & 1
-        state = state << 1 & 0x7F | bit
-        signs.append(1 - 2 * bit)
-    return signs
+@lru_cache
+def scrambler() -> Bits:
+    """One period of x^7 + x^4 + 1, all ones at the start (section 17.3.5.5): 127 bits."""
+    state, bits = 0x7F, np.empty(127, np.uint8)
+    for place in range(len(bits)):
+        bits[place] = (state >> 6 ^ state >> 3) & 1
+        state = state << 1 & 0x7F | int(bits[place])
+    return bits
+
+
+@lru_cache
+def interleaving(carrier_bits: int) -> NDArray[np.int64]:
+    """For each coded bit of a symbol, its place among the bits of the carriers (section 17.3.5.7)."""
+    count = carrier_bits * _CARRIERS
+    k = np.arange(count)
+    i = count // 16 * (k % 16) + k // 16
+    s = max(carrier_bits // 2, 1)
+    return s * (i // s) + (i + count - 16 * i // count) % s
+
+
+def decoded(encoding: Encoding, length: int, symbols: NDArray[np.uint8]) -> bytes | None:
+    """The frame of these symbols without its FCS; None if the FCS is wrong.
+
+    :param length: bytes of the frame, FCS included
+    :param symbols: array (symbols, 48): the point of each carrier, its first bit in the lowest
+    """
+    bits = (symbols[:, :, None] >> np.arange(encoding.carrier_bits, dtype=np.uint8) & 1).reshape(len(symbols), -1)
+    coded = bits[:, interleaving(encoding.carrier_bits)].reshape(-1)
+    data = _SERVICE_BITS + 8 * length
+    sent = np.resize(np.array(_KEPT[encoding.rate], bool), 2 * (data + _TAIL_BITS))
+    soft = np.zeros(len(sent), np.float32)
+    soft[sent] = _DECIDED * (2.0 * coded[: np.count_nonzero(sent)] - 1)
+    # GNU Radio's code has the two polynomials in the other order.
+    scrambled = _decoder(data).decode(soft.reshape(-1, 2)[:, ::-1].reshape(-1))
+    # The first seven bits are those of the scrambler.
+    whole = np.resize(scrambler(), 127 + 7)
+    starts = np.flatnonzero((np.lib.stride_tricks.sliding_window_view(whole, 7)[:127] == scrambled[:7]).all(axis=1))
+    if not len(starts):
+        return None
+    clear = scrambled ^ np.resize(np.roll(scrambler(), -int(starts[0])), data)
+    frame = np.packbits(clear[_SERVICE_BITS:], bitorder="little").tobytes()
+    return frame[:-_FCS_LEN] if zlib.crc32(frame) == _RESIDUE else None
+
+
+_decoder = lru_cache(maxsize=_DECODERS)(Convolutional)
 
 
 @contextmanager
@@ -286,7 +339,7 @@ class WifiTransmitter(TransmitterBlock):
         header_points = digital.chunks_to_symbols_bc([-1, 1], 1)
         join = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY, 1)
         data = [*range(-26, -21), *range(-20, -7), *range(-6, 0), *range(1, 7), *range(8, 21), *range(22, 27)]
-        pilots = [(sign, sign, sign, -sign) for sign in polarity()]
+        pilots = [(sign, sign, sign, -sign) for sign in (1 - 2 * int(bit) for bit in scrambler())]
         carriers = digital.ofdm_carrier_allocator_cvc(_FFT, [data], [_PILOTS], pilots, training(), _TX_KEY, True)
         inverse = fft.fft_vcc(_FFT, False, [_USED**-0.5] * _FFT, True, 1)
         prefix = digital.ofdm_cyclic_prefixer(_FFT, _SYMBOL, _ROLLOFF, _TX_KEY)
@@ -337,9 +390,10 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._number = 0
         self.message_port_register_out(PDUS)
 
-    def take_packet(self, packet: bytes) -> None:
-        self.message_port_pub(PDUS, pdu_of(self._frames.wrap(packet, self._number)))
-        self._number += 1
+    def take_packets(self, packets: list[bytes]) -> None:
+        for packet in packets:
+            self.message_port_pub(PDUS, pdu_of(self._frames.wrap(packet, self._number)))
+            self._number += 1
 
 
 class _Bursts(KeptAlive, gr.sync_block):  # type: ignore[misc]
@@ -378,16 +432,17 @@ class WifiReceiver(ReceiverBlock):
         window, length = 48, 320
         late = blocks.delay(gr.sizeof_gr_complex, _CP)
         product, turned = blocks.multiply_cc(), blocks.conjugate_cc()
-        correlation = blocks.moving_average_cc(window, 1, 4000)
-        power = blocks.moving_average_ff(window + _CP, 1, 4000)
+        # Filters, not moving averages: rounding leaves something of a burst in these, which looks like a preamble in
+        # the zeros behind it.
+        correlation = filter.fir_filter_ccf(1, [1.0] * window)
+        power = filter.fir_filter_fff(1, [1.0] * (window + _CP))
         ratio = blocks.divide_ff()
         short = wifi.sync_short(options.detection_threshold, 2, False, False)
         long = wifi.sync_long(length, False, False)
         carrier = _UNKNOWN_CARRIER if options.carrier_hz is None else options.carrier_hz
         estimate = getattr(wifi, options.equalizer.upper())
         self._equalizer = wifi.frame_equalizer(estimate, carrier, phy.sample_rate, False, False)
-        decoder = wifi.decode_mac(False, False)
-        self._heads, self._collector = _Heads(), _Collector(phy)
+        self._decoder = _Decoder(phy)
         self.connect(self, late, (short, 0))
         self.connect(late, turned, (product, 1))
         self.connect(self, (product, 0))
@@ -402,27 +457,24 @@ class WifiReceiver(ReceiverBlock):
             blocks.stream_to_vector(gr.sizeof_gr_complex, _FFT),
             fft.fft_vcc(_FFT, True, [], True, 1),
             self._equalizer,
-            decoder,
+            self._decoder,
         )
-        self.connect(self._equalizer, self._heads)
-        self.msg_connect((decoder, "out"), (self._collector, "frames"))
-        self.msg_connect((self._collector, "pdus"), (self, "pdus"))
+        self.msg_connect((self._decoder, "pdus"), (self, "pdus"))
 
     @property
     def damaged(self) -> int:
-        """Frames with a header whose FCS was wrong, whoever sent them; noise taken for a preamble counts too. Frames
-        that are being decoded count until they are."""
-        return max(0, self._heads.ended - self._collector.whole)
+        """Frames whose FCS was wrong, whoever sent them; noise taken for a preamble counts too."""
+        return self._decoder.damaged
 
     @property
     def foreign(self) -> int:
         """Whole frames that are not packets of this link."""
-        return self._collector.foreign
+        return self._decoder.foreign
 
     @property
     def snr_db(self) -> float | None:
         """SNR over the sampled band of the newest packets, dB; None before the first."""
-        return self._collector.snr_db
+        return self._decoder.snr_db
 
     def tap_symbols(self) -> SymbolTap:
         """Make the received constellation points visible."""
@@ -431,30 +483,20 @@ class WifiReceiver(ReceiverBlock):
         return SymbolTap(points.newest)
 
 
-class _Heads(KeptAlive, gr.sync_block):  # type: ignore[misc]
-    """Symbols of frames in: counts the frames that have ended, whole or damaged."""
-
-    def __init__(self) -> None:
-        super().__init__("gr_ros2_wifi_heads", [(np.uint8, _CARRIERS)], None)
-        self.ended = 0
-
-    def work(self, input_items: list[Any], output_items: list[Any]) -> int:  # noqa: ARG002
-        self.ended += len(self.get_tags_in_window(0, 0, len(input_items[0]), _HEAD))
-        return len(input_items[0])
-
-
-class _Collector(KeptAlive, gr.basic_block):  # type: ignore[misc]
-    """Message port `frames` in, whose FCS is right; message port `pdus` out: the packets of this link."""
+class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
+    """Symbols of frames in, whose first has tags; message port `pdus` out: the packets of this link."""
 
     def __init__(self, phy: WifiPhy) -> None:
-        super().__init__("gr_ros2_wifi_collector", None, None)
+        super().__init__("gr_ros2_wifi_decoder", [(np.uint8, _CARRIERS)], None)
         self._frames, self._lengths = DataFrames(phy.options), phy.lengths
         self._measures = phy.options.equalizer != "comb"
-        self.whole = self.foreign = 0
+        self._encoding, self._length, self._snr_db = phy.encoding, 0, 0.0
+        self._symbols: list[NDArray[np.uint8]] = []
+        self._missing = 0
+        """Symbols of the present frame that have not come yet."""
         self._snrs: deque[float] = deque(maxlen=_LOOKED_BACK)
+        self.damaged = self.foreign = 0
         self._port = PduPort(self)
-        self.message_port_register_in(pmt.intern("frames"))
-        self.set_msg_handler(pmt.intern("frames"), self._take)
 
     @property
     def snr_db(self) -> float | None:
@@ -466,15 +508,50 @@ class _Collector(KeptAlive, gr.basic_block):  # type: ignore[misc]
         self._port.find_readers()
         return super().start()
 
-    def _take(self, message: Any) -> None:
-        self.whole += 1
-        packet = self._frames.unwrap(octets(pmt.cdr(message)))
-        if packet is None or len(packet) not in self._lengths:
+    def work(self, input_items: list[NDArray[np.uint8]], output_items: list[Any]) -> int:  # noqa: ARG002
+        symbols = input_items[0]
+        begin, cursor = self.nitems_read(0), 0
+        packets: list[bytes] = []
+        heads: dict[int, dict[Any, Any]] = {}
+        for tag in self.get_tags_in_window(0, 0, len(symbols)):
+            heads.setdefault(tag.offset - begin, {})[pmt.symbol_to_string(tag.key)] = tag.value
+        for place, head in sorted(heads.items()):
+            packets += self._take(symbols[cursor:place])
+            self._begin(head)
+            cursor = place
+        packets += self._take(symbols[cursor:])
+        self._port.send(packets)
+        return len(symbols)
+
+    def _begin(self, head: dict[str, Any]) -> None:
+        """A frame begins; one that has not ended is damaged."""
+        self.damaged += bool(self._missing)
+        self._length = pmt.to_uint64(head["frame bytes"])
+        self._encoding = tuple(ENCODINGS.values())[pmt.to_uint64(head["encoding"])]
+        self._snr_db = band_snr_db(pmt.to_double(head["snr"]))
+        self._missing = self._encoding.symbols(self._length - _HEADER_LEN - _FCS_LEN)
+        self._symbols = []
+
+    def _take(self, symbols: NDArray[np.uint8]) -> list[bytes]:
+        """Further symbols; the packet that they complete."""
+        if not self._missing:
+            return []
+        new = symbols[: self._missing].copy()
+        self._symbols.append(new)
+        self._missing -= len(new)
+        if self._missing:
+            return []
+        frame = decoded(self._encoding, self._length, np.concatenate(self._symbols))
+        packet = None if frame is None else self._frames.unwrap(frame)
+        if frame is None:
+            self.damaged += 1
+        elif packet is None or len(packet) not in self._lengths:
             self.foreign += 1
-            return
-        if self._measures:
-            self._snrs.append(band_snr_db(pmt.to_double(pmt.dict_ref(pmt.car(message), _SNR, pmt.from_double(0)))))
-        self._port.send([packet])
+        else:
+            if self._measures:
+                self._snrs.append(self._snr_db)
+            return [packet]
+        return []
 
 
 def band_snr_db(told_db: float) -> float:
