@@ -1,25 +1,21 @@
 """The `wifi` PHY: IEEE 802.11 a/g/p frames by the out-of-tree module gr-ieee802-11.
 
-Invariants: a packet is the payload of one broadcast data frame (IEEE 802.11-2020, 9.3.2) with an LLC/SNAP header (IEEE
-802) and an FCS, so every output packet equals the packet sent; a frame has the length of its packet; a whole frame that
-is not ours is counted and dropped. The module's blocks encode, map, synchronise, equalise and decide. Stock blocks of
-GNU Radio between them are connected as in the module's ``wifi_phy_hier``. Decoding is here, with GNU Radio's Viterbi
-decoder: that of the module reads beyond the end of a frame. The sampled band is the channel: 10 MS/s for 802.11p, 20
+Invariants: a frame has the length of its packet, and an FCS, so every output packet equals the packet sent; a whole
+frame that is not ours is counted and dropped. The module's blocks encode, map, synchronise, equalise and decide. Stock
+blocks of GNU Radio between them are connected as in the module's ``wifi_phy_hier``. Decoding is in ``wifi_frames``,
+since the module's decoder reads beyond the end of a frame. The sampled band is the channel: 10 MS/s for 802.11p, 20
 MS/s for 802.11a and g.
 """
 
 from __future__ import annotations
 
 import os
-import zlib
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from fractions import Fraction
-from functools import lru_cache
 from math import log10
 from statistics import median
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pmt
@@ -33,96 +29,40 @@ from gr_ros2.phy import PHY
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
 from gr_ros2.phy.burst_blocks import STOCK, TakesPackets
-from gr_ros2.phy.fec import Bits, Convolutional
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.theory import convolutional_success, qam_bit_error
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit
+from gr_ros2.phy.wifi_frames import (
+    CARRIERS,
+    CP_LEN,
+    ENCODINGS,
+    FCS_LEN,
+    FFT_LEN,
+    HEADER_LEN,
+    MAX_PACKET,
+    MAX_PSDU,
+    PREAMBLE,
+    ROLLOFF,
+    SIGNAL_BITS,
+    USED_CARRIERS,
+    DataFrames,
+    FrameDecoder,
+    data_bits,
+    scrambler,
+    training,
+)
 
-MAX_PSDU = 1528
-"""Bytes of the longest frame that the module sends with any encoding, header and FCS included."""
-_HEADER_LEN, _FCS_LEN = 32, 4
-MAX_PACKET = MAX_PSDU - _HEADER_LEN - _FCS_LEN
-_DATA, _BROADCAST = b"\x08\x00\x00\x00", b"\xff" * 6
-"""Frame control and duration of a data frame within no infrastructure; the receiver's address."""
-_SNAP = bytes.fromhex("aaaa03000000 88b5")
-"""LLC/SNAP header with the first EtherType for local experiments."""
-_FFT, _CP, _CARRIERS = 64, 16, 48
-_USED = 52
-"""Carriers with power: data and pilots."""
-_SYMBOL = _FFT + _CP
-_PREAMBLE = 4
-"""Symbols: two of short training, two of long training."""
-_SERVICE_BITS, _TAIL_BITS = 16, 6
-_SIGNAL_BITS = 24
-_ROLLOFF = 2
-"""Samples in which a symbol passes into the next; a frame is one less longer."""
 _TX_KEY = "packet_len"
 """The length tag of the module's blocks, which cannot be changed."""
 _SMALLEST_BUFFER = 32768
 """Bytes that GNU Radio gives every buffer by default."""
 _UNKNOWN_CARRIER = 1e15
 """Hz. The module divides a carrier offset by the carrier to compute a clock offset; this makes it 0."""
-_RESIDUE = 0x2144DF1C
-"""CRC-32 of a whole frame, FCS included."""
-_KEPT = {(1, 2): (1, 1), (2, 3): (1, 1, 1, 0), (3, 4): (1, 1, 1, 0, 0, 1)}
-"""By code rate: which bits of the rate 1/2 code are sent (IEEE 802.11-2020, figure 17-9)."""
-_DECIDED = 10.0
-"""Magnitude of a hard decision as a soft bit."""
-_DECODERS = 64
-"""Decoders kept, one for each length of a frame."""
 _LOOKED_BACK = 16
 """Packets whose SNRs are averaged (median)."""
-_SHORT = np.sqrt(13 / 6) * (1 + 1j) * np.array([1, -1, 1, -1, -1, 1, 0, -1, -1, 1, 1, 1, 1])
-"""Carriers -24, -20, ... 24 of the short training symbols (IEEE 802.11-2020, equation 17-7)."""
-_LONG = "++--++-+-++++++--++-+-++++0+--++-+-+-----++--+-+-++++"
-"""Carriers -26 to 26 of the long training symbols (equation 17-8)."""
 _PILOTS = (-21, -7, 7, 21)
-
-
-class Encoding(NamedTuple):
-    """Modulation and code rate of a frame's data.
-
-    :param constant: its name in the module
-    :param carrier_bits: coded bits of a carrier
-    :param symbol_bits: bits of a symbol before coding
-    """
-
-    constant: str
-    carrier_bits: int
-    symbol_bits: int
-
-    def symbols(self, packet_len: int) -> int:
-        """Symbols with data of a packet of ``packet_len`` bytes."""
-        return -(-data_bits(packet_len) // self.symbol_bits)
-
-    @property
-    def rate(self) -> tuple[int, int]:
-        """Code rate."""
-        share = Fraction(self.symbol_bits, self.carrier_bits * _CARRIERS)
-        return share.numerator, share.denominator
-
-    def samples(self, packet_len: int) -> int:
-        """Samples of its frame."""
-        return (_PREAMBLE + 1 + self.symbols(packet_len)) * _SYMBOL + _ROLLOFF - 1
-
-
-def data_bits(packet_len: int) -> int:
-    """Bits that the code carries for a packet, before padding."""
-    return _SERVICE_BITS + 8 * (_HEADER_LEN + packet_len + _FCS_LEN) + _TAIL_BITS
-
-
-ENCODINGS = {
-    "bpsk-1/2": Encoding("BPSK_1_2", 1, 24),
-    "bpsk-3/4": Encoding("BPSK_3_4", 1, 36),
-    "qpsk-1/2": Encoding("QPSK_1_2", 2, 48),
-    "qpsk-3/4": Encoding("QPSK_3_4", 2, 72),
-    "16qam-1/2": Encoding("QAM16_1_2", 4, 96),
-    "16qam-3/4": Encoding("QAM16_3_4", 4, 144),
-    "64qam-2/3": Encoding("QAM64_2_3", 6, 192),
-    "64qam-3/4": Encoding("QAM64_3_4", 6, 216),
-}
 
 
 def _address(text: str) -> str:
@@ -215,8 +155,8 @@ class WifiPhy(Phy):
     def computed_pdr(self, snr_db: float) -> float:
         """For hard decisions, and a channel estimated from the two long training symbols, as the module does it."""
         # Noise is in all 64 carriers, power in 52; the estimate has half the noise of a symbol and adds it.
-        snr = 10 ** (snr_db / 10) * _FFT / _USED / 1.5
-        header = convolutional_success((1, 2), qam_bit_error(1, snr), _SIGNAL_BITS)
+        snr = 10 ** (snr_db / 10) * FFT_LEN / USED_CARRIERS / 1.5
+        header = convolutional_success((1, 2), qam_bit_error(1, snr), SIGNAL_BITS)
         wrong = qam_bit_error(self.encoding.carrier_bits, snr)
         return header * convolutional_success(self.encoding.rate, wrong, data_bits(self.packet_len))
 
@@ -228,87 +168,6 @@ class WifiPhy(Phy):
 
     def receiver(self, own_process: bool = False) -> PacketReceiver:  # noqa: ARG002 - the blocks are not Python's
         return WifiReceiver(self)
-
-
-class DataFrames:
-    """The broadcast data frames of a network.
-
-    :param options: network and own address
-    """
-
-    def __init__(self, options: WifiOptions) -> None:
-        self._network = bytes.fromhex(options.network.replace(":", ""))
-        self._addresses = _BROADCAST + bytes.fromhex(options.address.replace(":", "")) + self._network
-
-    def wrap(self, packet: bytes, number: int) -> bytes:
-        """The frame of a packet, FCS included.
-
-        :param number: sequence number; its lowest 12 bits are sent
-        """
-        body = _DATA + self._addresses + (number % 4096 << 4).to_bytes(2, "little") + _SNAP + packet
-        return body + zlib.crc32(body).to_bytes(_FCS_LEN, "little")
-
-    def unwrap(self, frame: bytes) -> bytes | None:
-        """The packet of a frame without FCS; None if it is not a frame of this network."""
-        ours = _DATA[:2], _BROADCAST, self._network, _SNAP
-        return frame[_HEADER_LEN:] if (frame[:2], frame[4:10], frame[16:22], frame[24:_HEADER_LEN]) == ours else None
-
-
-def training() -> list[list[complex]]:
-    """The four symbols of the preamble, by carrier from -32 on."""
-    short, long = np.zeros(_FFT, np.complex128), np.zeros(_FFT, np.complex128)
-    short[8:57:4] = _SHORT
-    long[6:59] = [{"+": 1, "-": -1, "0": 0}[sign] for sign in _LONG]
-    # The first symbol of long training has a cyclic prefix of 32 samples, and so begins 16 samples early.
-    early = long * (-1j) ** (np.arange(_FFT) % 4)
-    return [symbol.tolist() for symbol in (short, short, early, long)]
-
-
-@lru_cache
-def scrambler() -> Bits:
-    """One period of x^7 + x^4 + 1, all ones at the start (section 17.3.5.5): 127 bits."""
-    state, bits = 0x7F, np.empty(127, np.uint8)
-    for place in range(len(bits)):
-        bits[place] = (state >> 6 ^ state >> 3) & 1
-        state = state << 1 & 0x7F | int(bits[place])
-    return bits
-
-
-@lru_cache
-def interleaving(carrier_bits: int) -> NDArray[np.int64]:
-    """For each coded bit of a symbol, its place among the bits of the carriers (section 17.3.5.7)."""
-    count = carrier_bits * _CARRIERS
-    k = np.arange(count)
-    i = count // 16 * (k % 16) + k // 16
-    s = max(carrier_bits // 2, 1)
-    return s * (i // s) + (i + count - 16 * i // count) % s
-
-
-def decoded(encoding: Encoding, length: int, symbols: NDArray[np.uint8]) -> bytes | None:
-    """The frame of these symbols without its FCS; None if the FCS is wrong.
-
-    :param length: bytes of the frame, FCS included
-    :param symbols: array (symbols, 48): the point of each carrier, its first bit in the lowest
-    """
-    bits = (symbols[:, :, None] >> np.arange(encoding.carrier_bits, dtype=np.uint8) & 1).reshape(len(symbols), -1)
-    coded = bits[:, interleaving(encoding.carrier_bits)].reshape(-1)
-    data = _SERVICE_BITS + 8 * length
-    sent = np.resize(np.array(_KEPT[encoding.rate], bool), 2 * (data + _TAIL_BITS))
-    soft = np.zeros(len(sent), np.float32)
-    soft[sent] = _DECIDED * (2.0 * coded[: np.count_nonzero(sent)] - 1)
-    # GNU Radio's code has the two polynomials in the other order.
-    scrambled = _decoder(data).decode(soft.reshape(-1, 2)[:, ::-1].reshape(-1))
-    # The first seven bits are those of the scrambler.
-    whole = np.resize(scrambler(), 127 + 7)
-    starts = np.flatnonzero((np.lib.stride_tricks.sliding_window_view(whole, 7)[:127] == scrambled[:7]).all(axis=1))
-    if not len(starts):
-        return None
-    clear = scrambled ^ np.resize(np.roll(scrambler(), -int(starts[0])), data)
-    frame = np.packbits(clear[_SERVICE_BITS:], bitorder="little").tobytes()
-    return frame[:-_FCS_LEN] if zlib.crc32(frame) == _RESIDUE else None
-
-
-_decoder = lru_cache(maxsize=_DECODERS)(Convolutional)
 
 
 @contextmanager
@@ -340,9 +199,9 @@ class WifiTransmitter(TransmitterBlock):
         join = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY, 1)
         data = [*range(-26, -21), *range(-20, -7), *range(-6, 0), *range(1, 7), *range(8, 21), *range(22, 27)]
         pilots = [(sign, sign, sign, -sign) for sign in (1 - 2 * int(bit) for bit in scrambler())]
-        carriers = digital.ofdm_carrier_allocator_cvc(_FFT, [data], [_PILOTS], pilots, training(), _TX_KEY, True)
-        inverse = fft.fft_vcc(_FFT, False, [_USED**-0.5] * _FFT, True, 1)
-        prefix = digital.ofdm_cyclic_prefixer(_FFT, _SYMBOL, _ROLLOFF, _TX_KEY)
+        carriers = digital.ofdm_carrier_allocator_cvc(FFT_LEN, [data], [_PILOTS], pilots, training(), _TX_KEY, True)
+        inverse = fft.fft_vcc(FFT_LEN, False, [USED_CARRIERS**-0.5] * FFT_LEN, True, 1)
+        prefix = digital.ofdm_cyclic_prefixer(FFT_LEN, (FFT_LEN + CP_LEN), ROLLOFF, _TX_KEY)
         zeros = blocks.vector_source_c([0j] * phy.gap, True, 1, [_length_tag(phy.gap)])
         spaced = blocks.tagged_stream_mux(gr.sizeof_gr_complex, _TX_KEY)
         self.msg_connect((self, "pdus"), (self._framer, "pdus"))
@@ -353,7 +212,7 @@ class WifiTransmitter(TransmitterBlock):
         self.connect(zeros, (spaced, 1))
         self.connect(spaced, self._bursts)
         self.leave_by(self._bursts)
-        symbols = _PREAMBLE + 1 + phy.encoding.symbols(phy.packet_len)
+        symbols = PREAMBLE + 1 + phy.encoding.symbols(phy.packet_len)
         for block in (mapper, points, header, header_points, join, carriers, inverse, prefix, zeros, spaced):
             _fit_buffer(block, symbols, phy.airtime_samples())
 
@@ -376,7 +235,7 @@ def _fit_buffer(block: Any, symbols: int, samples: int) -> None:
     """Give a block buffer space for two frames where GNU Radio's default is too small: the blocks here take a frame at
     a time, and one that cannot get it stalls the flowgraph."""
     size = block.output_signature().sizeof_stream_item(0)
-    items = symbols if size >= _FFT else samples
+    items = symbols if size >= FFT_LEN else samples
     if 2 * items * size > _SMALLEST_BUFFER:
         block.set_min_output_buffer(0, 2 * items)
 
@@ -386,7 +245,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
 
     def __init__(self, phy: WifiPhy) -> None:
         super().__init__(phy.lengths, "gr_ros2_wifi_framer", None, None)
-        self._frames = DataFrames(phy.options)
+        self._frames = DataFrames(phy.options.network, phy.options.address)
         self._number = 0
         self.message_port_register_out(PDUS)
 
@@ -430,12 +289,12 @@ class WifiReceiver(ReceiverBlock):
         super().__init__("gr_ros2_wifi_rx")
         wifi, options = phy.module, phy.options
         window, length = 48, 320
-        late = blocks.delay(gr.sizeof_gr_complex, _CP)
+        late = blocks.delay(gr.sizeof_gr_complex, CP_LEN)
         product, turned = blocks.multiply_cc(), blocks.conjugate_cc()
         # Filters, not moving averages: rounding leaves something of a burst in these, which looks like a preamble in
         # the zeros behind it.
         correlation = filter.fir_filter_ccf(1, [1.0] * window)
-        power = filter.fir_filter_fff(1, [1.0] * (window + _CP))
+        power = filter.fir_filter_fff(1, [1.0] * (window + CP_LEN))
         ratio = blocks.divide_ff()
         short = wifi.sync_short(options.detection_threshold, 2, False, False)
         long = wifi.sync_long(length, False, False)
@@ -454,8 +313,8 @@ class WifiReceiver(ReceiverBlock):
         self.connect(short, blocks.delay(gr.sizeof_gr_complex, length), (long, 1))
         self.connect(
             long,
-            blocks.stream_to_vector(gr.sizeof_gr_complex, _FFT),
-            fft.fft_vcc(_FFT, True, [], True, 1),
+            blocks.stream_to_vector(gr.sizeof_gr_complex, FFT_LEN),
+            fft.fft_vcc(FFT_LEN, True, [], True, 1),
             self._equalizer,
             self._decoder,
         )
@@ -487,8 +346,9 @@ class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Symbols of frames in, whose first has tags; message port `pdus` out: the packets of this link."""
 
     def __init__(self, phy: WifiPhy) -> None:
-        super().__init__("gr_ros2_wifi_decoder", [(np.uint8, _CARRIERS)], None)
-        self._frames, self._lengths = DataFrames(phy.options), phy.lengths
+        super().__init__("gr_ros2_wifi_decoder", [(np.uint8, CARRIERS)], None)
+        self._frames, self._lengths = DataFrames(phy.options.network, phy.options.address), phy.lengths
+        self._frame_decoder = FrameDecoder()
         self._measures = phy.options.equalizer != "comb"
         self._encoding, self._length, self._snr_db = phy.encoding, 0, 0.0
         self._symbols: list[NDArray[np.uint8]] = []
@@ -529,7 +389,7 @@ class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._length = pmt.to_uint64(head["frame bytes"])
         self._encoding = tuple(ENCODINGS.values())[pmt.to_uint64(head["encoding"])]
         self._snr_db = band_snr_db(pmt.to_double(head["snr"]))
-        self._missing = self._encoding.symbols(self._length - _HEADER_LEN - _FCS_LEN)
+        self._missing = self._encoding.symbols(self._length - HEADER_LEN - FCS_LEN)
         self._symbols = []
 
     def _take(self, symbols: NDArray[np.uint8]) -> list[bytes]:
@@ -541,7 +401,7 @@ class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._missing -= len(new)
         if self._missing:
             return []
-        frame = decoded(self._encoding, self._length, np.concatenate(self._symbols))
+        frame = self._frame_decoder.decode(self._encoding, self._length, np.concatenate(self._symbols))
         packet = None if frame is None else self._frames.unwrap(frame)
         if frame is None:
             self.damaged += 1
@@ -560,7 +420,7 @@ def band_snr_db(told_db: float) -> float:
     The module compares sum and difference of the two long training symbols: of signal S and noise N of a used carrier
     it gives S/N + 1/2. The band has noise in all carriers.
     """
-    return 10 * log10(max(10 ** (told_db / 10) - 0.5, 1e-4) * _USED / _FFT)
+    return 10 * log10(max(10 ** (told_db / 10) - 0.5, 1e-4) * USED_CARRIERS / FFT_LEN)
 
 
 class _Points(KeptAlive, gr.basic_block):  # type: ignore[misc]
@@ -568,7 +428,7 @@ class _Points(KeptAlive, gr.basic_block):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__("gr_ros2_wifi_points", None, None)
-        self._kept: deque[NDArray[np.complex64]] = deque(maxlen=SYMBOLS_SHOWN // _CARRIERS)
+        self._kept: deque[NDArray[np.complex64]] = deque(maxlen=SYMBOLS_SHOWN // CARRIERS)
         self.message_port_register_in(pmt.intern("symbols"))
         self.set_msg_handler(pmt.intern("symbols"), self._take)
 

@@ -25,18 +25,8 @@ from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import SampleRecording, deliver, modulated, record
 from gr_ros2.phy.theory import half_point
 from gr_ros2.phy.threads import run_flowgraph
-from gr_ros2.phy.wifi import (
-    ENCODINGS,
-    MAX_PACKET,
-    DataFrames,
-    Encoding,
-    WifiOptions,
-    WifiPhy,
-    band_snr_db,
-    decoded,
-    scrambler,
-    training,
-)
+from gr_ros2.phy.wifi import WifiOptions, WifiPhy, band_snr_db
+from gr_ros2.phy.wifi_frames import ENCODINGS, MAX_PACKET, DataFrames, Encoding, FrameDecoder, scrambler, training
 from gr_ros2.registry import Registry
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
@@ -50,6 +40,7 @@ except ImportError:
 with_the_module = pytest.mark.skipif(ieee802_11 is None, reason="gr-ieee802-11 is not installed")
 RATE = 10e6
 """samples/s of IEEE 802.11p."""
+NETWORK, ADDRESS = WifiOptions().network, WifiOptions().address
 
 
 def make(packet_len: int = 64, **options: Any) -> WifiPhy:
@@ -98,7 +89,7 @@ def test_a_setting_out_of_range_is_named(packet_len: int, options: dict[str, Any
 
 @given(packet=st.binary(max_size=200), number=st.integers(0, 2**20))
 def test_a_frame_is_a_broadcast_data_frame_of_its_network(packet: bytes, number: int) -> None:
-    frames = DataFrames(WifiOptions(network="02:00:00:00:00:0A", address="02:00:00:00:00:0b"))
+    frames = DataFrames("02:00:00:00:00:0A", "02:00:00:00:00:0b")
     frame = frames.wrap(packet, number)
     # Type data, no flags, no duration; to all, from us, in our network; sequence number, fragment 0.
     assert frame[:4] == bytes((8, 0, 0, 0))
@@ -108,13 +99,13 @@ def test_a_frame_is_a_broadcast_data_frame_of_its_network(packet: bytes, number:
     assert len(frame) == len(packet) + 36
     assert zlib.crc32(frame) == 0x2144DF1C, "the residue of a CRC-32 behind its data"
     assert frames.unwrap(frame[:-4]) == packet
-    assert DataFrames(WifiOptions()).unwrap(frame[:-4]) is None
+    assert DataFrames(NETWORK, ADDRESS).unwrap(frame[:-4]) is None
 
 
 @given(st.binary(max_size=64))
 def test_any_other_frame_is_none_of_ours(frame: bytes) -> None:
-    assert DataFrames(WifiOptions()).unwrap(frame) is None
-    assert DataFrames(WifiOptions()).unwrap(b"\x08\x00\x00\x00" + frame) is None
+    assert DataFrames(NETWORK, ADDRESS).unwrap(frame) is None
+    assert DataFrames(NETWORK, ADDRESS).unwrap(b"\x08\x00\x00\x00" + frame) is None
 
 
 def test_airtimes_are_those_of_the_standard() -> None:
@@ -192,16 +183,16 @@ def encoded(encoding: Encoding, frame: bytes, start: int) -> Any:
 
 @pytest.mark.parametrize("encoding", ENCODINGS.values(), ids=list(ENCODINGS))
 def test_a_frame_is_decoded_as_the_standard_encodes_it(encoding: Encoding) -> None:
-    draw, frames = random.Random(1), DataFrames(WifiOptions())
+    draw, frames = random.Random(1), DataFrames(NETWORK, ADDRESS)
     for packet_len, start in ((0, 1), (13, 93), (14, 127), (64, 64), (200, 5)):
         frame = frames.wrap(draw.randbytes(packet_len), 7)
         symbols = encoded(encoding, frame, start)
         assert len(symbols) == encoding.symbols(packet_len)
-        assert decoded(encoding, len(frame), symbols) == frame[:-4]
+        assert FrameDecoder().decode(encoding, len(frame), symbols) == frame[:-4]
         symbols[len(symbols) // 2, 20] ^= 1
-        assert decoded(encoding, len(frame), symbols) == frame[:-4], "the code corrects a bit"
+        assert FrameDecoder().decode(encoding, len(frame), symbols) == frame[:-4], "the code corrects a bit"
         symbols[:, ::2] ^= 1
-        assert decoded(encoding, len(frame), symbols) is None
+        assert FrameDecoder().decode(encoding, len(frame), symbols) is None
 
 
 @given(data=st.data(), name=st.sampled_from(sorted(ENCODINGS)), length=st.integers(0, 120))
@@ -209,7 +200,7 @@ def test_symbols_of_anything_else_are_no_frame(data: st.DataObject, name: str, l
     encoding = ENCODINGS[name]
     count = 48 * encoding.symbols(length - 36)
     symbols = np.frombuffer(data.draw(st.binary(min_size=count, max_size=count)), np.uint8).reshape(-1, 48)
-    assert decoded(encoding, length, symbols) is None
+    assert FrameDecoder().decode(encoding, length, symbols) is None
 
 
 @with_the_module
