@@ -42,7 +42,7 @@ from gr_ros2.middleware.base import (
     TopicInfo,
     finite,
 )
-from gr_ros2.middleware.rcl import told, translated
+from gr_ros2.middleware.rcl import ros_localhost_only, translated
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
@@ -158,7 +158,7 @@ class RclpyMiddleware(RclpyParticipant):
         try:
             # Context.init does not touch signal handlers, unlike rclpy.init; without args=[] it would parse the command
             # line.
-            with told(localhost_only):
+            with ros_localhost_only(localhost_only):
                 self._context.init(args=[], domain_id=domain_id)
             self._node = Node(
                 node_name,
