@@ -159,7 +159,8 @@ class Outbox:
         self._starting_until = inf
         self.reported = False
         """Whether receivers report, so that it is known when a message is over."""
-        self._with_deadline: list[TopicQueue] = []
+        self.deadlines: list[TopicQueue] = []
+        """The queues whose messages may be too late."""
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
@@ -184,6 +185,10 @@ class Outbox:
         before = self.digest
         self._tabulate()
         return self.digest != before
+
+    def sends(self, topic_id: int) -> bool:
+        """Whether this is a topic that it may send."""
+        return topic_id in self._lines and topic_id != TABLE_TOPIC
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
         """Take a message. It may be refused, or cause other messages of its topic to be dropped.
@@ -273,7 +278,7 @@ class Outbox:
 
     def expire(self, now: float, interval: float) -> None:
         """Drop messages that would arrive too late."""
-        for queue in self._with_deadline:
+        for queue in self.deadlines:
             if queue:
                 self._drop(list(queue.expire(now, interval, LEAD_S, self._room - _ENTRY)))
 
@@ -285,6 +290,8 @@ class Outbox:
         :return: None if nothing may be sent
         """
         heap = self._heap(now)
+        if not heap:
+            return None
         picks: list[tuple[Message, int]] = []
         used = 0
         while heap and used < room:
@@ -364,7 +371,7 @@ class Outbox:
         return (line for topic_id, line in self._lines.items() if topic_id != TABLE_TOPIC)
 
     def _find_deadlines(self) -> None:
-        self._with_deadline = [line.queue for line in self._lines.values() if line.queue.deadline_s]
+        self.deadlines = [line.queue for line in self._lines.values() if line.queue.deadline_s]
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
@@ -387,8 +394,10 @@ class Outbox:
         for topic_id, line in self._lines.items():
             if line.queue and (ready := line.queue.open(now)):
                 self._open[topic_id] = ready
-        holder = self._holder = self._turns.holder(self._open) if self._open else -1
-        heap = []
+        heap: list[tuple[int, float, int, int]] = []
+        if not self._open:
+            return heap
+        holder = self._holder = self._turns.holder(self._open)
         for topic_id, ready in self._open.items():
             head, before = ready[0], self._lines[topic_id].newest
             worth = value(head, before if before > -inf else head.submitted - FIRST_AGE_S, _ENTRY)
@@ -408,7 +417,8 @@ class Outbox:
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
         parts: list[Part] = []
         sent: list[SentEntry] = []
-        qos = picks[0][0].qos
+        lives: list[Life] = []
+        stats, qos = self.stats, picks[0][0].qos
         for place, (message, taken) in enumerate(picks):
             topic_id, offset = message.topic_id, message.offset
             line = self._lines[topic_id]
@@ -417,21 +427,21 @@ class Outbox:
                 message.life.expires = message.expires
                 line.queue.started(now)
             payload = message.take(taken)
-            last = not message.remaining
-            begin = message.begin
+            last, begin = message.offset == len(message.payload), message.begin
             parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
             key = Key(self._boot, begin, message.place)
             total = message.index if last else 0
             sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
+            lives.append(message.life)
             if RANK[message.qos] < RANK[qos]:
                 qos = message.qos
-            self.stats.payload_bytes += taken
+            stats.payload_bytes += taken
             if last:
                 line.queue.popleft()
                 self._left(message, line, now)
         self._turns.sent(self._holder)
-        self.stats.entries += len(picks)
-        return Filling(parts, sent, tuple([message.life for message, _ in picks]), qos, used)
+        stats.entries += len(picks)
+        return Filling(parts, sent, tuple(lives), qos, used)
 
     def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""

@@ -373,7 +373,7 @@ class RepairWindow:
 
     def _lost(self, now: float) -> Sent | None:
         """The newest live packet that the only receiver lacks and that has not been sent again since."""
-        if len(self._receivers) != 1:
+        if not self._resend or len(self._receivers) != 1:
             return None
         (peer,) = self._receivers.values()
         while self._resend:
@@ -392,11 +392,19 @@ class RepairWindow:
         """The packets to combine, newest first."""
         found: list[Sent] = []
         everybody = self._everybody
+        before = -1
         for record in reversed(self._records.values()):
-            if (everybody and record.confirmed & everybody == everybody) or not record.alive(now):
-                continue
-            if found and found[0].number - record.number >= MAX_WINDOW:
+            if record.number <= before:
                 break
+            if everybody and record.confirmed & everybody == everybody:
+                continue
+            for life in record.lives:  # ``alive``, whose call would take half of this loop's time
+                if now < life.expires:
+                    break
+            else:
+                continue
+            if not found:
+                before = record.number - MAX_WINDOW
             found.append(record)
             if len(found) == GROUP:
                 break
