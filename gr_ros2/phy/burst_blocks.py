@@ -20,11 +20,11 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive
@@ -146,16 +146,20 @@ class TakesPackets(KeptAlive):
         PduPort.readable_by(self)
 
     @abstractmethod
-    def take_packet(self, packet: bytes) -> None:
-        """Process a packet."""
+    def take_packet(self, packet: bytes, rung: int) -> None:
+        """Process a packet.
+
+        :param rung: the rung that the PDU says, 0 where it says none
+        """
 
     def _take(self, message: Any) -> None:
         packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
         if problem:
             self._refuse()
+        rung = rung_of(message)
         for packet in packets:
             if len(packet) in self._lengths:
-                self.take_packet(packet)
+                self.take_packet(packet, rung)
             else:
                 self._refuse()
 
@@ -179,22 +183,24 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
-        self._modem = phy.running_modem
+        self._rungs = phy.running_modem.rungs
         self._gap = phy.gap
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[tuple[BurstModem, bytes]] = deque()
         self._rest = self._whole[:0]
         self.sent = 0
         """Packets that have left as samples."""
 
-    def take_packet(self, packet: bytes) -> None:
-        self._waiting.append(packet)
+    def take_packet(self, packet: bytes, rung: int) -> None:
+        # A rung that this end does not have is one of settings that differ: the most robust one is sent.
+        self._waiting.append((self._rungs[rung if 0 <= rung < len(self._rungs) else 0], packet))
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
         out, done = output_items[0], 0
         while done < len(out) and (len(self._rest) or self._waiting):
             if not len(self._rest):
-                burst = self._modem.modulate(self._waiting.popleft())
+                modem, packet = self._waiting.popleft()
+                burst = modem.modulate(packet)
                 self._rest = self._whole[: len(burst) + self._gap]
                 self._rest[: len(burst)] = burst
                 self._rest[len(burst) :] = 0
@@ -264,8 +270,8 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._port.find_readers()
-        send = self._port.send
-        self._engine = ReceiverProcess(self._modem, send) if self._own_process else BurstReceiver(self._modem)
+        modem = self._modem
+        self._engine = ReceiverProcess(modem, self._send) if self._own_process else BurstReceiver(modem)
         return super().start()
 
     def stop(self) -> bool:
@@ -273,10 +279,17 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        self._port.send(self._packets(input_items[0]))
+        self._send(self._packets(input_items[0]))
         return len(input_items[0])
 
-    def _packets(self, samples: Samples) -> list[bytes]:
+    def _send(self, packets: list[Heard]) -> None:
+        if len(self._modem.rungs) == 1:
+            self._port.send([packet.data for packet in packets])
+        else:
+            for packet in packets:
+                self._port.send_pdu(pdu_heard(packet.data, packet.rung, packet.snr_db))
+
+    def _packets(self, samples: Samples) -> list[Heard]:
         assert self._engine is not None
         try:
             return self._engine.feed(samples)

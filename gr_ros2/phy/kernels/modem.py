@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,10 +32,10 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "ofdm": (
         0,
         _fields(
-            int32="shortest longest size prefix repeat degrees chunk carrier_count data_count pilot_count once_count "
-            "twice_count shift_count point_count point_bits",
+            int32="shortest longest rung_count counted size prefix repeat degrees chunk carrier_count data_count "
+            "pilot_count once_count twice_count shift_count",
             float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
-            int32s="frame_bits carriers data pilots once twice shifts",
+            int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
             complex64s="words known turns whole smooth smooth_words crosswise points",
             float32s="word_weight",
             uint8s="marks headers header_mask",
@@ -76,7 +76,12 @@ class _Report(ctypes.Structure):
         ("length", ctypes.c_int64),
         ("soft", ctypes.c_int64),
         ("points", ctypes.c_int64),
+        ("rung", ctypes.c_int64),
     )
+
+
+_NO_BURST, _READ, _CUT = range(3)
+"""``Result`` of ``modem.h``."""
 
 
 class CompiledModem(BurstModem):
@@ -96,9 +101,15 @@ class CompiledModem(BurstModem):
         self._kernel = _new(self._functions, constants)
         weakref.finalize(self, self._functions.modem_free, self._kernel)
         self._soft, self._points = constants.soft_bits, constants.points
+        given = reference.rungs
+        self._rungs = tuple(CompiledModem(modem) for modem in given) if len(given) > 1 else ()
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
+
+    @property
+    def rungs(self) -> Sequence[BurstModem]:
+        return self._rungs or (self,)
 
     def samples_of(self, packet_len: int) -> int:
         return self._reference.samples_of(packet_len)
@@ -118,7 +129,7 @@ class CompiledModem(BurstModem):
     def modulate(self, packet: bytes) -> Samples:
         bits = self.frames.of(len(packet)).wrap(packet)
         out = np.empty(self.samples_of(len(packet)), np.complex64)
-        if _done(self._functions.modem_modulate(self._kernel, _address(bits), len(packet), _address(out))):
+        if _checked(self._functions.modem_modulate(self._kernel, _address(bits), len(packet), _address(out))):
             return out
         return self._reference.modulate(packet)
 
@@ -128,18 +139,18 @@ class CompiledModem(BurstModem):
         found = self._functions.modem_find(self._kernel, _address(samples), len(samples), ctypes.addressof(start))
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
-    def end(self, samples: Samples, start: int) -> int:
-        samples = np.ascontiguousarray(samples, np.complex64)
-        return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
-
     def read(self, samples: Samples, start: int) -> Reading | None:
         samples = np.ascontiguousarray(samples, np.complex64)
         soft, points = np.empty(self._soft, np.float32), np.empty(self._points, np.complex64)
         report = _Report()
         given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(report))
-        if not _done(self._functions.modem_read(self._kernel, *given)):
+        result = _checked(self._functions.modem_read(self._kernel, *given))
+        if result == _NO_BURST:
             return None
-        return Reading(report.length, soft[: report.soft], points[: report.points], report.snr, report.end)
+        if result == _CUT:
+            return Reading(report.length, None, points[:0], report.snr, report.end, report.rung)
+        read = (soft[: report.soft], points[: report.points])
+        return Reading(report.length, *read, report.snr, report.end, report.rung)
 
 
 def _new(functions: Any, constants: ModemConstants) -> int:
@@ -173,7 +184,7 @@ def _counted(result: int) -> int:
     return result
 
 
-def _done(result: int) -> bool:
+def _checked(result: int) -> int:
     if result < 0:
         raise MemoryError("no memory for a compiled kernel to work in")
-    return bool(result)
+    return result
