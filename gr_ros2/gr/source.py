@@ -31,6 +31,7 @@ from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PduPort
@@ -62,6 +63,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param seed: seed of sequence number and entry ids; None: random
     :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
         packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
+    :param ladder: the rungs of an adaptive rate (:attr:`gr_ros2.phy.Phy.ladder`). Each packet then is a PDU whose
+        metadata names its ``rung``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -76,6 +79,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
         any_length: bool = False,
+        ladder: Sequence[Rung] = (),
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -86,7 +90,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False, any_length=any_length)
+            start = start_of(self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -160,6 +164,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         unseen = [name for name in self.choice.named if name not in subscribed]
         waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
         return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
+
+    def rate(self) -> dict[str, str]:
+        """With an adaptive rate, the name of the rung of the newest packet as ``rung``; otherwise nothing."""
+        ladder = self._end.ladder
+        return {"rung": ladder[self._end.rung].name} if ladder else {}
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
@@ -415,12 +424,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-        if self._port.bundles:
+        if self._port.bundles and not self._end.ladder:
             self._port.send([sent.data for sent in packets])
         else:
             wall = time.time()
             for sent in packets:
-                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall))
+                rung = sent.rung if self._end.ladder else None
+                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall, rung))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:

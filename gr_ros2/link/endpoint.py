@@ -8,13 +8,14 @@ immediately; the receiving half returns its events, so that the caller can act o
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.rate import Rung
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
@@ -131,6 +132,10 @@ class Endpoint(Protocol):
         """The next packet that may go at ``now``, or None."""
 
     @property
+    def ladder(self) -> Sequence[Rung]:
+        """The rungs of an adaptive rate, the most robust one first; () for a fixed rate."""
+
+    @property
     def rung(self) -> int:
         """With an adaptive rate, the rung of the last packet from ``next_packet`` (:mod:`gr_ros2.link.rate`);
         otherwise 0."""
@@ -163,6 +168,7 @@ class EndpointV0:
     """
 
     answers = False
+    ladder: Sequence[Rung] = ()
 
     def __init__(
         self,

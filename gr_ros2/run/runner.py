@@ -193,7 +193,7 @@ class _Run:
             first = second = None
             if scenario.version:
                 any_length = all(phy.any_length for phy in phys)
-                first, second = live_ends(ways, self.registry, any_length=any_length)
+                first, second = live_ends(ways, self.registry, any_length=any_length, ladder=self.phy.ladder)
             self.directions = [
                 Direction(way, self.registry, phy, ends, **common)
                 for way, phy, ends in zip(ways, phys, ((first, second), (second, first)), strict=False)

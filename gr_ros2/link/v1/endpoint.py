@@ -114,6 +114,7 @@ class Endpoint:
     ) -> None:
         self.settings = settings
         self.rung = 0
+        self.ladder = tuple(ladder)
         self._rate = RateController(ladder) if ladder else None
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
