@@ -21,6 +21,7 @@ from tests.waiting import wait_for
 NEAR, FAR = "/rx_robot_2/add", "/robot_2/add"
 GOAL = bytes(range(16))
 SET = "rcl_interfaces/srv/SetParameters"
+DESCRIBE = "type_description_interfaces/srv/GetTypeDescription"
 STRING = "std_msgs/msg/String"
 
 
@@ -49,8 +50,8 @@ def test_auto_offers_services_and_actions_of_the_namespace(
         near, far = robots.graphs
         for name in ("/elsewhere/add", "/robot_2/left_out", "/robot_2/_hidden"):
             Adder(far, name)
-        for name in ("set_parameters", "get_type_description"):
-            far.serve(f"/robot_2/planner/{name}", SET, lambda *_: None)
+        for name, kind in (("set_parameters", SET), ("get_type_description", DESCRIBE)):
+            far.serve(f"/robot_2/planner/{name}", kind, lambda *_: None)
         FibonacciServer(far, "/robot_2/left_out_action")
         FibonacciServer(far, "/robot_2/count")
         client, caller = FibonacciClient(near, "/rx_robot_2/count"), Caller(near, NEAR)
@@ -116,11 +117,12 @@ def test_services_can_be_left_to_the_robot(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 def test_what_finds_no_room_is_left_out_as_a_whole(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    robots = Robots(tmp_path, "", topics=["auto", "-topic_*"])
+    robots = Robots(tmp_path, "", topics=["auto"])
     with robots.stack:
         source = robots.links[2].source
         for number in range(235):  # with the row of calls, four numbers are left
-            source._end.add([(f"topic_{number}", STRING, source.registry[0].options)])
+            robots.graphs[1].advertise(f"/robot_2/topic_{number}", STRING, Qos())
+        wait_for(lambda: len(source.subscribed) == 235, "the topics to be found")
         FibonacciServer(robots.graphs[1], "/robot_2/count")
         wait_for(lambda: "/robot_2/count (example_interfaces/action/Fibonacci) is not offered" in caplog.text, "a word")
         Adder(robots.graphs[1], FAR)

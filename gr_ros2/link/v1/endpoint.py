@@ -17,7 +17,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy, TopicOptions
+from gr_ros2.config import QueuePolicy
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.events import (
     AirKind,
@@ -46,7 +46,7 @@ from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import NewRow, Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -188,19 +188,17 @@ class Endpoint:
             self.outbox.ask(TABLE_TOPIC, self._now)
             self._talk.hurry(self._now)
 
-    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:
-        """Send one more topic. The robots that hear this one learn of it from the next hello.
-
-        :return: everything that is sent; the new topic is the last one
-        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option
-        """
+    def add(self, rows: Sequence[NewRow]) -> Registry:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one learn of them from the next
+        hello."""
         before = self.topics or ()
-        topic = Topic(len(before), name, type_name, options)
-        together = Registry([*before, topic])
+        topics = [Topic(number, *row) for number, row in enumerate(rows, len(before))]
+        together = Registry([*before, *topics])
         if self._codec is not None:
-            self._codec.add(topic)
+            for topic in topics:
+                self._codec.add(topic)
         self.topics = together
-        self.outbox.add([topic])
+        self.outbox.add(topics)
         self._talk.hurry(self._now)
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
