@@ -11,7 +11,7 @@ import numpy as np
 
 from fuzz.loop import main
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstReceiver, Samples
+from gr_ros2.phy.burst import Samples
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("ofdm", {}),
@@ -58,7 +58,7 @@ def kernels(data: bytes) -> None:
             begin = int((place * 1.2 - 0.1) * len(samples))
             if modem is not phy.modem:  # numpy checks every index by itself, and raises past the samples
                 anywhere(modem, samples[: 1 + value * len(samples) // 255], begin)
-        engine = BurstReceiver(modem)
+        engine = modem.receiver()
         cut = 1 + data[-1] * 37
         for at in range(0, len(samples), cut):
             assert sent.issuperset(engine.feed(np.ascontiguousarray(samples[at : at + cut])))

@@ -203,7 +203,6 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"{lost} messages lost on the ROS graph before they were sent")
     if sink["publish_failed"]:
         parts.append(f"{sink['publish_failed']} messages not published")
-    troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
-    quiet = ("name", "bursts_in", "bursts_out", "frames_in", "frames_out", "foreign")
-    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
+    troubles = {**stats["front_end"]["lost"], "refused": packets["refused"], "damaged": packets["damaged"]}
+    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if count]
     return "; ".join(parts)

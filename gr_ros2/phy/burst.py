@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from math import isfinite, log10
@@ -98,8 +98,8 @@ class Frames:
     ) -> None:
         self._again = partial(Frames, packet_len, fec, fixed=fixed, order=order, multiple=multiple, mask=mask)
         self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
-        self._order, self._multiple = order, multiple
-        self._mask = whitening(self.length(packet_len)) if mask is None else mask
+        self.order, self.multiple = order, multiple
+        self.mask = whitening(self.length(packet_len)) if mask is None else mask
         self._codes = Codes(fec)
         self.of = lru_cache(maxsize=_KEPT)(self._make)
         """The frame by the bytes of its packet."""
@@ -119,7 +119,7 @@ class Frames:
 
     def fill(self, packet_len: int) -> int:
         """Zero bytes after a packet of ``packet_len`` bytes."""
-        return -(packet_len + CRC_LEN) % self._multiple
+        return -(packet_len + CRC_LEN) % self.multiple
 
     def data_bits(self, packet_len: int) -> int:
         """Bits of the frame of a packet of ``packet_len`` bytes, before coding."""
@@ -130,9 +130,9 @@ class Frames:
         return self._codes.coded_bits(self.data_bits(packet_len))
 
     def _make(self, packet_len: int) -> Frame:
-        mask = self._mask[: self.length(packet_len)]
+        mask = self.mask[: self.length(packet_len)]
         code = self._codes.of(self.data_bits(packet_len))
-        return Frame(packet_len, self.fill(packet_len), mask, code, self._order)
+        return Frame(packet_len, self.fill(packet_len), mask, code, self.order)
 
 
 @lru_cache
@@ -233,6 +233,11 @@ class BurstModem(ABC):
     def modulate(self, packet: bytes) -> Samples:
         """One burst."""
 
+    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
+        """The bursts of these packets, each followed by ``gap`` zero samples."""
+        silence = np.zeros(gap, np.complex64)
+        return np.concatenate([part for packet in packets for part in (self.modulate(packet), silence)])
+
     @abstractmethod
     def find(self, samples: Samples) -> Search:
         """Look for the first burst."""
@@ -244,6 +249,10 @@ class BurstModem(ABC):
     @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
         """The burst whose reference sample is at ``start``; None if the close examination finds no burst."""
+
+    def receiver(self) -> BurstReceiver:
+        """A receiver for these bursts."""
+        return BurstReceiver(self)
 
     def constants(self) -> ModemConstants | None:
         """The parameters of the compiled kernel of this modem; None where there is no kernel."""
@@ -322,7 +331,11 @@ class BurstReceiver:
         # A head with values that are not finite gives no length, and such a burst is not read.
         return self._modem.end(self._buffer[: self._end], self._start) if self._finite(head) else head
 
+    def _remember(self, snrs: list[float]) -> None:
+        self._snrs = (*self._snrs, *snrs)[-_LOOKED_BACK:]
+
     def _take(self) -> list[bytes]:
+        """The packets that are complete now."""
         packets: list[bytes] = []
         while True:
             if self._start is None:
@@ -348,6 +361,6 @@ class BurstReceiver:
             else:
                 packets.append(packet)
                 self.points = reading.points
-                self._snrs = (*self._snrs[1 - _LOOKED_BACK :], reading.snr)
+                self._remember([reading.snr])
                 self._cursor = self._last - self._modem.margin
             self._start = self._last = None

@@ -27,7 +27,7 @@ from gr_ros2.phy.kernels import fastest, which
 from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
-from gr_ros2.phy.threads import KeptAlive
+from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.setting import AUTO, Auto
 
 STOCK = "GNU Radio's blocks"
@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 
 
 _LENGTH = pmt.intern(LENGTH_TAG)
+_BUFFER = 1 << 15
+"""Samples that may wait behind the modulator: several packets, so that the receiver gets several at a time."""
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -146,22 +148,19 @@ class TakesPackets(KeptAlive):
         PduPort.readable_by(self)
 
     @abstractmethod
-    def take_packet(self, packet: bytes) -> None:
-        """Process a packet."""
+    def take_packets(self, packets: list[bytes]) -> None:
+        """Process packets that came together."""
 
     def _take(self, message: Any) -> None:
         packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
-        if problem:
-            self._refuse()
-        for packet in packets:
-            if len(packet) in self._lengths:
-                self.take_packet(packet)
-            else:
-                self._refuse()
+        good = [packet for packet in packets if len(packet) in self._lengths]
+        self._refuse(len(packets) - len(good) + bool(problem))
+        self.take_packets(good)
 
-    def _refuse(self) -> None:
-        self.refused += 1
-        if self.refused == 1:
+    def _refuse(self, count: int) -> None:
+        first = bool(count and not self.refused)
+        self.refused += count
+        if first:
             block: Any = self
             least, most = self._lengths[0], self._lengths[-1]
             needed = f"{most}" if least == most else f"{least} to {most}"
@@ -181,23 +180,27 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self._tagged = phy.any_length
         self._modem = phy.running_modem
         self._gap = phy.gap
-        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
         self._waiting: deque[bytes] = deque()
-        self._rest = self._whole[:0]
+        self._bursts: deque[Samples] = deque()
+        """Bursts that are modulated, each with its gap."""
+        self._rest = np.empty(0, np.complex64)
         self.sent = 0
         """Packets that have left as samples."""
+        log_warnings_only([self])
+        self.set_min_output_buffer(_BUFFER)
 
-    def take_packet(self, packet: bytes) -> None:
-        self._waiting.append(packet)
+    def take_packets(self, packets: list[bytes]) -> None:
+        self._waiting.extend(packets)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
         out, done = output_items[0], 0
-        while done < len(out) and (len(self._rest) or self._waiting):
+        while done < len(out):
             if not len(self._rest):
-                burst = self._modem.modulate(self._waiting.popleft())
-                self._rest = self._whole[: len(burst) + self._gap]
-                self._rest[: len(burst)] = burst
-                self._rest[len(burst) :] = 0
+                if not self._bursts:
+                    self._modulate(len(out) - done)
+                if not self._bursts:
+                    break
+                self._rest = self._bursts.popleft()
                 if self._tagged:
                     self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
             count = min(len(out) - done, len(self._rest))
@@ -206,6 +209,18 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
             done += count
             self.sent += not len(self._rest)
         return done
+
+    def _modulate(self, room: int) -> None:
+        """Modulate as many waiting packets as there is room for, at least one."""
+        packets: list[bytes] = []
+        ends: list[int] = []
+        end = 0
+        while self._waiting and end < room:
+            packets.append(self._waiting.popleft())
+            end += self._modem.samples_of(len(packets[-1])) + self._gap
+            ends.append(end)
+        if packets:
+            self._bursts.extend(np.split(self._modem.modulate_all(packets, self._gap), ends[:-1]))
 
 
 class BurstSink(ReceiverBlock):
@@ -265,7 +280,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
     def start(self) -> bool:
         self._port.find_readers()
         send = self._port.send
-        self._engine = ReceiverProcess(self._modem, send) if self._own_process else BurstReceiver(self._modem)
+        self._engine = ReceiverProcess(self._modem, send) if self._own_process else self._modem.receiver()
         return super().start()
 
     def stop(self) -> bool:
@@ -285,7 +300,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
                 self._failed = True
                 _log.exception("%s: starts again after %s", self.name(), error)
             self._end_engine()
-            self._engine = BurstReceiver(self._modem)
+            self._engine = self._modem.receiver()
             return []
 
     def _end_engine(self) -> None:

@@ -168,7 +168,7 @@ class Endpoint:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
+        mending = self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
@@ -362,7 +362,7 @@ class Endpoint:
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
+        if self._mode() != "off" and self.window.unconfirmed(now):
             poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
             doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
@@ -394,11 +394,10 @@ class Endpoint:
         asks = talk.asks(self.neighbours, now)
         if asks:
             return self._control(asks, "hello", now)
-        if self._pace.known:
-            self.window.mode = self._mode()
-            repair = self._repair(now)
-            if repair is not None:
-                return repair
+        self.window.mode = self._mode()
+        repair = self._repair(now)
+        if repair is not None:
+            return repair
         early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
         return self._say(early, now) if early else None
 
@@ -532,8 +531,11 @@ class Endpoint:
         return Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
 
     def _mode(self) -> RepairMode:
-        if self.settings.repair != AUTO:
-            return self.settings.repair
+        mode = self.settings.repair
+        if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
+            return "thrifty" if mode != "off" and self.window.reported else "off"
+        if mode != AUTO:
+            return mode
         return "thrifty" if self.window.reported else "idle"
 
     # ---- what arrives

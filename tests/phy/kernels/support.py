@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
+from gr_ros2.phy.burst import BurstModem, Samples
 from gr_ros2.phy.kernels import library as libraries
 from gr_ros2.phy.kernels import modem as compiled
 
@@ -69,7 +69,7 @@ class Heard:
 
 def hear(modem: BurstModem, samples: Samples, cuts: list[int]) -> Heard:
     """Feed a stream in pieces of these lengths, in turn."""
-    engine, at, number, packets = BurstReceiver(modem), 0, 0, []
+    engine, at, number, packets = modem.receiver(), 0, 0, []
     while at < len(samples):
         piece = samples[at : at + cuts[number % len(cuts)]]
         at += len(piece)

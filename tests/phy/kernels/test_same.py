@@ -216,6 +216,36 @@ def test_threads_do_not_meet_in_one_kernel(
     assert found == [[heard] * 5 for heard in wanted]
 
 
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_bursts_made_in_one_call_are_those_made_one_by_one(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    draw, gap = random.Random(1), 5
+    packets = [draw.randbytes(length) for length in (64, 1, 13, 64)]
+    one_by_one = [np.append(phy.modem.modulate(packet), np.zeros(gap)) for packet in packets]
+    for modem in (phy.modem, fast):
+        assert np.abs(modem.modulate_all(packets, gap) - np.concatenate(one_by_one)).max() < EXACT
+
+
+@pytest.mark.parametrize("options", [{}, {"fec": "cc"}], ids=str)
+def test_all_packets_of_one_piece_come_out_whatever_their_number(
+    options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both("ofdm", options, functions, monkeypatch)
+    packets, samples = impaired(phy, 100, 25, 3)
+    begin = 400 + 50 * phy.airtime_samples()
+    samples[begin + 600 : begin + phy.airtime_samples()] = 0  # the second half of a burst
+    engine, reference = fast.receiver(), phy.modem.receiver()
+    piece = received(phy, samples)
+    found = engine.feed(piece)
+    assert found == reference.feed(piece)
+    assert found == packets[:50] + packets[51:]
+    assert engine.damaged == reference.damaged
+    assert engine.snr_db == pytest.approx(reference.snr_db, abs=0.01)
+    assert np.abs(engine.points - reference.points).max() < EXACT
+
+
 def test_a_compiled_modem_reaches_another_process_by_its_constants(
     functions: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
