@@ -13,7 +13,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -37,6 +37,7 @@ from gr_ros2.middleware.adapt import agreed
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
+from gr_ros2.service_rows import ServiceRow, parts, rows_of
 from gr_ros2.setting import AUTO, Auto
 from gr_ros2.topic_choice import TopicChoice
 
@@ -126,7 +127,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
         """The same for the services that other robots may call."""
         self.choice = TopicChoice(() if self.registry else words, namespace)
-        """The topics that are looked for on the ROS graph."""
+        """The topics and services that are looked for on the ROS graph."""
+        self.offered: set[str] = set()
+        """Absolute names of the services, actions and nodes that were found and chosen."""
+        self._offer: Callable[[str, Topic], None] | None = None
         self._left_out: set[str] = set()
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
@@ -159,9 +163,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     @property
     def unmatched(self) -> list[str]:
-        """Names, on the ROS graph, of the topics that nobody publishes yet."""
+        """Names, on the ROS graph, of the topics without a publisher; the patterns, if no name is known yet."""
         subscriptions, subscribed = self._subscriptions, self.subscribed
-        unseen = [name for name in self.choice.named if name not in subscribed]
+        unseen = [name for name in self.choice.named if name not in subscribed and name not in self.offered]
+        if self.choice.open and not subscribed and not unseen:
+            return [self.choice.everything]
         waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
         return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
 
@@ -175,6 +181,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._end.use_credit()
 
+    def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
+        """Look for services too, from the next start on, unless ``services`` of the settings is false.
+
+        :param offer: called with the name of each service on the ROS graph and its row, from a thread of this block
+        """
+        self._offer = offer if self.config.services else None
+
     def start(self) -> bool:
         self._unread = not self._port.find_readers()
         if self._unread:
@@ -183,7 +196,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
-            self._search = TopicSearch(self.middleware, self._found)
+            self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
         return True
 
     def stop(self) -> bool:
@@ -312,8 +325,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._search.close()
             self._search = None
 
-    def _found(self, infos: Sequence[TopicInfo]) -> None:
-        """Send the topics of the graph that are chosen and not sent yet."""
+    def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
+        """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
         for info in infos:
             row_name = (
                 self.choice.row_name(info.topic) if info.publishers and info.topic not in self.subscribed else None
@@ -323,11 +336,53 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             try:
                 self._add(row_name, info)
             except GrRos2Error as error:
-                self._left_out.add(info.topic)
-                full = len(self.registry) == MAX_TOPICS
-                level = logging.DEBUG if full and self._full else logging.WARNING
-                self._full = full
-                self._log.log(level, "topic %s is not sent: %s", info.topic, error)
+                self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
+        for row in rows_of(services):
+            row_name = self.choice.row_name(row.name, hidden=row.of_node)
+            if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self._left_out:
+                continue
+            try:
+                self._add_services(row_name, row)
+            except GrRos2Error as error:
+                self._leave_out(f"{row.name} {row.kind}", f"{row.name} ({row.kind}) is not offered", error)
+
+    def _leave_out(self, key: str, what: str, error: GrRos2Error) -> None:
+        """Say once what cannot be sent; of what finds no room, only the first."""
+        self._left_out.add(key)
+        full = len(self.registry) == MAX_TOPICS
+        level = logging.DEBUG if full and self._full else logging.WARNING
+        self._full = full
+        self._log.log(level, "%s: %s", what, error)
+
+    def _is_offered(self, row: ServiceRow) -> bool:
+        """Whether the services of a row are offered already, or have come by radio."""
+        names = parts(row.name, row.kind)
+        return any(name in self.services or LOOP_GUARD.returns(self._graph, name) for name in names)
+
+    def _add_services(self, row_name: str, row: ServiceRow) -> None:
+        """Offer the services of a row to other robots. The topics of an action are sent.
+
+        :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
+        """
+        assert self._offer is not None
+        options = self.config.topic_options
+        rows = [(name, type_name, options_of(name, options)) for name, type_name in parts(row_name, row.kind).items()]
+        namespace = self.config.namespace
+        with self._lock:
+            self.registry = self._end.add(rows)
+            added = {topic.on_graph(namespace): topic for topic in self.registry[-len(rows) :]}
+            added = {name: topic for name, topic in added.items() if not self.choice.leaves_out(name)}
+            self.services = {**self.services, **{name: topic for name, topic in added.items() if topic.is_service}}
+            topics = {name: topic for name, topic in added.items() if topic.is_topic}
+            self.subscribed = {**self.subscribed, **topics}
+        self.offered.add(row.name)
+        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
+        self._log.info("%s (%s) of the ROS graph is offered to other robots", row.name, row.kind)
+        for name, topic in added.items():
+            if topic.is_service:
+                self._offer(name, topic)
+            else:
+                self._subscribe_to(name, topic)
 
     def _add(self, row_name: str, info: TopicInfo) -> None:
         """Announce a topic of the graph, and subscribe it.
@@ -336,7 +391,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """
         options = options_of(row_name, self.config.topic_options)
         with self._lock:
-            self.registry = self._end.add(row_name, normalize_type(info.type_name), options)
+            self.registry = self._end.add([(row_name, normalize_type(info.type_name), options)])
             topic = self.registry[-1]
             subscribed = {**self.subscribed, info.topic: topic}
             self._adapt(topic, info.publishers)
@@ -344,7 +399,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
             self.subscribed = subscribed
             self._work.notify()
-        LOOP_GUARD.add_source(self, self._graph, subscribed)
+        LOOP_GUARD.add_source(self, self._graph, [*subscribed, *self.services])
         self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
         self._subscribe_to(info.topic, topic)
 

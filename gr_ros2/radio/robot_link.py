@@ -207,7 +207,7 @@ class RobotLink(Flowgraph):
     def stats(self) -> dict[str, Any]:
         """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
         end, and :meth:`incomplete`."""
-        phy, counts = self.phy, self.radio.counts()
+        phy, counts, front_end = self.phy, self.radio.counts(), self.front_end.counters()
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
@@ -229,6 +229,10 @@ class RobotLink(Flowgraph):
                 "snr_db": self.radio.snr_db,
                 **self.source.rate(),
             },
-            "front_end": {"name": self.front_end.name, **self.front_end.counters(), **self.radio.recorded()},
+            "front_end": {
+                "name": self.front_end.name,
+                "passed": front_end.passed,
+                "lost": {**front_end.lost, **self.radio.recorded()},
+            },
             "incomplete": self.incomplete(),
         }
