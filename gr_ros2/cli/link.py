@@ -49,7 +49,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @_flag("device", metavar="ARGS")
 @_flag("frequency", type=float, metavar="HZ")
 @_flag("frequency-rx", type=float, metavar="HZ")
-@click.option("--registry", metavar="CSV", help="Without CONFIG: which topics; default the built-in table4.")
+@click.option("--registry", metavar="CSV", help="Without CONFIG: a file of topics to send; default: --topics auto.")
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )
@@ -203,7 +203,6 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"{lost} messages lost on the ROS graph before they were sent")
     if sink["publish_failed"]:
         parts.append(f"{sink['publish_failed']} messages not published")
-    troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
-    quiet = ("name", "bursts_in", "bursts_out", "frames_in", "frames_out", "foreign")
-    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
+    troubles = {**stats["front_end"]["lost"], "refused": packets["refused"], "damaged": packets["damaged"]}
+    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if count]
     return "; ".join(parts)

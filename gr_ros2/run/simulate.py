@@ -344,8 +344,9 @@ class LinkDirection:
         if self._clock is not None:
             for packet in self._clock.due(now):
                 self._delayed.append((now + self._delay_s, packet))
-            while self._delayed and self._delayed[0][0] <= now:
-                yield from self._land(self._delayed.popleft()[1], now)
+        while self._delayed and self._delayed[0][0] <= now:
+            yield from self._land(self._delayed.popleft()[1], now)
+        if self._clock is not None:
             credits = self._clock.grants(now)
             if self._paced:
                 self.sender.endpoint.credit(credits)
@@ -373,6 +374,8 @@ class LinkDirection:
             packet = AirtimeEnded(data, endpoint.rung)
             if self._clock is not None:
                 self._clock.offer(packet, now, self._airtime(len(data), packet.rung))
+            elif self._delay_s:
+                self._delayed.append((now + self._delay_s, packet))
             else:
                 yield from self._told(now)
                 yield from self._land(packet, now)

@@ -17,7 +17,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy, TopicOptions
+from gr_ros2.config import QueuePolicy
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.events import (
     AirKind,
@@ -46,7 +46,7 @@ from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import NewRow, Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -114,6 +114,7 @@ class Endpoint:
     ) -> None:
         self.settings = settings
         self.rung = 0
+        self.ladder = tuple(ladder)
         self._rate = RateController(ladder) if ladder else None
         self.boot = boot
         self.keys = keys if keys is not None else Keys()
@@ -163,7 +164,7 @@ class Endpoint:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._pace.known and self._mode() != "off" and self.window.unconfirmed(self._now)
+        mending = self._mode() != "off" and self.window.unconfirmed(self._now)
         return self.outbox.idle and not mending
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
@@ -183,20 +184,18 @@ class Endpoint:
             self.outbox.ask(TABLE_TOPIC, self._now)
             self._talk.hurry(self._now)
 
-    def add(self, name: str, type_name: str, options: TopicOptions) -> Registry:
-        """Send one more topic. The robots that hear this one learn of it from the next hello.
-
-        :return: everything that is sent; the new topic is the last one
-        :raises ConfigError: for more than ``MAX_TOPICS`` topics, or a wrong option
-        """
+    def add(self, rows: Sequence[NewRow]) -> Registry:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one learn of them from the next
+        hello."""
         before = self.topics or ()
-        topic = Topic(len(before), name, type_name, options)
-        together = Registry([*before, topic])
+        topics = [Topic(number, *row) for number, row in enumerate(rows, len(before))]
+        together = Registry([*before, *topics])
         if self._codec is not None:
-            self._codec.add(topic)
+            for topic in topics:
+                self._codec.add(topic)
         self.topics = together
         self.answers = True
-        self.outbox.add([topic])
+        self.outbox.add(topics)
         self._talk.hurry(self._now)
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
@@ -360,7 +359,7 @@ class Endpoint:
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self._pace.known and self._mode() != "off" and self.window.unconfirmed(now):
+        if self._mode() != "off" and self.window.unconfirmed(now):
             poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
             doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
@@ -393,11 +392,10 @@ class Endpoint:
         asks = talk.asks(self.neighbours, now)
         if asks:
             return self._control(asks, "hello", now)
-        if self._pace.known:
-            self.window.mode = self._mode()
-            repair = self._repair(now)
-            if repair is not None:
-                return repair
+        self.window.mode = self._mode()
+        repair = self._repair(now)
+        if repair is not None:
+            return repair
         early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
         return self._say(early, now) if early else None
 
@@ -531,8 +529,11 @@ class Endpoint:
         return Header(qos, self._sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
 
     def _mode(self) -> RepairMode:
-        if self.settings.repair != AUTO:
-            return self.settings.repair
+        mode = self.settings.repair
+        if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
+            return "thrifty" if mode != "off" and self.window.reported else "off"
+        if mode != AUTO:
+            return mode
         return "thrifty" if self.window.reported else "idle"
 
     # ---- what arrives

@@ -62,6 +62,9 @@ _PATIENCE_S = 0.2
 """s that are added to the time for a report, unless the receiver reports every packet at once."""
 _MARGIN = 1.2
 """Factor on the longest recent delay of a report."""
+_UNDER_WAY_S = 1e-3
+"""s for which a repair is under way at least. Without it, a sender with no pace would repair without end where a report
+comes at once."""
 _SOON = 2
 """Mean times between two new packets within which a report must come to be waited for."""
 
@@ -534,6 +537,7 @@ class RepairWindow:
     def _fly(self, now: float, first: int, last: int) -> None:
         if self.mode == "thrifty":
             wait = max((peer.answer for peer in self._receivers.values()), default=inf)
+            wait = max(wait, _UNDER_WAY_S)
             self._flight.append((now + wait, first, last))
 
     def _retire(self, now: float) -> None:
