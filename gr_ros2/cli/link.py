@@ -49,7 +49,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @_flag("device", metavar="ARGS")
 @_flag("frequency", type=float, metavar="HZ")
 @_flag("frequency-rx", type=float, metavar="HZ")
-@click.option("--registry", metavar="CSV", help="Without CONFIG: which topics; default the built-in table4.")
+@click.option("--registry", metavar="CSV", help="Without CONFIG: a file of topics to send; default: --topics auto.")
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )

@@ -148,6 +148,20 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             publishers, subscribers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
         return grouped(self._foreign(publishers), self._foreign(subscribers))
 
+    def discover_services(self) -> dict[str, str]:
+        """See services. A server has a reader of requests and a writer of replies, in one participant."""
+        with self._lock:
+            writers, readers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
+        replying = {(writer.participant, writer.topic) for writer in writers if writer.participant != self._guid}
+        found = {}
+        for reader in readers:
+            service = ros_graph.ros_service(reader.topic, reader.type_name)
+            if service is not None:
+                (_, _), (replies, _) = ros_graph.dds_service(*service)
+                if (reader.participant, replies) in replying:
+                    found[service[0]] = service[1]
+        return found
+
     def close(self) -> None:
         worker = threading.current_thread() is self._thread
         if worker and self._closed:

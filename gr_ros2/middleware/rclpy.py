@@ -250,6 +250,14 @@ class RclpyMiddleware(RclpyParticipant):
                         found.append(TopicInfo(topic, type_name, offers, requests))
         return sorted(found, key=lambda info: (info.topic, info.type_name))
 
+    def discover_services(self) -> dict[str, str]:
+        """See services. ROS does not tell servers from clients here. Of several types, the first is taken."""
+        self.check_open()
+        own = {service.srv_name for service in self._node.services}
+        with translated("the graph cannot be read"):
+            found = self._node.get_service_names_and_types()
+        return {name: type_names[0] for name, type_names in found if type_names and name not in own}
+
     def close(self) -> None:
         """Leave the graph; waits ``JOIN_S`` for a callback that is running, unless called from it."""
         atexit.unregister(self.close)

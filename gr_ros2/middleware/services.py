@@ -51,6 +51,13 @@ class ServiceGraph(Middleware):
     """A participant that can have servers and clients."""
 
     @abstractmethod
+    def discover_services(self) -> dict[str, str]:
+        """Types, by absolute name, of the services of the graph, without the servers of this participant.
+
+        Services that have clients only are left out where the middleware can tell.
+        """
+
+    @abstractmethod
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> ServiceServer:
         """Make a server, which may take any time to reply.
 

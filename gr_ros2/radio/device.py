@@ -152,8 +152,9 @@ class DeviceFrontEnd(FrontEnd):
         """How long nothing is sent after each burst, s."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self, packet_len: int | None = None) -> float:
-        return self.layout.total_of(self.phy.airtime_samples(packet_len)) / self.phy.sample_rate + self._silence()
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
+        samples = self.phy.on_rung(rung).airtime_samples(packet_len)
+        return self.layout.total_of(samples) / self.phy.sample_rate + self._silence()
 
     def ahead(self) -> float:
         return 0.0 if self._silence() else _LEAD_S

@@ -194,7 +194,7 @@ class _Run:
             live: list[LiveEnd] = []
             if scenario.version:
                 any_length = all(phy.any_length for phy in phys)
-                live = live_ends(ways, self.registry, any_length=any_length)
+                live = live_ends(ways, self.registry, any_length=any_length, ladder=self.phy.ladder)
             ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
             further = [self.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
             there = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
