@@ -31,6 +31,8 @@ _CODES = {
 }  # fmt: skip
 """struct codes; bool and int8 are plain bytes, since any byte value may occur and has to be preserved."""
 SIZES = {code: Struct("<" + code).size for code in "BHhIiQqfd"}
+TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+QUATERNION_TYPE = "geometry_msgs/msg/Quaternion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,18 @@ class Types:
             except KeyError:
                 self._trees[type_name] = None
         return self._trees[type_name]
+
+
+def tree_of(types: Typesdict, type_name: str) -> Composite | None:
+    """The tree of a type by these definitions alone; None where :meth:`Types.tree` gives none, or where they define a
+    time or a quaternion in another way than ROS does."""
+    humble = _humble().fielddefs
+    if any(name in types and types[name][1] != humble[name][1] for name in (*TIME_TYPES, QUATERNION_TYPE)):
+        return None
+    try:
+        return _composite(types, type_name, ())
+    except KeyError:
+        return None
 
 
 def _composite(types: Typesdict, type_name: str, above: tuple[str, ...]) -> Composite:

@@ -20,6 +20,8 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
+from gr_ros2.compression import LinkCodec
+from gr_ros2.compression.schema import tree_of
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
@@ -31,8 +33,12 @@ from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
@@ -93,6 +99,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             )
         end.observer = self._observe
         self._live, self._end = end, end.endpoint
+        self._codec = end.endpoint.codec if isinstance(end.endpoint, EndpointV1) else None
+        """The codec of the messages sent, where it can learn types: the robots that receive them are told."""
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self.clock = clock
@@ -127,6 +135,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
+        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
@@ -175,6 +184,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found)
+        if isinstance(self._codec, LinkCodec) and isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
     def stop(self) -> bool:
@@ -299,9 +310,25 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         subscription.follow(partial(self._follow, topic))
 
     def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search.close()
-            self._search = None
+        for search in (self._search, self._types):
+            if search is not None:
+                search.close()
+        self._search = self._types = None
+
+    def _types_in_use(self) -> list[tuple[str, str]]:
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def _learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        tree = tree_of(described.types, described.type_name)
+        if tree is None:
+            self._log.info("%s cannot be coded by its definition", described.type_name)
+            return
+        with self._lock:
+            assert isinstance(self._codec, LinkCodec) and isinstance(self._end, EndpointV1)
+            self._codec.learn(described.type_name, tree)
+            self._end.announce_coding()
+            self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo]) -> None:
         """Send the topics of the graph that are chosen and not sent yet."""

@@ -20,6 +20,12 @@ class MessageCodec(Protocol):
         :raises ConfigError: for a wrong option of the topic
         """
 
+    def announcement(self, topic_id: int) -> str:
+        """What the table of topics says about the coding of a topic, at most 255 bytes."""
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:
+        """Whether a message can be decoded only after its sender has announced more about its topic."""
+
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The result of ``decode`` for the coded message: the payload itself, except for bytes without information and
         for loss that was configured."""

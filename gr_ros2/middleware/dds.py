@@ -33,7 +33,7 @@ from gr_ros2.middleware.cdr_dds import (
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
 from gr_ros2.middleware.dds_services import SERVICE_QOS, DdsClient, DdsServer, ServiceParticipant
-from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback, Witness
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -147,6 +147,25 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         with self._lock:
             publishers, subscribers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
         return grouped(self._foreign(publishers), self._foreign(subscribers))
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:
+        name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
+        with self._lock:
+            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
+        hashes: dict[str, set[bytes]] = {}
+        services: dict[bytes, list[str]] = {}
+        for endpoint in everyone:
+            if endpoint.participant == self._guid or not endpoint.is_cyclone:
+                continue  # services of Fast DDS cannot be called from here
+            if (endpoint.topic, endpoint.type_name) == (name, kind):
+                hashes.setdefault(ros_graph.hash_told(endpoint.user_data), set()).add(endpoint.participant)
+            elif service := ros_graph.description_service(endpoint.topic):
+                services.setdefault(endpoint.participant, []).append(service)
+        found = []
+        for digest in sorted(hashes.keys() - {""}):
+            named = sorted({service for owner in hashes[digest] for service in services.get(owner, ())})
+            found.append(Witness(digest, tuple(named)))
+        return found
 
     def close(self) -> None:
         worker = threading.current_thread() is self._thread

@@ -45,7 +45,8 @@ from gr_ros2.middleware.base import (
 from gr_ros2.middleware.rcl import told, translated
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
-from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback, Witness
+from gr_ros2.middleware.type_descriptions import SERVICE as DESCRIPTION_SERVICE
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -249,6 +250,23 @@ class RclpyMiddleware(RclpyParticipant):
                     if offers or requests:
                         found.append(TopicInfo(topic, type_name, offers, requests))
         return sorted(found, key=lambda info: (info.topic, info.type_name))
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:
+        """See services. rclpy gives type hashes since Jazzy."""
+        self.check_open()
+        node = self._node
+        with translated(f"endpoints of {topic} cannot be read"):
+            infos = [
+                *self._foreign(node.get_publishers_info_by_topic(topic), topic, node.publishers),
+                *self._foreign(node.get_subscriptions_info_by_topic(topic), topic, node.subscriptions),
+            ]
+        found: dict[str, set[str]] = {}
+        for info in infos:
+            digest = getattr(info, "topic_type_hash", None)
+            if info.topic_type == type_name and digest is not None and digest.version > 0:
+                service = f"{info.node_namespace.rstrip('/')}/{info.node_name}/{DESCRIPTION_SERVICE}"
+                found.setdefault(str(digest), set()).add(service)
+        return [Witness(digest, tuple(sorted(services))) for digest, services in sorted(found.items())]
 
     def close(self) -> None:
         """Leave the graph; waits ``JOIN_S`` for a callback that is running, unless called from it."""

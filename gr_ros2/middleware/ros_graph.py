@@ -36,6 +36,7 @@ __all__ = [
     "dds_service",
     "dds_topic",
     "dds_type",
+    "description_service",
     "discovery_options",
     "endpoint_user_data",
     "gid_size",
@@ -68,6 +69,7 @@ package."""
 
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
 _TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
+_DESCRIPTION = re.compile(r"rq(/.+/get_type_description)Request")
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 
 
@@ -84,6 +86,12 @@ def dds_service(service: str, type_name: str) -> tuple[tuple[str, str], tuple[st
     """
     request, response = (dds_type(f"{type_name}_{part}") for part in ("Request", "Response"))
     return (f"rq{service}Request", request), (f"rr{service}Reply", response)
+
+
+def description_service(name: str) -> str:
+    """The service ``/…/get_type_description`` whose requests go to a DDS topic; '' for another topic."""
+    match = _DESCRIPTION.fullmatch(name)
+    return match[1] if match else ""
 
 
 def ros_topic(name: str) -> str | None:

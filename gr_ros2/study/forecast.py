@@ -366,6 +366,12 @@ class _Remembering:
     def add(self, topic: Topic) -> None:
         self._codec.add(topic)
 
+    def announcement(self, topic_id: int) -> str:
+        return self._codec.announcement(topic_id)
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:
+        return self._codec.lacks(topic_id, coded)
+
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         return self._codec.canonical(topic_id, payload)
 

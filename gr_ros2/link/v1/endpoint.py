@@ -94,6 +94,7 @@ class Endpoint:
     :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
     :param ladder: the rungs of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
+    :ivar codec: the same; after it has learned something, call :meth:`announce_coding`
     :ivar rung: rung of the last packet, 0 with a fixed rate
     """
 
@@ -138,7 +139,7 @@ class Endpoint:
         )
         self.topics = topics
         """What it sends."""
-        self._codec = codec
+        self.codec = codec
         self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._pace = Pace(settings.packet_rate)
@@ -197,14 +198,20 @@ class Endpoint:
         before = self.topics or ()
         topic = Topic(len(before), name, type_name, options)
         together = Registry([*before, topic])
-        if self._codec is not None:
-            self._codec.add(topic)
+        if self.codec is not None:
+            self.codec.add(topic)
         self.topics = together
         self.outbox.add([topic])
         self._talk.hurry(self._now)
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
         return together
+
+    def announce_coding(self) -> None:
+        """Announce to the other robots that the codec of the messages sent has learned more about its topics."""
+        if self.outbox.recoded() and self._started:
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
 
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""

@@ -161,6 +161,15 @@ class Outbox:
         self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
         self._tabulate()
 
+    def recoded(self) -> bool:
+        """Announce how topics are coded now.
+
+        :return: whether the table of topics has changed
+        """
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
     def offer(self, topic_id: int, *, offered: bool) -> bool:
         """Announce a service, or no longer.
 
@@ -341,7 +350,7 @@ class Outbox:
             ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
             ordered = ordered and self._queues[topic.topic_id].policy != "latest"
             depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
-            codec = "" if self._codec is None else options.codec
+            codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
             qos = QOS_NAMES.index(options.qos)
             name, kind, latched = topic.name, topic.type_name, self._is_latched(topic)
             rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, latched, min(depth, 255), codec))
