@@ -16,7 +16,7 @@ from gnuradio import blocks, digital, gr
 
 from bench.rows import Row
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
+from gr_ros2.phy.burst import BurstModem, Samples
 from gr_ros2.phy.kernels import which
 from gr_ros2.phy.theory import half_point
 from gr_ros2.phy.threads import run_flowgraph
@@ -162,8 +162,8 @@ def _noise(count: int, seed: int) -> Samples:
 
 
 def _receive(modem: BurstModem, samples: Samples) -> list[bytes]:
-    engine = BurstReceiver(modem)
-    return [packet for at in range(0, len(samples), PIECE) for packet in engine.feed(samples[at : at + PIECE])]
+    engine = modem.receiver()
+    return [heard.data for at in range(0, len(samples), PIECE) for heard in engine.feed(samples[at : at + PIECE])]
 
 
 def _ffts(samples: Samples) -> float:

@@ -20,12 +20,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from pathlib import Path
+from typing import Any
 
 from gr_ros2.compression import bounds
 from gr_ros2.compression.dictionary import GENERAL, OWN, SHIPPED, Dictionary, load, shipped
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.quantize import Quantizer, parse_steps
-from gr_ros2.compression.schema import Composite, Types
+from gr_ros2.compression.schema import Composite, Types, tree_of
 from gr_ros2.compression.structure import read_structure, write_structure
 from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
@@ -99,8 +100,11 @@ class LinkCodec:
             made._topics[topic_id] = made._topics[topic_id].told(text)
         return made
 
-    def learn(self, type_name: str, tree: Composite) -> None:
-        """Prefer a definition of a type for sending, which a program on the graph has given."""
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """See MessageCodec. A type that cannot be split is coded as before."""
+        tree = tree_of(definitions, type_name)
+        if tree is None:
+            return
         for key, codec in self._made.items():
             if key[0] == type_name:
                 codec.learn(tree)

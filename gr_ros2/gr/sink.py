@@ -35,7 +35,7 @@ from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.names import topic_fault
-from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, packets_of, snr_db_of
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 from gr_ros2.setting import AUTO
@@ -326,7 +326,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if problem:
                 self._refuse(problem)
             else:
-                self._take(packets)
+                self._take(packets, snr_db_of(message))
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
         self.handled += max(len(packets), 1)
@@ -347,11 +347,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if first:
             self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
 
-    def _take(self, packets: Iterable[bytes]) -> None:
+    def _take(self, packets: Iterable[bytes], snr_db: float | None) -> None:
         events: list[ReceiverEvent] = []
         with self._lock:
             for data in packets:
-                events += self._end.receive(data, self._clock())
+                events += self._end.receive(data, self._clock(), snr_db)
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
             if self._end.answers and not self._end.out_of_credit:

@@ -5,7 +5,8 @@ Invariant: every message is coded independently, so that a lost message damages 
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 from gr_ros2.registry import Topic
 
@@ -18,6 +19,12 @@ class MessageCodec(Protocol):
         """Code the messages of one more topic, or of a topic id that now means another topic.
 
         :raises ConfigError: for a wrong option of the topic
+        """
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Prefer a definition of a type for sending.
+
+        :param definitions: of the type and of those that it is made of, in the form of rosbags
         """
 
     def announcement(self, topic_id: int) -> str:

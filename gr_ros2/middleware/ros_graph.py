@@ -36,7 +36,6 @@ __all__ = [
     "dds_service",
     "dds_topic",
     "dds_type",
-    "description_service",
     "discovery_options",
     "endpoint_user_data",
     "gid_size",
@@ -44,6 +43,7 @@ __all__ = [
     "hash_told",
     "participant_entities_info",
     "resolve_domain_id",
+    "ros_service",
     "ros_topic",
     "ros_type",
 ]
@@ -68,8 +68,8 @@ DISCOVERY_USER_DATA = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1e
 package."""
 
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
+_REQUESTS, _REQUEST_TYPE = re.compile(r"rq(/.+)Request"), re.compile(r"(.+/.+/.+)_Request")
 _TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
-_DESCRIPTION = re.compile(r"rq(/.+/get_type_description)Request")
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 
 
@@ -88,10 +88,10 @@ def dds_service(service: str, type_name: str) -> tuple[tuple[str, str], tuple[st
     return (f"rq{service}Request", request), (f"rr{service}Reply", response)
 
 
-def description_service(name: str) -> str:
-    """The service ``/…/get_type_description`` whose requests go to a DDS topic; '' for another topic."""
-    match = _DESCRIPTION.fullmatch(name)
-    return match[1] if match else ""
+def ros_service(name: str, type_name: str) -> tuple[str, str] | None:
+    """Name and type of a service, from topic and type of its requests; None for any other topic."""
+    service, kind = _REQUESTS.fullmatch(name), _REQUEST_TYPE.fullmatch(ros_type(type_name))
+    return None if service is None or kind is None else (service[1], kind[1])
 
 
 def ros_topic(name: str) -> str | None:

@@ -20,6 +20,10 @@ ServerCallback = Callable[[bool], None]
 """Takes whether a server is there."""
 
 
+DESCRIPTION, DESCRIPTION_TYPE = "get_type_description", "type_description_interfaces/srv/GetTypeDescription"
+"""The service with which a node describes types since Iron: its name below that of the node, and its type."""
+
+
 class Witness(NamedTuple):
     """A participant that can say what a type is.
 
@@ -61,6 +65,13 @@ class ServiceClient(ABC):
 
 class ServiceGraph(Middleware):
     """A participant that can have servers and clients."""
+
+    @abstractmethod
+    def discover_services(self) -> dict[str, str]:
+        """Types, by absolute name, of the services of the graph, without the servers of this participant.
+
+        Services that have clients only are left out where the middleware can tell.
+        """
 
     @abstractmethod
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> ServiceServer:

@@ -19,11 +19,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.errors import DescriptionError
+from gr_ros2.middleware.services import DESCRIPTION_TYPE
 from gr_ros2.middleware.type_definitions import DAMAGED
 
-SERVICE = "get_type_description"
-"""Name of the service below that of its node."""
-SERVICE_TYPE = "type_description_interfaces/srv/GetTypeDescription"
 MAX_REPLY = 1 << 20
 """Bytes of the largest reply that is read."""
 MAX_VALUES = 10_000
@@ -31,7 +29,7 @@ MAX_VALUES = 10_000
 MAX_DEPTH = 30
 """Most messages within each other."""
 
-_REQUEST, _RESPONSE = (SERVICE_TYPE.replace("/srv/", "/msg/") + f"_{part}" for part in ("Request", "Response"))
+_REQUEST, _RESPONSE = (DESCRIPTION_TYPE.replace("/srv/", "/msg/") + f"_{part}" for part in ("Request", "Response"))
 _REQUEST_TEXT = "string type_name\nstring type_hash\nbool include_type_sources\n"
 _RESPONSE_TEXT = """\
 bool successful

@@ -14,9 +14,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 from gr_ros2.errors import DescriptionError, GrRos2Error, MiddlewareError
-from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.services import DESCRIPTION_TYPE, ServiceGraph
 from gr_ros2.middleware.type_definitions import ships
-from gr_ros2.middleware.type_descriptions import SERVICE_TYPE, Described, read_reply, request
+from gr_ros2.middleware.type_descriptions import Described, read_reply, request
 
 LOOK_S = 0.5
 """s between two looks, at least."""
@@ -103,7 +103,7 @@ class TypeSearch:
             replied.set()
 
         try:
-            client = self._graph.client(service, SERVICE_TYPE, on_reply, on_server)
+            client = self._graph.client(service, DESCRIPTION_TYPE, on_reply, on_server)
         except GrRos2Error as error:
             _log.debug("%s cannot be asked: %s", service, error)
             return None

@@ -20,14 +20,14 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
-from gr_ros2.phy.threads import KeptAlive
+from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.setting import AUTO, Auto
 
 STOCK = "GNU Radio's blocks"
@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 
 
 _LENGTH = pmt.intern(LENGTH_TAG)
+_BUFFER = 1 << 15
+"""Samples that may wait behind the modulator: several packets, so that the receiver gets several at a time."""
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -146,22 +148,22 @@ class TakesPackets(KeptAlive):
         PduPort.readable_by(self)
 
     @abstractmethod
-    def take_packet(self, packet: bytes) -> None:
-        """Process a packet."""
+    def take_packets(self, packets: list[bytes], rung: int) -> None:
+        """Process packets that came together.
+
+        :param rung: the rung that their PDU says, 0 where it says none
+        """
 
     def _take(self, message: Any) -> None:
         packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
-        if problem:
-            self._refuse()
-        for packet in packets:
-            if len(packet) in self._lengths:
-                self.take_packet(packet)
-            else:
-                self._refuse()
+        good = [packet for packet in packets if len(packet) in self._lengths]
+        self._refuse(len(packets) - len(good) + bool(problem))
+        self.take_packets(good, rung_of(message))
 
-    def _refuse(self) -> None:
-        self.refused += 1
-        if self.refused == 1:
+    def _refuse(self, count: int) -> None:
+        first = bool(count and not self.refused)
+        self.refused += count
+        if first:
             block: Any = self
             least, most = self._lengths[0], self._lengths[-1]
             needed = f"{most}" if least == most else f"{least} to {most}"
@@ -179,25 +181,31 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
-        self._modem = phy.running_modem
+        self._rungs = phy.running_modem.rungs
         self._gap = phy.gap
-        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
-        self._waiting: deque[bytes] = deque()
-        self._rest = self._whole[:0]
+        self._waiting: deque[tuple[BurstModem, bytes]] = deque()
+        self._bursts: deque[Samples] = deque()
+        """Bursts that are modulated, each with its gap."""
+        self._rest = np.empty(0, np.complex64)
         self.sent = 0
         """Packets that have left as samples."""
+        log_warnings_only([self])
+        self.set_min_output_buffer(_BUFFER)
 
-    def take_packet(self, packet: bytes) -> None:
-        self._waiting.append(packet)
+    def take_packets(self, packets: list[bytes], rung: int) -> None:
+        # A rung that this end does not have is one of settings that differ: the most robust one is sent.
+        modem = self._rungs[rung if 0 <= rung < len(self._rungs) else 0]
+        self._waiting.extend((modem, packet) for packet in packets)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
         out, done = output_items[0], 0
-        while done < len(out) and (len(self._rest) or self._waiting):
+        while done < len(out):
             if not len(self._rest):
-                burst = self._modem.modulate(self._waiting.popleft())
-                self._rest = self._whole[: len(burst) + self._gap]
-                self._rest[: len(burst)] = burst
-                self._rest[len(burst) :] = 0
+                if not self._bursts:
+                    self._modulate(len(out) - done)
+                if not self._bursts:
+                    break
+                self._rest = self._bursts.popleft()
                 if self._tagged:
                     self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
             count = min(len(out) - done, len(self._rest))
@@ -206,6 +214,20 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
             done += count
             self.sent += not len(self._rest)
         return done
+
+    def _modulate(self, room: int) -> None:
+        """Modulate as many waiting packets of one rung as there is room for, at least one."""
+        packets: list[bytes] = []
+        ends: list[int] = []
+        end = 0
+        modem = self._waiting[0][0] if self._waiting else None
+        while self._waiting and end < room and self._waiting[0][0] is modem:
+            _, packet = self._waiting.popleft()
+            packets.append(packet)
+            end += modem.samples_of(len(packet)) + self._gap
+            ends.append(end)
+        if modem is not None:
+            self._bursts.extend(np.split(modem.modulate_all(packets, self._gap), ends[:-1]))
 
 
 class BurstSink(ReceiverBlock):
@@ -264,8 +286,8 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._port.find_readers()
-        send = self._port.send
-        self._engine = ReceiverProcess(self._modem, send) if self._own_process else BurstReceiver(self._modem)
+        modem = self._modem
+        self._engine = ReceiverProcess(modem, self._send) if self._own_process else modem.receiver()
         return super().start()
 
     def stop(self) -> bool:
@@ -273,10 +295,17 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        self._port.send(self._packets(input_items[0]))
+        self._send(self._packets(input_items[0]))
         return len(input_items[0])
 
-    def _packets(self, samples: Samples) -> list[bytes]:
+    def _send(self, packets: list[Heard]) -> None:
+        if len(self._modem.rungs) == 1:
+            self._port.send([packet.data for packet in packets])
+        else:
+            for packet in packets:
+                self._port.send_pdu(pdu_heard(packet.data, packet.rung, packet.snr_db))
+
+    def _packets(self, samples: Samples) -> list[Heard]:
         assert self._engine is not None
         try:
             return self._engine.feed(samples)
@@ -285,7 +314,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
                 self._failed = True
                 _log.exception("%s: starts again after %s", self.name(), error)
             self._end_engine()
-            self._engine = BurstReceiver(self._modem)
+            self._engine = self._modem.receiver()
             return []
 
     def _end_engine(self) -> None:

@@ -176,8 +176,9 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._frame = frame
         self.message_port_register_out(PDUS)
 
-    def take_packet(self, packet: bytes) -> None:
-        self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
+    def take_packets(self, packets: list[bytes], rung: int) -> None:  # noqa: ARG002 - one rate
+        for packet in packets:
+            self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 
 
 class SdrReceiver(ReceiverBlock):

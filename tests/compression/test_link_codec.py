@@ -7,12 +7,12 @@ import random
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.dictionary import OWN
 from gr_ros2.compression.link_codec import ANNOUNCED, FIELDS, FIELDS_AND_MORE, MAX_LEARNED, STORED, ZSTD
-from gr_ros2.compression.schema import Composite, tree_of
 from gr_ros2.compression.train import learn
 from gr_ros2.compression.zstd_frames import Zstd, varint
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
@@ -149,10 +149,8 @@ def test_two_dictionaries_of_one_id_are_refused(monkeypatch: pytest.MonkeyPatch)
         codec_for(ODOMETRY, one, two)
 
 
-def _definition(text: str, name: str = "my_msgs/msg/Thing") -> Composite:
-    found = tree_of({**STORE.fielddefs, **get_types_from_msg(text, name)}, name)
-    assert found is not None
-    return found
+def _definition(text: str) -> Typesdict:
+    return {**STORE.fielddefs, **get_types_from_msg(text, "my_msgs/msg/Thing")}
 
 
 def _thing(text: str, seed: int) -> tuple[bytes, bytes]:
@@ -197,10 +195,7 @@ def test_a_type_that_changes_is_announced_again() -> None:
 
 def test_a_definition_that_a_dictionary_has_is_not_announced_but_preferred() -> None:
     sender = codec_for("sensor_msgs/msg/Range")
-    newer = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    found = tree_of(newer, "sensor_msgs/msg/Range")
-    assert found is not None
-    sender.learn("sensor_msgs/msg/Range", found)
+    sender.learn("sensor_msgs/msg/Range", get_typestore(Stores.ROS2_JAZZY).fielddefs)
     assert sender.announcement(0) == "auto"
     payload, clean = Writer(random.Random(3), store=get_typestore(Stores.ROS2_JAZZY)).message("sensor_msgs/msg/Range")
     coded = sender.encode(0, payload)

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,9 +15,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gnuradio import gr
 
 from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.link.events import Announced
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.registry import Registry
 from tests.domains import free_domains
+from tests.gr.probe import Hears
 from tests.middleware.describing import CUSTOM, message
 from tests.middleware.support import Peer
 from tests.waiting import wait_for
@@ -39,7 +42,15 @@ class Link:
         self.source = RosSource(
             REGISTRY, middleware=graphs[0], version=1, namespace="/robot_1", robot_id=1, compression=True, state=state
         )
-        self.sink = RosSink("", middleware=graphs[1], version=1, compression=True, frame_prefix="robot_{src_id}/")
+        self.told: list[Any] = []
+        self.sink = RosSink(
+            "",
+            middleware=graphs[1],
+            version=1,
+            compression=True,
+            frame_prefix="robot_{src_id}/",
+            observer=Hears(self.told.append),
+        )
         top = gr.top_block()
         top.msg_connect((self.source, "pdus"), (self.sink, "pdus"))
         for block in (self.source, self.sink):
@@ -49,8 +60,8 @@ class Link:
 
     @property
     def coding(self) -> str:
-        assert self.source._codec is not None
-        return self.source._codec.announcement(0)
+        """What the source has announced about its topic."""
+        return str([event.rows[0].codec for event in list(self.told) if isinstance(event, Announced)][-1])
 
 
 @pytest.fixture

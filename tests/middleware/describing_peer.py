@@ -13,7 +13,8 @@ from collections.abc import Hashable
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.ros_graph import endpoint_user_data
-from gr_ros2.middleware.type_descriptions import SERVICE_TYPE, request
+from gr_ros2.middleware.services import DESCRIPTION_TYPE
+from gr_ros2.middleware.type_descriptions import request
 from tests.middleware.describing import CUSTOM, CUSTOM_TEXT, OTHER_TEXT, hash_of_text, reply, types_of
 from tests.said import say
 
@@ -43,7 +44,7 @@ def main(domain: str, topic: str, role: str, how: str) -> None:
         if how in replies:
             server.reply(client, replies[how])
 
-    server = node.serve("/wheels/get_type_description", SERVICE_TYPE, answer)
+    server = node.serve("/wheels/get_type_description", DESCRIPTION_TYPE, answer)
     qos = Qos("reliable", "volatile", 100)
     endpoint = (
         node.advertise(topic, CUSTOM, qos)

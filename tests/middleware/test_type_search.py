@@ -9,8 +9,8 @@ from contextlib import closing
 import pytest
 
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.middleware.services import Witness
-from gr_ros2.middleware.type_descriptions import SERVICE, Described
+from gr_ros2.middleware.services import DESCRIPTION, Witness
+from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TRIES, TypeSearch
 from tests.domains import free_domains
 from tests.middleware.describing import CUSTOM, CUSTOM_TEXT, hash_of_text, message
@@ -57,7 +57,7 @@ def test_a_type_is_learned_from_whoever_uses_it(graph: DdsMiddleware, domain: in
         assert (described.type_name, described.digest) == (CUSTOM, DIGEST)
         assert described.store().deserialize_cdr(message(3), CUSTOM).mode == 3
         (witness,) = graph.witnesses(TOPIC, CUSTOM)
-        assert witness == Witness(DIGEST, (f"/wheels/{SERVICE}",))
+        assert witness == Witness(DIGEST, (f"/wheels/{DESCRIPTION}",))
         assert peer.asked == 1
     assert not graph.counters
 

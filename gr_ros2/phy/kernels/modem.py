@@ -1,24 +1,30 @@
 """A burst modem that uses a compiled kernel for search and demodulation.
 
 Invariants: the numpy modem, which is the reference, does everything except the processing of samples; a kernel knows
-only the constants of that modem; calls from several threads do not share memory.
+only the constants of that modem; calls from several threads do not share memory. Each call releases Python's lock, so a
+link processes several packets per call: waiting for the lock afterwards takes longer than a short burst.
 """
 
 from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, ModemConstants, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.kernels.library import loaded
 
 _NONE = -(2**63)
 _NO_MEMORY = 2**63 - 1
+_NEEDS_SAMPLES, _FULL, _NOT_PLAIN = range(3)
+"""Why a call of :meth:`CompiledModem.take` ended: ``Taken`` in ``stream.h``."""
+_ROOM = 32
+"""Packets that one call may find."""
 
 Fields = Mapping[str, str]
 """Names of a kernel's numbers and arrays, in the order of its struct in ``modem.h``, by type."""
@@ -32,10 +38,10 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "ofdm": (
         0,
         _fields(
-            int32="shortest longest size prefix repeat degrees chunk carrier_count data_count pilot_count once_count "
-            "twice_count shift_count point_count point_bits",
+            int32="shortest longest rung_count counted size prefix repeat degrees chunk carrier_count data_count "
+            "pilot_count once_count twice_count shift_count",
             float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
-            int32s="frame_bits carriers data pilots once twice shifts",
+            int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
             complex64s="words known turns whole smooth smooth_words crosswise points",
             float32s="word_weight",
             uint8s="marks headers header_mask",
@@ -76,7 +82,55 @@ class _Report(ctypes.Structure):
         ("length", ctypes.c_int64),
         ("soft", ctypes.c_int64),
         ("points", ctypes.c_int64),
+        ("rung", ctypes.c_int64),
     )
+
+
+class _FrameForm(ctypes.Structure):
+    """The struct of the same name in ``frames.h``. It keeps the whitening sequence in memory."""
+
+    _fields_ = (("multiple", ctypes.c_int32), ("high_first", ctypes.c_int32), ("mask", ctypes.c_void_p))
+
+    def __init__(self, frames: Frames) -> None:
+        self._mask = np.ascontiguousarray(frames.mask, np.uint8)
+        super().__init__(frames.multiple, frames.order == "big", _address(self._mask) if frames.plain else None)
+
+
+class _Batch(ctypes.Structure):
+    """The struct of the same name in ``stream.h``."""
+
+    _fields_ = (
+        ("frames", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("gap", ctypes.c_int64),
+        ("data", ctypes.c_void_p),
+        ("lengths", ctypes.c_void_p),
+        ("data_sizes", ctypes.c_void_p),
+        ("sizes", ctypes.c_void_p),
+        ("out", ctypes.c_void_p),
+    )
+
+
+class _Stream(ctypes.Structure):
+    """The struct of the same name in ``stream.h``."""
+
+    _fields_ = (
+        ("samples", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("frames", ctypes.c_void_p),
+        *(
+            (name, ctypes.c_int64)
+            for name in ["margin", "span", "peak", "burst", "stretch", "cursor", "start", "last", "room"]
+        ),
+        *((name, ctypes.c_void_p) for name in ["packets", "lengths", "snrs", "soft", "points"]),
+        *((name, ctypes.c_int64) for name in ["row_size", "row", "whole", "damaged"]),
+        ("report", _Report),
+        ("row_points", ctypes.c_int64),
+    )
+
+
+_NO_BURST, _READ, _CUT = range(3)
+"""``Result`` of ``modem.h``."""
 
 
 class CompiledModem(BurstModem):
@@ -95,13 +149,22 @@ class CompiledModem(BurstModem):
         self._functions = loaded().functions
         self._kernel = _new(self._functions, constants)
         weakref.finalize(self, self._functions.modem_free, self._kernel)
-        self._soft, self._points = constants.soft_bits, constants.points
+        self.reading_size = constants.soft_bits, constants.points
+        """Most soft bits and points of a reading."""
+        self._samples_of = lru_cache(maxsize=None)(reference.samples_of)
+        self._form = _FrameForm(reference.frames)
+        given = reference.rungs
+        self._rungs = tuple(CompiledModem(modem) for modem in given) if len(given) > 1 else ()
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
 
+    @property
+    def rungs(self) -> Sequence[BurstModem]:
+        return self._rungs or (self,)
+
     def samples_of(self, packet_len: int) -> int:
-        return self._reference.samples_of(packet_len)
+        return self._samples_of(packet_len)
 
     @property
     def span(self) -> int:
@@ -116,11 +179,34 @@ class CompiledModem(BurstModem):
         return self._reference.peak_samples
 
     def modulate(self, packet: bytes) -> Samples:
-        bits = self.frames.of(len(packet)).wrap(packet)
-        out = np.empty(self.samples_of(len(packet)), np.complex64)
-        if _done(self._functions.modem_modulate(self._kernel, _address(bits), len(packet), _address(out))):
+        return self.modulate_all([packet], 0)
+
+    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
+        frames = self.frames
+        data = [frames.of(len(one)).wrap(one).tobytes() for one in packets] if not frames.plain else packets
+        lengths = [len(packet) for packet in packets]
+        sizes = np.array([self._samples_of(length) + gap for length in lengths], np.int64)
+        numbers = np.array((lengths, [len(one) for one in data]), np.int32)
+        out = np.empty(int(sizes.sum()), np.complex64)
+        arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
+        batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(_address, arrays))
+        if _checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
             return out
-        return self._reference.modulate(packet)
+        return self._reference.modulate_all(packets, gap)
+
+    def receiver(self) -> BurstReceiver:
+        return CompiledReceiver(self)
+
+    def take(self, stream: _Stream) -> int:
+        """Take packets from a stream until there is a reason to stop, which is returned.
+
+        :raises MemoryError: when memory is short
+        """
+        stream.frames = ctypes.addressof(self._form)
+        reason: int = self._functions.modem_take(self._kernel, ctypes.addressof(stream))
+        if reason < 0:
+            raise MemoryError("no memory for a compiled kernel to work in")
+        return reason
 
     def find(self, samples: Samples) -> Search:
         samples = np.ascontiguousarray(samples, np.complex64)
@@ -128,18 +214,92 @@ class CompiledModem(BurstModem):
         found = self._functions.modem_find(self._kernel, _address(samples), len(samples), ctypes.addressof(start))
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
-    def end(self, samples: Samples, start: int) -> int:
-        samples = np.ascontiguousarray(samples, np.complex64)
-        return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
-
     def read(self, samples: Samples, start: int) -> Reading | None:
         samples = np.ascontiguousarray(samples, np.complex64)
-        soft, points = np.empty(self._soft, np.float32), np.empty(self._points, np.complex64)
+        soft_bits, most_points = self.reading_size
+        soft, points = np.empty(soft_bits, np.float32), np.empty(most_points, np.complex64)
         report = _Report()
         given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(report))
-        if not _done(self._functions.modem_read(self._kernel, *given)):
+        result = _checked(self._functions.modem_read(self._kernel, *given))
+        if result == _NO_BURST:
             return None
-        return Reading(report.length, soft[: report.soft], points[: report.points], report.snr, report.end)
+        if result == _CUT:
+            return Reading(report.length, None, points[:0], report.snr, report.end, report.rung)
+        read = (soft[: report.soft], points[: report.points])
+        return Reading(report.length, *read, report.snr, report.end, report.rung)
+
+
+class CompiledReceiver(BurstReceiver):
+    """A :class:`BurstReceiver` that takes all packets of its samples in one call, or one at a time where
+    Python unwraps the frames.
+
+    :param modem: modulation and frames
+    """
+
+    _modem: CompiledModem
+
+    def __init__(self, modem: CompiledModem) -> None:
+        super().__init__(modem)
+        self._packets = np.empty(_ROOM * modem.frames.packet_len, np.uint8)
+        self._lengths = np.empty(_ROOM, np.int32)
+        self._newest_snrs = np.empty(_ROOM, np.float64)
+        soft, points = modem.reading_size
+        self._soft, self._points = np.empty(soft, np.float32), np.empty((2, points), np.complex64)
+        self._stream = stream = _Stream()
+        stream.samples = _address(self._buffer)
+        stream.margin, stream.span = modem.margin, modem.span
+        stream.peak, stream.burst, stream.stretch = modem.peak_samples, modem.burst_samples, self._stretch
+        stream.room, stream.row_size = _ROOM, points
+        stream.packets, stream.lengths = _address(self._packets), _address(self._lengths)
+        stream.snrs = _address(self._newest_snrs)
+        stream.soft, stream.points = _address(self._soft), _address(self._points)
+
+    def _take(self) -> list[Heard]:
+        stream = self._stream
+        stream.count, stream.cursor = self._end, self._cursor
+        stream.start, stream.last = (_NONE if at is None else at for at in (self._start, self._last))
+        packets: list[Heard] = []
+        reason = None
+        while reason != _NEEDS_SAMPLES:
+            stream.whole = stream.damaged = 0
+            reason = self._modem.take(stream)
+            self.damaged += stream.damaged
+            if stream.whole:
+                packets += self._whole()
+            if reason == _NOT_PLAIN:
+                packets += self._unwrapped()
+        self._cursor = stream.cursor
+        self._start, self._last = (None if at == _NONE else at for at in (stream.start, stream.last))
+        return packets
+
+    def _whole(self) -> list[Heard]:
+        """The packets of the last call."""
+        stream, packets, begin = self._stream, [], 0
+        lengths, snrs = self._lengths[: stream.whole].tolist(), self._newest_snrs[: stream.whole].tolist()
+        joined = self._packets[: sum(lengths)].tobytes()
+        for length, snr in zip(lengths, snrs, strict=True):
+            packets.append(Heard(joined[begin : begin + length], snr))
+            begin += length
+        self._measured(self._points[stream.row, : stream.row_points], snrs)
+        return packets
+
+    def _unwrapped(self) -> list[Heard]:
+        """The packet of the burst that was read, if its CRC-32 matches."""
+        stream, report = self._stream, self._stream.report
+        frames = self._modem.rungs[report.rung].frames
+        packet = frames.of(report.length).unwrap(self._soft[: report.soft])
+        if packet is None:
+            self.damaged += 1
+            stream.cursor = stream.start + stream.peak
+        else:
+            stream.cursor = report.end - stream.margin
+            self._measured(self._points[stream.row, : report.points], [report.snr])
+        stream.start = stream.last = _NONE
+        return [] if packet is None else [Heard(packet, report.snr, report.rung)]
+
+    def _measured(self, points: Samples, snrs: list[float]) -> None:
+        self.points = points.copy()
+        self._remember(snrs)
 
 
 def _new(functions: Any, constants: ModemConstants) -> int:
@@ -173,7 +333,7 @@ def _counted(result: int) -> int:
     return result
 
 
-def _done(result: int) -> bool:
+def _checked(result: int) -> int:
     if result < 0:
         raise MemoryError("no memory for a compiled kernel to work in")
-    return bool(result)
+    return result

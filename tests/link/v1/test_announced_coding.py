@@ -9,7 +9,6 @@ from rosbags.typesys import get_types_from_msg
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.link_codec import ANNOUNCED
-from gr_ros2.compression.schema import tree_of
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Lost, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
@@ -20,7 +19,7 @@ from tests.link.v1.air import SLOT_S, Air, Robot
 
 THING = "my_msgs/msg/Thing"
 TOPICS = Registry([Topic(0, "thing", THING, TopicOptions())])
-TREE = tree_of(get_types_from_msg("int32 number\nfloat64[6] values\n", THING), THING)
+TYPES = get_types_from_msg("int32 number\nfloat64[6] values\n", THING)
 
 
 def payload(number: int) -> bytes:
@@ -36,12 +35,6 @@ def robots(hears: bool) -> tuple[Robot, Robot, LinkCodec]:
     codec = LinkCodec(TOPICS)
     sender = Robot(1, TOPICS, coding=(codec, None), hears=hears, repeat_s=2.0)
     return sender, Robot(2, coding=(None, decoder), hears=hears), codec
-
-
-def learn(sender: Robot, codec: LinkCodec) -> None:
-    assert TREE is not None
-    codec.learn(THING, TREE)
-    sender.end.announce_coding()
 
 
 def carries_table(sender: Robot) -> bool:
@@ -60,7 +53,7 @@ def test_nothing_is_lost_while_receivers_learn(hears: bool, table_lost: bool) ->
     air.lost = lambda robot, _: losing[0] and robot is sender and carries_table(sender)
     for number in range(60):
         if number == 20:
-            learn(sender, codec)
+            sender.end.learn(THING, TYPES)
             losing[0] = table_lost
         if number == 30:
             losing[0] = False
@@ -76,15 +69,14 @@ def test_what_is_never_announced_is_lost_by_name_and_memory_is_bounded() -> None
     sender, receiver, codec = robots(hears=True)
     air = Air(sender, receiver)
     air.run(1.0)
-    assert TREE is not None
-    codec.learn(THING, TREE)  # and not announced
+    codec.learn(THING, TYPES)  # and not announced
     for number in range(400):
         sender.end.submit(0, payload(number), air.now)
         air.run(2 * SLOT_S)
     lost = [event for event in receiver.events if isinstance(event, Lost)]
     assert len(lost) >= 400 - 256 - 5 and {event.reason for event in lost} == {LedgerRow.UNKNOWN_DICTIONARY}
     assert not receiver.delivered(1)
-    sender.end.announce_coding()
+    sender.end.learn(THING, TYPES)
     air.run(1.0)
     assert receiver.delivered(1)[-1] == payload(399)
 
@@ -93,7 +85,9 @@ def test_a_table_that_says_the_same_is_not_sent_again() -> None:
     sender, receiver, _ = robots(hears=True)
     air = Air(sender, receiver)
     air.run(2.0)
+    sender.end.learn(THING, TYPES)
+    air.run(2.0)
     before = sender.end.sent.repeats
-    sender.end.announce_coding()
+    sender.end.learn(THING, TYPES)
     air.run(2.0)
     assert sender.end.sent.repeats == before

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
+from gr_ros2.phy.burst import BurstModem, Samples
 from gr_ros2.phy.kernels import library as libraries
 from gr_ros2.phy.kernels import modem as compiled
 
@@ -18,6 +18,8 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     *(("ofdm", {"payload_modulation": name}) for name in ("qpsk", "8psk", "16qam", "64qam")),
     *(("ofdm", {"fec": name}) for name in ("cc", "ldpc", "polar")),
     ("ofdm", {"payload_modulation": "64qam", "fec": "cc"}),
+    ("ofdm", {"rate": "adaptive"}),
+    ("ofdm", {"rate": "adaptive", "rungs": ("qpsk-cc", "64qam-cc"), "fft_len": 128, "scramble": True}),
     ("ofdm", {"fft_len": 256, "scramble": True}),
     ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "16qam"}),
     ("ofdm", {"carriers": 25, "pilots": (-24, -8, 8, 24), "detection_threshold": 0.5}),
@@ -69,10 +71,10 @@ class Heard:
 
 def hear(modem: BurstModem, samples: Samples, cuts: list[int]) -> Heard:
     """Feed a stream in pieces of these lengths, in turn."""
-    engine, at, number, packets = BurstReceiver(modem), 0, 0, []
+    engine, at, number, packets = modem.receiver(), 0, 0, []
     while at < len(samples):
         piece = samples[at : at + cuts[number % len(cuts)]]
         at += len(piece)
         number += 1
-        packets += [(at, packet) for packet in engine.feed(piece)]
+        packets += [(at, heard.data) for heard in engine.feed(piece)]
     return Heard(packets, engine.damaged)

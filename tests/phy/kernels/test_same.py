@@ -85,11 +85,19 @@ def test_same_soft_bits_within_rounding(
         for start in each_burst(phy.modem, stream):
             if start + phy.modem.burst_samples > len(stream):
                 break
-            assert fast.end(stream, start) == phy.modem.end(stream, start)
+            head = stream[: start + phy.modem.span]
+            cut = [modem.read(head, start) for modem in (phy.modem, fast)]
             wanted, found = phy.modem.read(stream, start), fast.read(stream, start)
             if wanted is None:
                 assert found is None
                 continue
+            assert found is not None
+            assert wanted.soft is not None
+            assert found.soft is not None
+            for reading in cut if len(head) < wanted.end else ():
+                assert reading is not None
+                assert reading.soft is None
+                assert (reading.length, reading.rung, reading.end) == (wanted.length, wanted.rung, wanted.end)
             typical = float(np.abs(wanted.soft).mean())
             assert np.abs(found.soft - wanted.soft).max() <= EXACT * typical
             assert np.abs(found.points - wanted.points).max() <= EXACT * np.abs(wanted.points).max()
@@ -104,11 +112,14 @@ def test_same_with_packets_of_all_lengths(
 ) -> None:
     phy, fast = both(name, options, functions, monkeypatch)
     draw = random.Random(8)
-    packets = [draw.randbytes(length) for length in (1, 64, 13, 40, 2)]
-    parts = [part for packet in packets for part in (phy.modem.modulate(packet), np.zeros(phy.gap))]
-    for packet in packets:
-        wanted = phy.modem.modulate(packet)
-        assert fast.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+    rungs = list(zip(phy.modem.rungs, fast.rungs, strict=True))
+    packets = [draw.randbytes(length) for length in (1, 64, 13, 40, 2, 33, 7, 58)]
+    parts = []
+    for number, packet in enumerate(packets):
+        rung, fast_rung = rungs[number % len(rungs)]
+        wanted = rung.modulate(packet)
+        assert fast_rung.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+        parts += [wanted, np.zeros(phy.gap)]
     samples = delayed(np.concatenate((np.zeros(400), *parts, np.zeros(400))), 0.3)
     for snr_db in (half_point(phy.computed_pdr), 40):
         stream = received(phy, samples + noise(len(samples), snr_db, 3) * phy.burst_power() ** 0.5)
@@ -214,6 +225,36 @@ def test_threads_do_not_meet_in_one_kernel(
     for thread in threads:
         thread.join()
     assert found == [[heard] * 5 for heard in wanted]
+
+
+@pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
+def test_bursts_made_in_one_call_are_those_made_one_by_one(
+    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both(name, options, functions, monkeypatch)
+    draw, gap = random.Random(1), 5
+    packets = [draw.randbytes(length) for length in (64, 1, 13, 64)]
+    one_by_one = [np.append(phy.modem.modulate(packet), np.zeros(gap)) for packet in packets]
+    for modem in (phy.modem, fast):
+        assert np.abs(modem.modulate_all(packets, gap) - np.concatenate(one_by_one)).max() < EXACT
+
+
+@pytest.mark.parametrize("options", [{}, {"fec": "cc"}], ids=str)
+def test_all_packets_of_one_piece_come_out_whatever_their_number(
+    options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phy, fast = both("ofdm", options, functions, monkeypatch)
+    packets, samples = impaired(phy, 100, 25, 3)
+    begin = 400 + 50 * phy.airtime_samples()
+    samples[begin + 600 : begin + phy.airtime_samples()] = 0  # the second half of a burst
+    engine, reference = fast.receiver(), phy.modem.receiver()
+    piece = received(phy, samples)
+    found, wanted = engine.feed(piece), reference.feed(piece)
+    assert [heard.data for heard in found] == [heard.data for heard in wanted] == packets[:50] + packets[51:]
+    assert [heard.snr for heard in found] == pytest.approx([heard.snr for heard in wanted], rel=EXACT)
+    assert engine.damaged == reference.damaged
+    assert engine.snr_db == pytest.approx(reference.snr_db, abs=0.01)
+    assert np.abs(engine.points - reference.points).max() < EXACT
 
 
 def test_a_compiled_modem_reaches_another_process_by_its_constants(
