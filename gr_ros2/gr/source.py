@@ -34,6 +34,9 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
@@ -135,6 +138,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
+        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
@@ -197,6 +201,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
+        if self.config.version and self.config.compression and isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
     def stop(self) -> bool:
@@ -321,9 +327,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         subscription.follow(partial(self._follow, topic))
 
     def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search.close()
-            self._search = None
+        for search in (self._search, self._types):
+            if search is not None:
+                search.close()
+        self._search = self._types = None
+
+    def _types_in_use(self) -> list[tuple[str, str]]:
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def _learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        with self._lock:
+            self._end.learn(described.type_name, described.types)
+            self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
         """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
