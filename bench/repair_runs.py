@@ -1,7 +1,7 @@
 """What repair delivers in a scenario, as `gr-ros2 run` runs it in simulated time: the table of `bench.repair`, on the
 air of a radio. A packet leaves as soon as the air is free, and a repair on the air cannot be interrupted.
 
-Odometry comes at 35 Hz from the simulator, and from a recording if there is one.
+Odometry comes at 35 Hz from the simulator and from a recording.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from bench.rows import Row
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
+from tests.recordings import DRIVES
 
-RECORDING = Path(__file__).resolve().parents[2] / "shared" / "data" / "husky_outdoor"
-"""Odometry at 10 Hz, played at 35 Hz: 34 s."""
+DRIVE = DRIVES[-1]
 SPEED = 3.5
+"""Its odometry comes at 10 Hz, and is played at 35 Hz."""
 
 
 def repair_runs() -> list[Row]:
@@ -28,8 +29,8 @@ def repair_runs() -> list[Row]:
         registry = Path(folder, "odom.csv")
         registry.write_text("odom,nav_msgs/msg/Odometry\n", encoding="utf-8")
         rows += _rows("simulated", {})
-        if RECORDING.is_dir():
-            rows += _rows("recorded", {"source": f"bag:{RECORDING}", "bag_speed": SPEED, "registry": str(registry)})
+        bag = {"source": f"bag:{DRIVE.path}", "bag_speed": SPEED, "registry": str(registry)}
+        rows += _rows(f"recorded ({DRIVE.path.name})", bag)
     return rows
 
 

@@ -239,6 +239,8 @@ class SourceConfig(Queued, EndConfig):
     :param topics: which topics are sent: names, in which * and ? stand for others; auto = every topic of the namespace;
         -NAME leaves out. Of the registry, where there is one ([] = all); otherwise, with version 1, of the ROS graph,
         which says type and QoS ([] = none)
+    :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
+        call; this needs both directions of a link and version 1
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
     :param dst_id: destination id, 255 broadcast
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
@@ -265,6 +267,7 @@ class SourceConfig(Queued, EndConfig):
         BeforeValidator(lambda given: words_of(given) if isinstance(given, str) else given),
         AfterValidator(checked_words),
     ] = ()
+    services: Annotated[bool, Field(title="Services and actions too")] = True
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
     min_fragment: Annotated[int, Field(ge=1, title="Smallest fragment (bytes)")] = 16

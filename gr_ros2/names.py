@@ -22,6 +22,9 @@ MAX_NODE_LEN = 255
 INFRASTRUCTURE = ("/rosout", "/parameter_events")
 """Topics that every ROS node has and that are rarely meant to be sent by radio."""
 
+OWN_NODES = "/gr_ros2_"
+"""Beginning of the names of this package's nodes, which publish what a link says of itself."""
+
 _FIELD = "{src_id}"
 _LONGEST_ID = 255
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")

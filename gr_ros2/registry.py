@@ -20,6 +20,7 @@ from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
 from gr_ros2.old_names import new_name
+from gr_ros2.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
 from gr_ros2.setting import AUTO
 from gr_ros2.topic_choice import TopicChoice
 from gr_ros2.wire import FORMATS, TableRow
@@ -32,30 +33,6 @@ CALLS_TYPE = "gr_ros2/calls/Frame"
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _FEEDBACK = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*_FeedbackMessage")
-_SERVICE = re.compile(
-    r"[A-Za-z][A-Za-z0-9_]*/(srv/[A-Za-z][A-Za-z0-9_]*|action/[A-Za-z][A-Za-z0-9]*_(SendGoal|GetResult))"
-)
-_ACTION = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*")
-_OF_NODES = {
-    "parameters": {
-        "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
-        "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
-        "get_parameters": "rcl_interfaces/srv/GetParameters",
-        "list_parameters": "rcl_interfaces/srv/ListParameters",
-        "set_parameters": "rcl_interfaces/srv/SetParameters",
-        "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
-    },
-    "lifecycle": {
-        "change_state": "lifecycle_msgs/srv/ChangeState",
-        "get_available_states": "lifecycle_msgs/srv/GetAvailableStates",
-        "get_available_transitions": "lifecycle_msgs/srv/GetAvailableTransitions",
-        "get_state": "lifecycle_msgs/srv/GetState",
-        "get_transition_graph": "lifecycle_msgs/srv/GetAvailableTransitions",
-    },
-}
-"""The services of a node, by a word that stands in place of a type."""
-STATUS = "_action/status"
-"""End of the name of an action's latched topic."""
 _LATCHED = frozenset({"tf_static", "map", "robot_description"})
 """Topics that ROS programs publish transient-local by convention."""
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
@@ -79,11 +56,6 @@ def normalize_type(text: str) -> str:
     if match is None:
         raise ConfigError(f"malformed type {text!r}; write package/Type or package/msg/Type")
     return f"{match[1]}/msg/{match[2]}"
-
-
-def is_service(type_name: str) -> bool:
-    """Whether this is the type of a service: ``package/srv/Type``, or one of those that make an action."""
-    return _SERVICE.fullmatch(type_name) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,14 +101,22 @@ class Topic:
 
     @property
     def of_node(self) -> bool:
-        """Whether this row names a service that nodes have, below the name of its node."""
-        word = self.name.rpartition("/")[2]
-        return any(services.get(word) == self.type_name for services in _OF_NODES.values())
+        """Whether this row names a service that ROS itself gives to nodes, below the name of its node."""
+        return is_of_node(self.name, self.type_name)
+
+    @property
+    def action(self) -> str:
+        """Name of the action that this row is a part of; '' if it is no part of one."""
+        return self.name.rpartition(OF_ACTION)[0]
 
     @property
     def is_topic(self) -> bool:
         """Whether this row names a topic: neither a service nor the row of requests and replies."""
         return self.type_name != CALLS_TYPE and not self.is_service
+
+
+NewRow = tuple[str, str, TopicOptions]
+"""Name, type and options of a row that has no number yet."""
 
 
 class Registry(Sequence[Topic]):
@@ -224,15 +204,24 @@ class Registry(Sequence[Topic]):
     def chosen(self, words: Sequence[str]) -> list[Topic]:
         """The rows that the setting ``topics`` chooses, with or without leading slash; all rows if there is no word.
 
+        An action is chosen as a whole, by its name.
+
         :raises ConfigError: for a name that is not in the registry
         """
         if not words:
             return list(self)
         choice = TopicChoice([word.replace("/", "", word.startswith(("/", "-/"))) for word in words], "")
+        actions = {topic.action.lstrip("/") for topic in self if topic.action}
         for name in choice.named.values():
-            self.named(name)
-        taken = set(choice.of(topic.name.lstrip("/") for topic in self))
-        return [topic for topic in self if topic.name.lstrip("/") in taken]
+            if name not in actions:
+                self.named(name)
+        taken = set(choice.of([*actions, *(topic.name.lstrip("/") for topic in self)]))
+
+        def is_chosen(topic: Topic) -> bool:
+            name, action = topic.name.lstrip("/"), topic.action.lstrip("/")
+            return name in taken or (action in taken and not choice.leaves_out(f"/{name}"))
+
+        return [topic for topic in self if is_chosen(topic)]
 
     def with_options(self, options: Mapping[str, TopicOptions], *, announced: bool = False) -> Registry:
         """The same rows, with configured options instead of the registry's own. Only settings that differ from the
@@ -283,8 +272,8 @@ def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
     if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
         raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
     known = options_of(row.name, options)
-    said = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
-    chosen = {name: value for name, value in said.items() if getattr(known, name) == AUTO}
+    from_row = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
+    chosen = {name: value for name, value in from_row.items() if getattr(known, name) == AUTO}
     merged = build(TopicOptions, {**asdict(known), **chosen})
     special = row.type_name == CALLS_TYPE or is_service(row.type_name)
     return Topic(row.topic_id, row.name, row.type_name if special else normalize_type(row.type_name), merged)
@@ -361,23 +350,11 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
 
 def _parts(name: str, kind: str, options: Mapping[str, str]) -> Iterator[tuple[str, str, Mapping[str, str]]]:
     """Name, type and options of the topics and services for which a row stands."""
-    if kind in _OF_NODES:
-        parts = {f"/{service}": type_name for service, type_name in _OF_NODES[kind].items()}
-    elif _ACTION.fullmatch(kind):
-        parts = {
-            "/_action/send_goal": f"{kind}_SendGoal",
-            "/_action/cancel_goal": "action_msgs/srv/CancelGoal",
-            "/_action/get_result": f"{kind}_GetResult",
-            "/_action/feedback": f"{kind}_FeedbackMessage",
-            f"/{STATUS}": "action_msgs/msg/GoalStatusArray",
-        }
-    else:
-        parts = {"": kind}
-    for end, type_name in parts.items():
+    for part, type_name in parts(name, kind).items():
         own = dict(options)
-        if end and "publish_as" in own:
-            own["publish_as"] += end
-        yield name + end, type_name, own
+        if "publish_as" in own:
+            own["publish_as"] += part.removeprefix(name)
+        yield part, type_name, own
 
 
 def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:

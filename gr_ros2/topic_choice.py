@@ -1,11 +1,12 @@
-"""The setting `topics`: words that choose which topics of a robot are sent.
+"""The setting `topics`: words that choose which topics of a robot are sent, and which services it offers.
 
 A word is a topic name, relative to the robot's namespace or absolute with leading slash. It may contain ``*`` (any
 characters) and ``?`` (one character). ``auto`` stands for ``*``, every topic of the namespace. A word that begins with
 ``-`` leaves out what it names, in whatever order the words stand; if all words leave out, everything else is chosen.
+Services and actions are chosen by the same words.
 
 Invariants: a topic that a word names exactly is chosen even if it is hidden; ``*`` does not choose hidden topics, nor
-those that every ROS node has. Nothing here asks a graph.
+those that every ROS node or a link itself has. Nothing here asks a graph.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from gr_ros2.names import INFRASTRUCTURE, topic_fault
+from gr_ros2.names import INFRASTRUCTURE, OWN_NODES, topic_fault
 from gr_ros2.setting import AUTO
 
 _ALL, _LEAVES_OUT, _WILD = "*", "-", "*?"
@@ -57,23 +58,29 @@ class TopicChoice:
     def __bool__(self) -> bool:
         return self.open or bool(self.named)
 
-    def row_name(self, name: str) -> str | None:
+    def row_name(self, name: str, *, hidden: bool = False) -> str | None:
         """The name by which a topic of the graph is sent, or None if it is not chosen.
 
         A topic that was chosen by a relative word has a relative name.
 
-        :param name: absolute name on the graph
+        :param name: absolute name on the graph; that of a service, an action or a node for what these have
+        :param hidden: whether only a word that names it exactly chooses it
         """
-        if any(fnmatchcase(name, pattern) for pattern in self._left_out):
+        if self.leaves_out(name):
             return None
         if name in self.named:
             return self.named[name]
-        if name in INFRASTRUCTURE or "/_" in name:  # ROS hides what begins with _
+        hidden = hidden or name in INFRASTRUCTURE or name.startswith(OWN_NODES)
+        if hidden or "/_" in name:  # ROS hides what begins with _
             return None
         for pattern in self._patterns:
             if fnmatchcase(name, self._absolute(pattern)):
                 return name if pattern.startswith("/") else name.removeprefix(self._namespace)
         return None
+
+    def leaves_out(self, name: str) -> bool:
+        """Whether a word leaves this out, by its absolute name on the graph."""
+        return any(fnmatchcase(name, pattern) for pattern in self._left_out)
 
     def of(self, names: Iterable[str]) -> list[str]:
         """Those of some names, relative or absolute, that are chosen."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import json
 import re
 import shutil
 import signal
@@ -12,10 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from gr_ros2 import grc_python
 from gr_ros2.errors import ConfigError
 from gr_ros2.grc_path import example
+from gr_ros2.grc_path import grc_path as block_folder
 from gr_ros2.grc_python import MODULE, PATH_FILE, OtherPython, ask, finds_us, grc_program, provide, withdraw
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
@@ -25,6 +29,7 @@ from tests.waiting import PATIENCE_S, wait_for
 ROOT = Path(__file__).resolve().parent.parent
 GRCC = Path("/usr/bin/grcc")
 GRC = Path("/usr/bin/gnuradio-companion")
+BLOCKS = block_folder()
 ODOM = "nav_msgs/Odometry"
 
 
@@ -201,6 +206,32 @@ def colours(pixels: Path) -> int:
     """How many different pixels a screen has."""
     data = pixels.read_bytes()
     return len(set(memoryview(data[len(data) % 4 :]).cast("I")))
+
+
+@pytest.mark.slow
+def test_the_window_explains_every_block_and_each_of_its_settings(home: Path, screen: tuple[str, Path]) -> None:
+    """GRC writes the text over a field itself: key, type and value. Ours is on the page Documentation."""
+    done = subprocess.run(
+        ["/usr/bin/python3", Path(__file__).with_name("grc_texts.py")],
+        env=plain(home, DISPLAY=screen[0]),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        cwd=home,
+    )
+    assert done.returncode == 0, done.stderr
+    shown = json.loads(done.stdout.splitlines()[-1])
+    blocks = {path.name.partition(".")[0]: yaml.safe_load(path.read_text()) for path in BLOCKS.glob("*.block.yml")}
+    assert shown.keys() == blocks.keys()
+    for name, block in blocks.items():
+        texts, summary = shown[name], block["documentation"].splitlines()[0]
+        assert html.unescape(texts["hover"]).startswith(summary), name
+        assert texts["page"].startswith(summary), name
+        explained = tuple(re.findall(r"^([^:\n]+): \S", texts["page"], re.MULTILINE))
+        for parameter in block["parameters"]:
+            assert parameter["label"] in texts["labels"], (name, parameter["label"])
+            assert parameter["label"].partition(" (")[0].startswith(explained), (name, parameter["label"])
+            assert any(text.startswith(f"Key: {parameter['id']}\n") for text in texts["hovers"]), parameter["id"]
 
 
 @pytest.mark.slow

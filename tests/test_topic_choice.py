@@ -13,7 +13,7 @@ from gr_ros2.topic_choice import TopicChoice
 
 GRAPH = (
     *("/robot_1/odom", "/robot_1/map", "/robot_1/camera/image", "/robot_1/camera/info", "/robot_1/_action/status"),
-    *("/robot_2/odom", "/tf", "/rosout", "/parameter_events"),
+    *("/robot_2/odom", "/tf", "/rosout", "/parameter_events", "/gr_ros2_link_1/statistics"),
 )
 NAMES = st.from_regex(r"[a-z]{1,3}(/[a-z]{1,3})?", fullmatch=True)
 
@@ -49,7 +49,7 @@ def test_in_the_root_namespace_what_every_node_has_is_not_meant() -> None:
     found = chosen("auto", "")
     assert "/tf" in found
     assert found["/robot_1/odom"] == "robot_1/odom"
-    assert not found.keys() & {"/rosout", "/parameter_events", "/robot_1/_action/status"}
+    assert not found.keys() & {"/rosout", "/parameter_events", "/robot_1/_action/status", "/gr_ros2_link_1/statistics"}
     assert "/rosout" in chosen("auto, rosout", "")
 
 
@@ -75,6 +75,31 @@ def test_of_a_registry() -> None:
     assert rows("-camera/*", "-/tf") == ["odom", "map"]
     with pytest.raises(ConfigError, match="'scan' is not in the registry"):
         rows("auto", "scan")
+
+
+def test_an_action_of_a_registry_is_chosen_as_one() -> None:
+    registry = Registry.from_rows(
+        {"odom": "std_msgs/String", "/go": "a/action/Go", "clear": "b/srv/Clear", "planner": "parameters"}
+    )
+
+    def rows(*words: str) -> list[str]:
+        return [topic.name for topic in registry.chosen(words)]
+
+    parts = [f"/go/_action/{name}" for name in ("send_goal", "cancel_goal", "get_result", "feedback", "status")]
+    assert rows() == rows("auto")
+    assert rows("go") == rows("*o", "-odom") == parts
+    assert rows("/go", "-go/_action/feedback") == [name for name in parts if not name.endswith("feedback")]
+    assert rows("go/_action/status") == parts[-1:]
+    assert rows("auto", "-/go", "-planner/*") == ["odom", "clear"]
+
+
+def test_what_is_hidden_is_chosen_only_by_its_name() -> None:
+    choice = TopicChoice(["auto", "planner", "-*/left_out"], "/robot_1")
+    assert choice.row_name("/robot_1/planner", hidden=True) == "planner"
+    assert choice.row_name("/robot_1/other") == "other"
+    assert choice.row_name("/robot_1/other", hidden=True) is None
+    assert choice.leaves_out("/robot_1/a/left_out")
+    assert not choice.leaves_out("/robot_1/planner")
 
 
 @given(st.lists(NAMES, max_size=6), st.lists(NAMES, min_size=1, max_size=6))

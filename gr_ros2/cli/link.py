@@ -49,7 +49,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @_flag("device", metavar="ARGS")
 @_flag("frequency", type=float, metavar="HZ")
 @_flag("frequency-rx", type=float, metavar="HZ")
-@click.option("--registry", metavar="CSV", help="Without CONFIG: which topics; default the built-in table4.")
+@click.option("--registry", metavar="CSV", help="Without CONFIG: a file of topics to send; default: --topics auto.")
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )
@@ -163,10 +163,10 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
     """Print what runs and what it waits for, with one status line until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import Waiting
 
-    said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
-    said(say, _opening(running))
+    guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
+    guarded(say, _opening(running))
     if running.remark:
-        said(say, running.remark)
+        guarded(say, running.remark)
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
     waiting = Waiting(running.source)
@@ -176,12 +176,12 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
             if (waits_for := waiting.look()) is not None:
-                said(say, waits_for)
+                guarded(say, waits_for)
             if isinstance(status, Status):
-                said(status.update, status_line(running.stats()))
+                guarded(status.update, status_line(running.stats()))
             elif time.monotonic() - shown >= LOG_S:
                 shown = time.monotonic()
-                said(say, status_line(running.stats()))
+                guarded(say, status_line(running.stats()))
 
 
 def status_line(stats: Mapping[str, Any]) -> str:
@@ -203,7 +203,6 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"{lost} messages lost on the ROS graph before they were sent")
     if sink["publish_failed"]:
         parts.append(f"{sink['publish_failed']} messages not published")
-    troubles = {**stats["front_end"], "refused": packets["refused"], "damaged": packets["damaged"]}
-    quiet = ("name", "bursts_in", "bursts_out", "frames_in", "frames_out", "foreign")
-    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if name not in quiet and count]
+    troubles = {**stats["front_end"]["lost"], "refused": packets["refused"], "damaged": packets["damaged"]}
+    parts += [f"{count} {name.replace('_', ' ')}" for name, count in troubles.items() if count]
     return "; ".join(parts)

@@ -22,9 +22,11 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
+from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.names import INFRASTRUCTURE, checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic
+from gr_ros2.service_rows import OF_ACTION, ServiceRow, parts, rows_of
 from gr_ros2.setting import AUTO, Auto
 
 _NO_MESSAGES = {"srv": "a service", "action": "an action"}
@@ -90,15 +92,26 @@ class SharedGraph(Completed):
     "--domain-id", default=AUTO, type=OrAuto(click.IntRange(0, 232)), help="ROS domain; default auto: ROS_DOMAIN_ID."
 )
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
+@click.option("--services", is_flag=True, help="Services and actions too, for links of version 1.")
 @_out
 def from_graph(
-    *, namespace: str, topics: str, middleware: str, domain_id: int | Auto, wait: float, out: Path | None
+    *,
+    namespace: str,
+    topics: str,
+    middleware: str,
+    domain_id: int | Auto,
+    wait: float,
+    services: bool,
+    out: Path | None,
 ) -> None:
     """Write a registry from the topics that are published on the ROS graph."""
     with join_graph(middleware, domain_id=domain_id, node_name="gr_ros2") as graph:
         time.sleep(wait)  # discovery does not report when it is complete
         found = graph.discover()
-    _write(registry_csv(found, namespace, _names(topics)), unfit(found), out)
+        offered = rows_of(graph.discover_services()) if services and isinstance(graph, ServiceGraph) else []
+    actions = {row.name for row in offered}
+    left_out = {topic: why for topic, why in unfit(found).items() if topic.rpartition(OF_ACTION)[0] not in actions}
+    _write(registry_csv(found, namespace, _names(topics), services=offered), left_out, out)
 
 
 @click.command("from-bag")
@@ -130,7 +143,7 @@ def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:
             reasons[topic] = f"it has several types, {' and '.join(sorted(names))}"
         elif kind in _NO_MESSAGES or "/_action/" in topic:
             owner = _NO_MESSAGES.get(kind, "an action")
-            reasons[topic] = f"it belongs to {owner}, whose row this command does not write (docs/how-to/services.md)"
+            reasons[topic] = f"it belongs to {owner}, for which this registry has no row (docs/how-to/services.md)"
         elif kind != "msg":
             reasons[topic] = f"{names[0]!r} is no message type of ROS"
         elif fault := topic_fault(topic):
@@ -139,7 +152,11 @@ def unfit(found: Sequence[TopicInfo]) -> dict[str, str]:
 
 
 def registry_csv(
-    found: Sequence[TopicInfo], namespace: str, wanted: Sequence[str] = (), bag: Path | None = None
+    found: Sequence[TopicInfo],
+    namespace: str,
+    wanted: Sequence[str] = (),
+    bag: Path | None = None,
+    services: Sequence[ServiceRow] = (),
 ) -> str:
     """The text of a registry CSV with header.
 
@@ -149,8 +166,9 @@ def registry_csv(
     :param bag: the bag of the topics; the CSV then has columns with the QoS that their publishers offered. None: the
         topics are of the graph, which does not tell all of the QoS, and where subscriptions adapt; the CSV then has a
         column only for latched topics
+    :param services: services and actions of the graph; those that ROS itself gives to nodes are left out
     :raises ConfigError: when nothing is left, a wanted topic is missing or unfit, the namespace is not valid in ROS, or
-        more than 16 topics remain
+        more than 240 rows remain
     """
     try:
         checked_namespace(namespace)
@@ -163,21 +181,31 @@ def registry_csv(
         for info in sorted(found, key=lambda info: info.topic)
         if info.publishers and info.topic.startswith(prefix) and info.topic not in (*INFRASTRUCTURE, *reasons)
     }
-    names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or list(published)
+    offered = {
+        name: row.kind
+        for row in services
+        if row.name.startswith(prefix)
+        and not row.of_node
+        and not topic_fault(row.name)
+        and "/_" not in row.name
+        and (name := row.name.removeprefix(prefix)) not in published
+    }
+    names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or [*published, *offered]
     seen = f"published below {prefix} are {', '.join(published) or 'no topics'}"
     for name in names:
         if why := reasons.get(f"{prefix}{name}"):
             raise ConfigError(f"topic {name!r} cannot be registered: {why}")
-        if name not in published:
+        if name not in published and name not in offered:
             raise ConfigError(f"topic {name!r} is not {f'in {bag}' if bag else 'on the graph'}; {seen}")
     if not names:
         remedy = f"choose another namespace of {bag}" if bag else "is the robot running, and in this ROS domain?"
         raise ConfigError(f"nothing to register: {seen}; {remedy}")
-    if len(names) > MAX_TOPICS:
+    count = sum(len(parts(name, offered.get(name, ""))) for name in names)
+    if count > MAX_TOPICS:
         raise ConfigError(
-            f"{len(names)} topics, a registry has at most {MAX_TOPICS}; choose with --namespace or --topics; {seen}"
+            f"{count} topics, a registry has at most {MAX_TOPICS}; choose with --namespace or --topics; {seen}"
         )
-    offers = {name: _offered(published[name].publishers) for name in names}
+    offers = {name: _offered(published[name].publishers) for name in names if name in published}
     columns: tuple[str, ...] = _QOS_COLUMNS
     if bag is None:
         offers = {
@@ -187,8 +215,9 @@ def registry_csv(
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["topic", "type", *columns])
-    for name, offer in offers.items():
-        writer.writerow([name, published[name].type_name, *(offer[column] for column in columns)])
+    for name in names:
+        qos = [offers[name][column] if name in offers else "" for column in columns]
+        writer.writerow([name, offered[name] if name in offered else published[name].type_name, *qos])
     return text.getvalue()
 
 

@@ -63,21 +63,21 @@ class LiveCalls:
         self._lock, self._work = end.lock, end.work
         self._engine = Calls(self._end.settings.src_id, self._end.boot)
         self._row = len(source.registry)
-        self._sink = sink
+        self._source, self._sink = source, sink
         self._clock = source.clock
         self._robots: dict[int, _Robot] = {}
         self._servers: dict[tuple[int, int], ServiceServer] = {}
         self._counters: Counter[str] = Counter()
         self._changing = threading.Lock()  # for the servers; held while they are made and closed
         self._closed = False
-        self._own = {topic.topic_id: Offer(name, _deadline(topic)) for name, topic in source.services.items()}
+        self._own: dict[int, Offer] = {}
+        """The services of this robot by id."""
         self._offered: dict[int, Offer] = {}
         """The services of this robot whose server is there, by id."""
         self._clients: dict[int, ServiceClient] = {}
         for name, topic in source.services.items():
-            graph = _with_services(source.middleware, name)
-            changed = partial(self._server_changed, topic.topic_id)
-            self._clients[topic.topic_id] = graph.client(name, topic.type_name, self._reply, changed)
+            self._offer(name, topic)
+        source.offer_with(self._offer_found)
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:
@@ -130,6 +130,31 @@ class LiveCalls:
             end.close()
 
     # ---- services of this robot
+
+    def _offer(self, name: str, topic: Topic) -> None:
+        """Offer a service to other robots, for as long as its server is there.
+
+        :raises ConfigError: for a service that this graph cannot have
+        """
+        graph = _with_services(self._source.middleware, name)
+        self._own[topic.topic_id] = Offer(name, _deadline(topic))
+        changed = partial(self._server_changed, topic.topic_id)
+        client = graph.client(name, topic.type_name, self._reply, changed)
+        with self._changing:
+            if not self._closed:
+                self._clients[topic.topic_id] = client
+                return
+        client.close()
+
+    def _offer_found(self, name: str, topic: Topic) -> None:
+        """The same for a service that the source has found on its graph."""
+        if not self._source.config.key and not self._own:
+            _log.warning(
+                "service %s and others can be called by whoever can send on this link, as it has no key; set key, "
+                "or ros_source.services = false",
+                name,
+            )
+        self._offer(name, topic)
 
     def _server_changed(self, topic_id: int, there: bool) -> None:
         with self._lock:

@@ -18,9 +18,6 @@ from gr_ros2.link.ledger_rows import LedgerRow
 
 Stats = Mapping[str, Any]
 
-_NO_LOSS = {"bursts_in", "bursts_out", "frames_in", "frames_out", "foreign", "blanked"}
-"""Counters of a front end that are not losses: what passed, what others sent, and samples that half duplex
-loses by design."""
 _LOCKED = {
     "no_key": "sealed, and no key is configured here",
     "not_sealed": "not sealed, where a key is configured",
@@ -83,7 +80,8 @@ class _Look(NamedTuple):
     lost_on_graph: int
     unpublished: int
     topics: dict[str, tuple[int, int]]
-    front_end: dict[str, int]
+    front_end_passed: Mapping[str, int]
+    front_end_lost: Mapping[str, int]
     locked: dict[str, int]
 
 
@@ -111,7 +109,7 @@ class LinkHealth:
         while len(self._looks) > 1 and self._looks[1].now <= now - self._config.window_s:
             self._looks.popleft()
         before = self._looks[0] if self._looks else look
-        front_end = self._front_end(look, self._looks[-1].front_end if self._looks else {})
+        front_end = self._front_end(look, self._looks[-1].front_end_lost if self._looks else {})
         self._looks.append(look)
         topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
         receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
@@ -167,8 +165,9 @@ class LinkHealth:
     def _front_end(self, look: _Look, before: Mapping[str, int]) -> list[Status]:
         """The counters of the front end, with a warning of new losses. Empty if it counts nothing."""
         status = Status(f"{self._name}: front end")
-        for name, count in look.front_end.items():
-            status.warn(name.replace("_", " "), count, count if name in _NO_LOSS else before.get(name, 0))
+        status.values |= {name.replace("_", " "): str(count) for name, count in look.front_end_passed.items()}
+        for name, count in look.front_end_lost.items():
+            status.warn(name.replace("_", " "), count, before.get(name, 0))
         return [status] if status.values else []
 
     def _topic(self, name: str, topic: Stats, before: _Look, look: _Look) -> Status:
@@ -193,7 +192,6 @@ def _look(stats: Stats, now: float) -> _Look:
     sink = stats["sink"]
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
-    front_end = {name: count for name, count in stats.get("front_end", {}).items() if name != "name"}
     lost_on_graph = sum(topic[LedgerRow.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
@@ -204,7 +202,8 @@ def _look(stats: Stats, now: float) -> _Look:
         lost_on_graph=lost_on_graph,
         unpublished=sink[LedgerRow.PUBLISH_FAILED],
         topics=topics,
-        front_end=front_end,
+        front_end_passed=stats["front_end"]["passed"],
+        front_end_lost=stats["front_end"]["lost"],
         locked={kind: count for kind, count in sink["rejected"].items() if kind in _LOCKED},
     )
 

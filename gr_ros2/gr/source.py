@@ -13,7 +13,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,11 +31,16 @@ from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
+from gr_ros2.service_rows import ServiceRow, parts, rows_of
 from gr_ros2.setting import AUTO, Auto
 from gr_ros2.topic_choice import TopicChoice
 
@@ -62,6 +67,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param seed: seed of sequence number and entry ids; None: random
     :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
         packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
+    :param ladder: the rungs of an adaptive rate (:attr:`gr_ros2.phy.Phy.ladder`). Each packet then is a PDU whose
+        metadata names its ``rung``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -76,6 +83,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
         any_length: bool = False,
+        ladder: Sequence[Rung] = (),
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -86,7 +94,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False, any_length=any_length)
+            start = start_of(self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -122,11 +130,15 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
         """The same for the services that other robots may call."""
         self.choice = TopicChoice(() if self.registry else words, namespace)
-        """The topics that are looked for on the ROS graph."""
+        """The topics and services that are looked for on the ROS graph."""
+        self.offered: set[str] = set()
+        """Absolute names of the services, actions and nodes that were found and chosen."""
+        self._offer: Callable[[str, Topic], None] | None = None
         self._left_out: set[str] = set()
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
+        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
@@ -155,16 +167,30 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     @property
     def unmatched(self) -> list[str]:
-        """Names, on the ROS graph, of the topics that nobody publishes yet."""
+        """Names, on the ROS graph, of the topics without a publisher; the patterns, if no name is known yet."""
         subscriptions, subscribed = self._subscriptions, self.subscribed
-        unseen = [name for name in self.choice.named if name not in subscribed]
+        unseen = [name for name in self.choice.named if name not in subscribed and name not in self.offered]
+        if self.choice.open and not subscribed and not unseen:
+            return [self.choice.everything]
         waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
         return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
+
+    def rate(self) -> dict[str, str]:
+        """With an adaptive rate, the name of the rung of the newest packet as ``rung``; otherwise nothing."""
+        ladder = self._end.ladder
+        return {"rung": ladder[self._end.rung].name} if ladder else {}
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
         with self._lock:
             self._end.use_credit()
+
+    def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
+        """Look for services too, from the next start on, unless ``services`` of the settings is false.
+
+        :param offer: called with the name of each service on the ROS graph and its row, from a thread of this block
+        """
+        self._offer = offer if self.config.services else None
 
     def start(self) -> bool:
         self._unread = not self._port.find_readers()
@@ -174,7 +200,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
-            self._search = TopicSearch(self.middleware, self._found)
+            self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
+        if self.config.version and self.config.compression and isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
     def stop(self) -> bool:
@@ -299,12 +327,22 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         subscription.follow(partial(self._follow, topic))
 
     def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search.close()
-            self._search = None
+        for search in (self._search, self._types):
+            if search is not None:
+                search.close()
+        self._search = self._types = None
 
-    def _found(self, infos: Sequence[TopicInfo]) -> None:
-        """Send the topics of the graph that are chosen and not sent yet."""
+    def _types_in_use(self) -> list[tuple[str, str]]:
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def _learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        with self._lock:
+            self._end.learn(described.type_name, described.types)
+            self._work.notify()
+
+    def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
+        """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
         for info in infos:
             row_name = (
                 self.choice.row_name(info.topic) if info.publishers and info.topic not in self.subscribed else None
@@ -314,11 +352,53 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             try:
                 self._add(row_name, info)
             except GrRos2Error as error:
-                self._left_out.add(info.topic)
-                full = len(self.registry) == MAX_TOPICS
-                level = logging.DEBUG if full and self._full else logging.WARNING
-                self._full = full
-                self._log.log(level, "topic %s is not sent: %s", info.topic, error)
+                self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
+        for row in rows_of(services):
+            row_name = self.choice.row_name(row.name, hidden=row.of_node)
+            if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self._left_out:
+                continue
+            try:
+                self._add_services(row_name, row)
+            except GrRos2Error as error:
+                self._leave_out(f"{row.name} {row.kind}", f"{row.name} ({row.kind}) is not offered", error)
+
+    def _leave_out(self, key: str, what: str, error: GrRos2Error) -> None:
+        """Say once what cannot be sent; of what finds no room, only the first."""
+        self._left_out.add(key)
+        full = len(self.registry) == MAX_TOPICS
+        level = logging.DEBUG if full and self._full else logging.WARNING
+        self._full = full
+        self._log.log(level, "%s: %s", what, error)
+
+    def _is_offered(self, row: ServiceRow) -> bool:
+        """Whether the services of a row are offered already, or have come by radio."""
+        names = parts(row.name, row.kind)
+        return any(name in self.services or LOOP_GUARD.returns(self._graph, name) for name in names)
+
+    def _add_services(self, row_name: str, row: ServiceRow) -> None:
+        """Offer the services of a row to other robots. The topics of an action are sent.
+
+        :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
+        """
+        assert self._offer is not None
+        options = self.config.topic_options
+        rows = [(name, type_name, options_of(name, options)) for name, type_name in parts(row_name, row.kind).items()]
+        namespace = self.config.namespace
+        with self._lock:
+            self.registry = self._end.add(rows)
+            added = {topic.on_graph(namespace): topic for topic in self.registry[-len(rows) :]}
+            added = {name: topic for name, topic in added.items() if not self.choice.leaves_out(name)}
+            self.services = {**self.services, **{name: topic for name, topic in added.items() if topic.is_service}}
+            topics = {name: topic for name, topic in added.items() if topic.is_topic}
+            self.subscribed = {**self.subscribed, **topics}
+        self.offered.add(row.name)
+        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
+        self._log.info("%s (%s) of the ROS graph is offered to other robots", row.name, row.kind)
+        for name, topic in added.items():
+            if topic.is_service:
+                self._offer(name, topic)
+            else:
+                self._subscribe_to(name, topic)
 
     def _add(self, row_name: str, info: TopicInfo) -> None:
         """Announce a topic of the graph, and subscribe it.
@@ -327,7 +407,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """
         options = options_of(row_name, self.config.topic_options)
         with self._lock:
-            self.registry = self._end.add(row_name, normalize_type(info.type_name), options)
+            self.registry = self._end.add([(row_name, normalize_type(info.type_name), options)])
             topic = self.registry[-1]
             subscribed = {**self.subscribed, info.topic: topic}
             self._adapt(topic, info.publishers)
@@ -335,7 +415,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
             self.subscribed = subscribed
             self._work.notify()
-        LOOP_GUARD.add_source(self, self._graph, subscribed)
+        LOOP_GUARD.add_source(self, self._graph, [*subscribed, *self.services])
         self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
         self._subscribe_to(info.topic, topic)
 
@@ -415,12 +495,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-        if self._port.bundles:
+        if self._port.bundles and not self._end.ladder:
             self._port.send([sent.data for sent in packets])
         else:
             wall = time.time()
             for sent in packets:
-                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall))
+                rung = sent.rung if self._end.ladder else None
+                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall, rung))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:

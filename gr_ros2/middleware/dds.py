@@ -33,7 +33,7 @@ from gr_ros2.middleware.cdr_dds import (
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
 from gr_ros2.middleware.dds_services import SERVICE_QOS, DdsClient, DdsServer, ServiceParticipant
-from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
+from gr_ros2.middleware.services import DESCRIPTION_TYPE, ReplyCallback, RequestCallback, ServerCallback, Witness
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -147,6 +147,40 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         with self._lock:
             publishers, subscribers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
         return grouped(self._foreign(publishers), self._foreign(subscribers))
+
+    def discover_services(self) -> dict[str, str]:
+        """See services. A server has a reader of requests and a writer of replies, in one participant."""
+        with self._lock:
+            writers, readers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
+        replying = {(writer.participant, writer.topic) for writer in writers if writer.participant != self._guid}
+        found = {}
+        for reader in readers:
+            service = ros_graph.ros_service(reader.topic, reader.type_name)
+            if service is not None:
+                (_, _), (replies, _) = ros_graph.dds_service(*service)
+                if (reader.participant, replies) in replying:
+                    found[service[0]] = service[1]
+        return found
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:
+        name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
+        with self._lock:
+            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
+        hashes: dict[str, set[bytes]] = {}
+        services: dict[bytes, list[str]] = {}
+        for endpoint in everyone:
+            if endpoint.participant == self._guid or not endpoint.is_cyclone:
+                continue  # services of Fast DDS cannot be called from here
+            if (endpoint.topic, endpoint.type_name) == (name, kind):
+                hashes.setdefault(ros_graph.hash_told(endpoint.user_data), set()).add(endpoint.participant)
+            service = ros_graph.ros_service(endpoint.topic, endpoint.type_name)
+            if service is not None and service[1] == DESCRIPTION_TYPE:
+                services.setdefault(endpoint.participant, []).append(service[0])
+        found = []
+        for digest in sorted(hashes.keys() - {""}):
+            named = sorted({service for owner in hashes[digest] for service in services.get(owner, ())})
+            found.append(Witness(digest, tuple(named)))
+        return found
 
     def close(self) -> None:
         worker = threading.current_thread() is self._thread

@@ -214,6 +214,10 @@ class MemoryMiddleware(ServiceGraph):
             ]
         return grouped(*found)
 
+    def discover_services(self) -> dict[str, str]:
+        with self.graph.lock:
+            return dict(server.names for server in self.graph.services.servers if server.participant is not self)
+
     def close(self) -> None:
         with self.graph.lock:
             if self.closed:

@@ -43,6 +43,7 @@ __all__ = [
     "hash_told",
     "participant_entities_info",
     "resolve_domain_id",
+    "ros_service",
     "ros_topic",
     "ros_type",
 ]
@@ -67,6 +68,7 @@ DISCOVERY_USER_DATA = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1e
 package."""
 
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv|action)::dds_::([A-Za-z0-9_]+)_")
+_REQUESTS, _REQUEST_TYPE = re.compile(r"rq(/.+)Request"), re.compile(r"(.+/.+/.+)_Request")
 _TYPE_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
 _24_BYTE_GID_DISTROS = frozenset({"", "foxy", "galactic", "humble"})
 
@@ -84,6 +86,12 @@ def dds_service(service: str, type_name: str) -> tuple[tuple[str, str], tuple[st
     """
     request, response = (dds_type(f"{type_name}_{part}") for part in ("Request", "Response"))
     return (f"rq{service}Request", request), (f"rr{service}Reply", response)
+
+
+def ros_service(name: str, type_name: str) -> tuple[str, str] | None:
+    """Name and type of a service, from topic and type of its requests; None for any other topic."""
+    service, kind = _REQUESTS.fullmatch(name), _REQUEST_TYPE.fullmatch(ros_type(type_name))
+    return None if service is None or kind is None else (service[1], kind[1])
 
 
 def ros_topic(name: str) -> str | None:

@@ -1,4 +1,5 @@
-"""One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, delay, sink.
+"""One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, delay, sink; and further
+receivers, each with a channel and a sink of its own.
 
 Invariants: any PHY of the table works here; a PHY without samples skips transmitter, channel and receiver; a block that
 would do nothing is left out, since each Python block costs as much time per packet as source or sink.
@@ -14,6 +15,7 @@ from gr_ros2.config import ChannelConfig
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
+from gr_ros2.phy.branch import Branch
 from gr_ros2.phy.channel import PacketLoss
 from gr_ros2.phy.delay import PacketDelay
 from gr_ros2.phy.flowgraph import Flowgraph
@@ -35,6 +37,7 @@ class LoopbackLink(PacketPath, Flowgraph):
     :param delay_s: s that a packet takes beside its airtime
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
+    :param further: the channel and the sink of each further receiver
     :raises ConfigError: for a channel that this PHY does not support
     """
 
@@ -49,6 +52,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         paced: bool = True,
         delay_s: float = 0.0,
         instrumented: bool = False,
+        further: Sequence[tuple[ChannelConfig, Any]] = (),
     ) -> None:
         super().__init__("gr_ros2_loopback", f"phy {phy.name}")
         self.phy, self.source, self.sink = phy, source, sink
@@ -60,16 +64,19 @@ class LoopbackLink(PacketPath, Flowgraph):
             airtime_of = phy.airtime if phy.any_length else None
             self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
             last = self._follow(last, self._gate)
+        sent = self._transmit(last) if phy.has_samples else last
+        self.branches = [self._branch(sent, *each) for each in further]
+        """The further receivers."""
         if phy.has_samples:
             # The channel also stops tags.
             faded = instrumented or bool(self.channel.on_samples()) or phy.leaves_tags()
-            self._receive(self._transmit(last), faded=faded, shown=instrumented)
+            self._receive(sent, faded=faded, shown=instrumented)
             last = self._receiver
-            # A hier block with message ports keeps itself alive, and with it, for OFDM, 60 of the system's 4096 shared
-            # memory segments.
-            for hier_block in (self._transmitter, self._receiver):
-                if hier_block is not None:
-                    weakref.finalize(self, hier_block.release)
+        # A hier block with message ports keeps itself alive, and with it, for OFDM, 60 of the system's 4096 shared
+        # memory segments.
+        for hier_block in (self._transmitter, self._receiver, *self.branches):
+            if hier_block is not None:
+                weakref.finalize(self, hier_block.release)
         if self.channel.loses_packets or instrumented:
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)
@@ -92,6 +99,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         """Count the channel's outages from ``now`` (s, monotonic) instead of from the start of the flowgraph."""
         if self._loss is not None:
             self._loss.epoch = now
+        for branch in self.branches:
+            branch.run_began(now)
 
     def gate_lateness(self) -> Lateness | None:
         """Delays of the gate; None if there is no gate."""
@@ -100,6 +109,16 @@ class LoopbackLink(PacketPath, Flowgraph):
     def passed_at(self) -> Sequence[float]:
         """s, monotonic, when each packet passed the gate; () if there is no gate."""
         return () if self._gate is None else self._gate.passed_at
+
+    def _branch(self, sent: Any, channel: ChannelConfig, sink: Any) -> Branch:
+        """Connect a further receiver to a block that gives samples, or packets for a PHY without samples."""
+        branch = Branch(self.phy, channel)
+        if self.phy.has_samples:
+            self.connect(sent, branch)
+        else:
+            self._follow(sent, branch)
+        self._follow(branch, sink)
+        return branch
 
     def _offered(self) -> int:
         return int(self.source.emitted)
@@ -110,5 +129,6 @@ class LoopbackLink(PacketPath, Flowgraph):
     def _progress(self) -> int:
         """Packets that have passed the link, for the credit window."""
         if self._transmitter is None:
-            return self._handled() + (0 if self._loss is None else self._loss.dropped.total())
+            first = self._handled() + (0 if self._loss is None else self._loss.dropped.total())
+            return min([first, *(branch.received for branch in self.branches)])
         return int(self._transmitter.packets_sent())

@@ -28,7 +28,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
-from gr_ros2.phy.burst_blocks import STOCK, TakesPackets
+from gr_ros2.phy.burst_blocks import STOCK, AirOptions, TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
@@ -53,6 +53,7 @@ from gr_ros2.phy.wifi_frames import (
     scrambler,
     training,
 )
+from gr_ros2.setting import AUTO, Auto
 
 _TX_KEY = "packet_len"
 """The length tag of the module's blocks, which cannot be changed."""
@@ -60,6 +61,8 @@ _SMALLEST_BUFFER = 32768
 """Bytes that GNU Radio gives every buffer by default."""
 _UNKNOWN_CARRIER = 1e15
 """Hz. The module divides a carrier offset by the carrier to compute a clock offset; this makes it 0."""
+_GAP = 400
+"""Zero samples after a packet. With 336 the receiver would keep most of the last packets."""
 _LOOKED_BACK = 16
 """Packets whose SNRs are averaged (median)."""
 _PILOTS = (-21, -7, 7, 21)
@@ -76,7 +79,7 @@ Address = Annotated[str, AfterValidator(_address)]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class WifiOptions:
+class WifiOptions(AirOptions):
     """Settings of this PHY beside packet length and sample rate, which is the channel's bandwidth: 10e6 samples/s for
     802.11p, 20e6 for 802.11a and g.
 
@@ -84,28 +87,26 @@ class WifiOptions:
         much. The receiver reads it in each frame
     :param equalizer: how the receiver estimates the channel: ``ls`` = from the preamble, ``lms`` = follows it by the
         decided symbols, ``comb`` = from the pilots, ``sta`` = averages over time and carriers. ``comb`` reports no SNR
-    :param gap: zero samples after each packet, 360..100000; fewer would keep the last packet in the receiver
-    :param lengths: ``any`` = a packet is as long on the air as its bytes need; ``fixed`` = all have ``packet_len``
-        bytes. The same at both ends
-    :param detection_threshold: part of the preamble's autocorrelation from which on a frame is looked at, 0.3..0.9; the
+    :param gap: zero samples after each packet, 360..100000; fewer would keep the last packet in the receiver.
+        auto = 400
+    :param sensitivity: part of the preamble's autocorrelation from which on a frame is looked at, 0.3..0.9; the
         module's default is 0.56, which hears frames from 5 dB on
     :param network: address 3 (BSSID) of the frames, six octets in hexadecimal. Frames of others are counted as
         ``foreign`` and dropped
     :param address: address 2 of the frames sent, of this radio, for those who listen with other programs
-    :param carrier_hz: the radio's carrier frequency, 1e6..1e11 Hz, by which the module tells how much the clocks
-        differ; null = it takes them to be alike
+    :param channel_hz: the centre frequency of the radio's channel, 1e6..1e11 Hz, by which the module tells how much the
+        clocks differ; null = it takes them to be alike
     """
 
     encoding: Literal[
         "bpsk-1/2", "bpsk-3/4", "qpsk-1/2", "qpsk-3/4", "16qam-1/2", "16qam-3/4", "64qam-2/3", "64qam-3/4"
     ] = "bpsk-1/2"
     equalizer: Literal["ls", "lms", "comb", "sta"] = "ls"
-    gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] = 400
-    lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
-    detection_threshold: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
+    gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
+    sensitivity: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
     network: Annotated[Address, Field(title="Network (BSSID)")] = "02:67:72:2d:72:32"
     address: Annotated[Address, Field(title="Own address")] = "02:67:72:00:00:01"
-    carrier_hz: Annotated[float, Field(ge=1e6, le=1e11, title="Carrier frequency (Hz)")] | None = None
+    channel_hz: Annotated[float, Field(ge=1e6, le=1e11, title="Channel frequency (Hz)")] | None = None
 
 
 class WifiPhy(Phy):
@@ -130,7 +131,7 @@ class WifiPhy(Phy):
             )
         (self.module,) = PHY.modules(self.name)
         self.encoding = ENCODINGS[self.options.encoding]
-        self.gap: int = self.options.gap
+        self.gap: int = _GAP if self.options.gap == AUTO else self.options.gap
         self._padded = self.options.lengths == "fixed"
 
     @property
@@ -249,7 +250,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._number = 0
         self.message_port_register_out(PDUS)
 
-    def take_packets(self, packets: list[bytes]) -> None:
+    def take_packets(self, packets: list[bytes], rung: int) -> None:  # noqa: ARG002 - one rate
         for packet in packets:
             self.message_port_pub(PDUS, pdu_of(self._frames.wrap(packet, self._number)))
             self._number += 1
@@ -296,9 +297,9 @@ class WifiReceiver(ReceiverBlock):
         correlation = filter.fir_filter_ccf(1, [1.0] * window)
         power = filter.fir_filter_fff(1, [1.0] * (window + CP_LEN))
         ratio = blocks.divide_ff()
-        short = wifi.sync_short(options.detection_threshold, 2, False, False)
+        short = wifi.sync_short(options.sensitivity, 2, False, False)
         long = wifi.sync_long(length, False, False)
-        carrier = _UNKNOWN_CARRIER if options.carrier_hz is None else options.carrier_hz
+        carrier = _UNKNOWN_CARRIER if options.channel_hz is None else options.channel_hz
         estimate = getattr(wifi, options.equalizer.upper())
         self._equalizer = wifi.frame_equalizer(estimate, carrier, phy.sample_rate, False, False)
         self._decoder = _Decoder(phy)

@@ -21,8 +21,8 @@ from gr_ros2.config import STRICT, Count, Seconds, Text
 from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
-from gr_ros2.radio.front_end import FrontEnd, Hertz, SharedAir
-from gr_ros2.radio.stream_events import GapCounter
+from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters, Hertz, SharedAir
+from gr_ros2.radio.stream_events import BURSTS_OUT, GapCounter
 from gr_ros2.setting import AUTO, Auto
 
 TOLERANCE = 1e-4
@@ -152,8 +152,9 @@ class DeviceFrontEnd(FrontEnd):
         """How long nothing is sent after each burst, s."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self, packet_len: int | None = None) -> float:
-        return self.layout.total_of(self.phy.airtime_samples(packet_len)) / self.phy.sample_rate + self._silence()
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
+        samples = self.phy.on_rung(rung).airtime_samples(packet_len)
+        return self.layout.total_of(samples) / self.phy.sample_rate + self._silence()
 
     def ahead(self) -> float:
         return 0.0 if self._silence() else _LEAD_S
@@ -172,19 +173,22 @@ class DeviceFrontEnd(FrontEnd):
             "unplugged, or is the machine too slow for phy.sample_rate?"
         )
 
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> FrontEndCounters:
         """Losses, and what the device reports about them.
 
         ``clipped``: samples beyond full scale. ``blanked``: samples not received because this robot was sending.
-        ``overflows``: places where received samples were lost before they came here. The counters of :meth:`_told` are
-        added.
+        ``overflows``: places where received samples were lost before they came here. Those of
+        :meth:`_device_counters` are added.
         """
-        blanked = {} if self._blanker is None else {"blanked": self._blanker.blanked}
+        counted = self._device_counters()
+        passed = {BURSTS_OUT: counted.pop(BURSTS_OUT)} if BURSTS_OUT in counted else {}
+        if self._blanker is not None:
+            passed["blanked"] = self._blanker.blanked
         overflows = {} if self._gaps.gaps is None else {"overflows": self._gaps.gaps}
-        return {"clipped": self._shaper.clipped, **blanked, **overflows, **self._told()}
+        return FrontEndCounters(passed, {"clipped": self._shaper.clipped, **overflows, **counted})
 
-    def _told(self) -> dict[str, int]:
-        """Counters of the bursts after the shaper, by name."""
+    def _device_counters(self) -> dict[str, int]:
+        """Counters of the bursts after the shaper, by name; those sent completely are ``BURSTS_OUT``."""
         return {}
 
     def close(self) -> None:
@@ -253,9 +257,9 @@ class DeviceFrontEnd(FrontEnd):
         except (RuntimeError, ValueError, IndexError) as error:
             if isinstance(error, RadioError):
                 raise
-            said = " ".join(str(error).split()).removeprefix("RuntimeError: ") or type(error).__name__
+            reason = " ".join(str(error).split()).removeprefix("RuntimeError: ") or type(error).__name__
             raise RadioError(
-                f"front_end {self.name}: args = {self.options.args!r}: {said}; is the device plugged in, and free? "
+                f"front_end {self.name}: args = {self.options.args!r}: {reason}; is the device plugged in, and free? "
                 f"{self.find_with} lists devices, args look like {self.example_args}"
             ) from error
 

@@ -23,7 +23,7 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
-from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
+from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndCounters, FrontEndOptions
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 
 _STEP_S = 0.005
@@ -94,11 +94,12 @@ class FileFrontEnd(FrontEnd):
     def finished(self) -> bool:
         return self._replay is not None and self._replay.finished and self._recorder is None
 
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> FrontEndCounters:
         """Numbers of samples. ``unwritten``: not written, for example because the disk is full. ``not_finite``: not a
         finite number in the recording, replaced by 0."""
-        written = {} if self._recorder is None else {"unwritten": self._recorder.failed}
-        return written if self._replay is None else {**written, "not_finite": self._replay.not_finite}
+        unwritten = {} if self._recorder is None else {"unwritten": self._recorder.failed}
+        not_finite = {} if self._replay is None else {"not_finite": self._replay.not_finite}
+        return FrontEndCounters({}, {**unwritten, **not_finite})
 
     def close(self) -> None:
         if self._recorder is not None:

@@ -9,7 +9,7 @@ a thread. `close` releases everything and may be called twice. `counters` counts
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -41,6 +41,17 @@ class SharedAir(FrontEndOptions):
     """
 
     half_duplex: bool = False
+
+
+class FrontEndCounters(NamedTuple):
+    """Counters of a front end, by name.
+
+    :ivar passed: no trouble: what was sent and received, what others sent, and what is not received by design
+    :ivar lost: what was lost or refused, which should not grow
+    """
+
+    passed: dict[str, int]
+    lost: dict[str, int]
 
 
 class FrontEnd(ABC):
@@ -111,12 +122,13 @@ class FrontEnd(ABC):
         """Frequency at which it receives, Hz; None if there is no radio."""
         return None
 
-    def airtime(self, packet_len: int | None = None) -> float:
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
         """Time from the start of one packet to the earliest start of the next, s.
 
         :param packet_len: length of the packet, bytes; None: that of the longest
+        :param rung: with an adaptive rate, the rung that it is sent with
         """
-        return self.phy.airtime(packet_len) + float(self.options.guard_s)
+        return self.phy.airtime(packet_len, rung) + float(self.options.guard_s)
 
     def ahead(self) -> float | None:
         """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a
@@ -140,9 +152,9 @@ class FrontEnd(ABC):
         :raises RadioError: when the device gives or takes no more samples
         """
 
-    def counters(self) -> dict[str, int]:
-        """Counters by name: what was lost or refused here, and what was received and sent."""
-        return {}
+    def counters(self) -> FrontEndCounters:
+        """What passed and what was lost here."""
+        return FrontEndCounters({}, {})
 
     def close(self) -> None:  # noqa: B027 - most have nothing to release
         """Release device, sockets and files. The flowgraph must have stopped."""

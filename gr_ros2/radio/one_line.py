@@ -13,9 +13,8 @@ from typing import Any
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, FrontEndBackend
+from gr_ros2.setting import AUTO
 from gr_ros2.topic_choice import words_of
-
-DEFAULT_REGISTRY = "table4"
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,9 @@ def one_line(
 
     :param robot: 0..254; its topics are in the namespace ``/robot_N``
     :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
-    :param registry: CSV path or the name of a built-in one; None takes the built-in ``table4``, or none with ``topics``
+    :param registry: CSV path or the name of a built-in one; None finds the topics on the ROS graph
     :param flags: value of each option of ``FLAGS`` that was given
-    :param topics: which topics of the registry, or without one of the ROS graph; None sends the whole registry
+    :param topics: which topics of the registry, or without one of the ROS graph; None sends all of them
     :raises ConfigError: for an unknown radio, an option that the radio does not have, or a missing option that it needs
     :raises BackendMissingError: when software that the radio needs is not installed
     """
@@ -71,11 +70,12 @@ def one_line(
         if name not in flags and item.default is MISSING and item.default_factory is MISSING:
             raise ConfigError(f"--{name} is missing, radio {radio} needs it ({FLAGS[name].meaning})")
     chosen = {names[flag]: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
-    default = DEFAULT_REGISTRY if topics is None else ""
+    if topics is None and registry is None:
+        topics = AUTO
     chosen_topics = {} if topics is None else {"topics": list(words_of(topics))}
     return {
         "name": f"robot_{robot}",
-        "registry": default if registry is None else registry,
+        "registry": registry or "",
         "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
         "phy": _phy(FRONT_ENDS[radio]),
         "front_end": {"name": radio, **chosen},

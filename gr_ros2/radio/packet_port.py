@@ -24,7 +24,7 @@ from gr_ros2.phy import Phy
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.radio.framing import Framing
-from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters
 
 _RETRY_S = 1.0
 _JOIN_S = 5.0
@@ -270,15 +270,16 @@ class PacketFrontEnd(FrontEnd):
     def packets(self) -> Any:
         return self._port
 
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> FrontEndCounters:
         """Counters of what passed and what did not.
 
         ``frames_out``, ``frames_in``: packets sent and received. ``not_taken``: packets for which the device had no
         room. ``disconnected``: packets while there was no connection, and ``interruptions``: how often it was lost.
         ``malformed``, ``too_long``: received frames that are no packets. ``foreign``: frames of other stations.
         """
-        names = ("frames_out", "frames_in", "not_taken", "disconnected", "interruptions")
-        return {name: self._counters[name] for name in (*names, "malformed", "too_long", "foreign")}
+        passed = ("frames_out", "frames_in", "foreign")
+        lost = ("not_taken", "disconnected", "interruptions", "malformed", "too_long")
+        return FrontEndCounters(*({name: self._counters[name] for name in names} for names in (passed, lost)))
 
     def close(self) -> None:
         self._port.close()

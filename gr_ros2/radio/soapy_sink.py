@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from gr_ros2.phy.threads import ThreadState
 from gr_ros2.radio.bursts import BurstCutter
+from gr_ros2.radio.stream_events import BURSTS_OUT
 
 _TX, _CHANNEL = 0, 0
 _END_BURST = 1 << 1
@@ -105,8 +106,8 @@ def _call(function: str, *arguments: Any) -> Any:
     # After an error, functions that make an object return None. The others return a code other than 0.
     failed = result is None if function in ("makeStrArgs", "setupStream") else isinstance(result, int) and result != 0
     if failed:
-        said = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
-        raise RuntimeError(said.decode("utf-8", "replace") or f"{function} failed")
+        reason = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
+        raise RuntimeError(reason.decode("utf-8", "replace") or f"{function} failed")
     return result
 
 
@@ -223,7 +224,7 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
         if result in _EVENTS:
             self._counted[_EVENTS[result]] += 1
         elif result >= 0 and flags.value & _END_BURST:
-            self._counted["bursts_out"] += 1
+            self._counted[BURSTS_OUT] += 1
         return result >= 0 or result in _EVENTS
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from gr_ros2.phy.threads import KeepsThreadState
 
+BURSTS_OUT = "bursts_out"
+"""Counter of the bursts that a device has sent completely. All other events are losses."""
 _MARK = pmt.intern("rx_rate")
 _ASYNC, _EVENTS = pmt.intern("async_msgs"), pmt.intern("event_code")
 _NAMES = {
-    "burst_ack": "bursts_out",
+    "burst_ack": BURSTS_OUT,
     "underflow": "underflows",
     "underflow_in_packet": "underflows",
     "seq_error": "sequence_errors",

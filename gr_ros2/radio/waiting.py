@@ -27,7 +27,7 @@ class Waiting:
 
     def __init__(self, source: RosSource) -> None:
         self._source = source
-        self._told = ALL_THERE
+        self._last = ALL_THERE
 
     def look(self) -> str | None:
         """One line for the user; None if the last line is still true. At first, every topic is assumed to have a
@@ -35,12 +35,11 @@ class Waiting:
 
         :raises MiddlewareError: when the graph cannot be asked
         """
-        missing, choice = self._source.unmatched, self._source.choice
-        wanted = missing or ([] if self._source.subscribed or not choice.open else [choice.everything])
-        line = waiting_line(wanted, self._types(), self._others()) if wanted else self._sent()
-        if line == self._told:
+        missing = self._source.unmatched
+        line = waiting_line(missing, self._types(), self._others()) if missing else self._sent()
+        if line == self._last:
             return None
-        self._told = line
+        self._last = line
         return line
 
     def _others(self) -> list[TopicInfo]:
@@ -49,8 +48,12 @@ class Waiting:
         return [info for info in infos if choice.row_name(info.topic) is None]
 
     def _sent(self) -> str:
-        """That every topic has a publisher; with the topics, where the user did not name them."""
-        return f"{ALL_THERE}: {_listed(list(self._source.subscribed))}" if self._source.choice.open else ALL_THERE
+        """That every topic has a publisher; with the topics and services, where the user did not name them."""
+        if not self._source.choice.open:
+            return ALL_THERE
+        topics = [name for name, topic in self._source.subscribed.items() if not topic.action]
+        offered = f"; services and actions: {_listed(sorted(self._source.offered))}" if self._source.offered else ""
+        return f"{ALL_THERE}: {_listed(topics)}{offered}"
 
     def _types(self) -> dict[str, str]:
         return {name: topic.type_name for name, topic in self._source.subscribed.items()}

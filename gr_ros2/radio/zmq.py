@@ -35,7 +35,7 @@ from gr_ros2.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
-from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndOptions
+from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndCounters, FrontEndOptions
 
 HEADER = struct.Struct("<4sIQd")
 """Magic, number of the sender (random at each start), number of the burst, samples/s. The samples follow as complex64,
@@ -135,16 +135,16 @@ class ZmqFrontEnd(FrontEnd):
     def source(self) -> Any:
         return self._source
 
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> FrontEndCounters:
         """Counters of what passed and what did not.
 
         ``bursts_out``, ``bursts_in``: bursts sent and received. ``missed``: gaps in the numbers of a sender.
         ``restarts``: senders beyond one for each address. ``malformed`` and ``wrong_rate``: refused messages.
         ``overflows``: bursts that arrived while ``burst_queue`` bursts waited for the flowgraph, and were dropped.
         """
-        counted = {name: self._counters[name] for name in ("bursts_out", "bursts_in", "missed")}
-        counted["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
-        return counted | {name: self._counters[name] for name in ("malformed", "wrong_rate", "overflows")}
+        lost = {name: self._counters[name] for name in ("missed", "malformed", "wrong_rate", "overflows")}
+        lost["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
+        return FrontEndCounters({name: self._counters[name] for name in ("bursts_out", "bursts_in")}, lost)
 
     def close(self) -> None:
         self._let_go()

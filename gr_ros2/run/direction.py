@@ -1,5 +1,5 @@
-"""One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph; and the way back
-for reports.
+"""One direction of a run: input graph -> ROS Source -> PHY and channel -> ROS Sink -> output graph; and the ways
+back for reports. The first direction may have further receivers.
 
 Invariants: the only path from the input graph to the output graph is the link; everything that is opened here is closed
 by the exit stack it was entered on.
@@ -15,12 +15,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import ChannelConfig, SinkConfig, SourceConfig, replaced
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
@@ -28,7 +29,8 @@ from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
 from gr_ros2.run.ends import Halves, halves_of_ends, start_of_run
 from gr_ros2.run.load import recorded_names, source_names
-from gr_ros2.run.scenario import Reports, Scenario
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.setting import AUTO
 
 _QUIET_S = 0.3
 """A PHY is empty if nothing waits for it and it has given no packet for this time."""
@@ -47,12 +49,15 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     )
 
 
-def live_ends(ways: Sequence[Scenario], registry: Registry, *, any_length: bool) -> list[LiveEnd]:
+def live_ends(
+    ways: Sequence[Scenario], registry: Registry, *, any_length: bool, ladder: Sequence[Rung] = ()
+) -> list[LiveEnd]:
     """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`.
 
     :param any_length: whether the PHY carries shorter packets in less time
+    :param ladder: the rungs of an adaptive rate; () for a fixed rate
     """
-    start = start_of_run(ways, any_length=any_length)
+    start = start_of_run(ways, any_length=any_length, ladder=ladder)
     return [
         LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
         for halves in halves_of_ends(ways)
@@ -73,10 +78,11 @@ class Direction:
     """Both blocks and the link between them, ready to start.
 
     :param scenario: a one-way scenario, see :meth:`Scenario.directions`
-    :param ends: the end that sends and the end that receives; None: the blocks make their own (version 0)
-    :param observer: receives the events of both blocks
+    :param ends: the end that sends and those that receive; None: the blocks make their own (version 0)
+    :param observer: receives the events of the sender and of the first receiver
     :param stack: closes what is opened here
     :param instrumented: see :class:`LoopbackLink`
+    :param further: receive the events of one further receiver each
     :ivar topics: topic id of every topic the source subscribes, by absolute name
     """
 
@@ -85,11 +91,12 @@ class Direction:
         scenario: Scenario,
         registry: Registry,
         phy: Phy,
-        ends: tuple[LiveEnd | None, LiveEnd | None],
+        ends: Sequence[LiveEnd | None],
         *,
         observer: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
+        further: Sequence[LinkObserver] = (),
     ) -> None:
         self.scenario = scenario
         self.registry = registry
@@ -109,15 +116,11 @@ class Direction:
             **own_settings(replace(scenario.ros_source, backpressure=backpressure)),
         )
         stack.callback(self.source.close)
-        self.sink = RosSink(
-            registry,
-            middleware=self.output,
-            observer=observer,
-            end=ends[1],
-            **own_settings(scenario.ros_sink),
-        )
-        stack.callback(self.sink.close)
-        self.sink.announce(self.src_id, self.topics.values())
+        self.sink = self._sink(scenario.ros_sink, ends[1], observer, stack)
+        sinks = [
+            self._sink(_apart(scenario.ros_sink, registry, number), end, receiver, stack)
+            for number, (end, receiver) in enumerate(zip(ends[2:], further, strict=True), 2)
+        ]
         self.link = LoopbackLink(
             phy,
             self.source,
@@ -125,6 +128,7 @@ class Direction:
             channel=scenario.channel,
             throttled=scenario.time != "unthrottled",
             instrumented=instrumented,
+            further=list(zip(scenario.receivers, sinks, strict=True)),
         )
         stack.callback(self.link.stop)
 
@@ -153,6 +157,12 @@ class Direction:
             "channel": dict(self.link.counts().losses),
         }
 
+    def _sink(self, config: SinkConfig, end: LiveEnd | None, observer: LinkObserver, stack: ExitStack) -> RosSink:
+        sink = RosSink(self.registry, middleware=self.output, observer=observer, end=end, **own_settings(config))
+        stack.callback(sink.close)
+        sink.announce(self.src_id, self.topics.values())
+        return sink
+
     def _input_graph(self) -> Middleware:
         path = self.scenario.bag_path
         if path is None:
@@ -161,23 +171,42 @@ class Direction:
         return BagMiddleware(path=path, speed=self.scenario.bag_speed)
 
 
+def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
+    """The settings of a further receiver's sink, which publishes on the same graph in a namespace of its own."""
+    inside = f"/receiver_{number}/"
+    options = {
+        topic.name: replaced(topic.options, publish_as=inside + topic.options.publish_as.lstrip("/"))
+        for topic in registry.with_options(config.topic_options)
+        if topic.options.publish_as != AUTO
+    }
+    return replaced(
+        config,
+        namespace_format=inside + config.namespace_format.lstrip("/"),
+        topic_options={**config.topic_options, **options},
+        merge_tf=inside + config.merge_tf.lstrip("/") if config.merge_tf else "",
+    )
+
+
 class ReportDirection:
-    """The way back for reports alone, ready to start. It carries no topics.
+    """The way back for one receiver's reports alone, ready to start. It carries no topics.
 
     :param there: the direction of the messages
     :param ends: the sender, which hears the reports, and the receiver, which sends them
     :param src_id: of the receiver
+    :param channel: between the receiver and the sender
+    :param delay_s: s that a report takes beside its airtime
     :param observer, stack, instrumented: see :class:`Direction`
     """
 
     def __init__(
         self,
-        reports: Reports,
         there: Direction,
         phy: Phy,
         ends: tuple[LiveEnd, LiveEnd],
         src_id: int,
         *,
+        channel: ChannelConfig,
+        delay_s: float,
         observer: LinkObserver,
         stack: ExitStack,
         instrumented: bool = False,
@@ -191,9 +220,9 @@ class ReportDirection:
             phy,
             source,
             sink,
-            channel=reports.channel,
+            channel=channel,
             throttled=there.scenario.time != "unthrottled",
-            delay_s=reports.delay_s,
+            delay_s=delay_s,
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)

@@ -17,6 +17,7 @@ from typing import Any
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.files import make_folder, write_whole
+from gr_ros2.gr.ends import LiveEnd
 from gr_ros2.guard import Guard, one_line
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -24,16 +25,16 @@ from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.record.lateness import lateness_result, modem_lateness
-from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.direction import Direction, ReportDirection, live_ends, open_graph
 from gr_ros2.run.ends import halves_of_ends
-from gr_ros2.run.load import make_phys, recording, source_names
+from gr_ros2.run.load import make_phys, recording
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.pulse import Pulse
+from gr_ros2.run.recorders import FurtherRecorders, make_recorder
 from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulated_runner import run_simulated
@@ -93,7 +94,7 @@ class DeliveryRecorder:
                 subscription.close()
             self._guard.last(self._bag.close)
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What is missing in the bag, as one line; empty if nothing is missing. To be called after :meth:`close`."""
         missed = sum(self._bag.counters.values())
         if self._guard.error is not None:  # a storage writes in chunks: earlier messages may be missing too
@@ -171,9 +172,8 @@ class _Run:
         ways = scenario.directions()
         phys = make_phys(ways, self.registry)
         self.phy = phys[0]
-        namespaces = {way.ros_source.src_id(): way.ros_source.namespace for way in ways}
-        topics = {way.ros_source.src_id(): source_names(way, self.registry).values() for way in ways}
-        self.recorder = Recorder(self.registry, namespaces, topics)
+        self.recorder = make_recorder(self.registry, ways)
+        self.further = FurtherRecorders(self.registry, ways)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
         self.pulse = Pulse()
@@ -184,27 +184,31 @@ class _Run:
         try:
             link_observers = Observers[LinkObserver]()
             self.recording = link_observers.add(self.recorder, needed=True)
+            link_observers.add(self.further)
             link_observers.add(run_observers)
             common: dict[str, Any] = {
                 "observer": link_observers,
                 "stack": stack,
                 "instrumented": run_observers.instruments,
             }
-            first = second = None
+            live: list[LiveEnd] = []
             if scenario.version:
                 any_length = all(phy.any_length for phy in phys)
-                first, second = live_ends(ways, self.registry, any_length=any_length)
-            self.directions = [
-                Direction(way, self.registry, phy, ends, **common)
-                for way, phy, ends in zip(ways, phys, ((first, second), (second, first)), strict=False)
-            ]
+                live = live_ends(ways, self.registry, any_length=any_length, ladder=self.phy.ladder)
+            ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
+            further = [self.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
+            there = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
+            self.directions = [there]
+            if len(ways) > 1:
+                self.directions.append(Direction(ways[1], self.registry, phys[1], ends[1::-1], **common))
             self.links = [direction.link for direction in self.directions]
-            if scenario.reports is not None and first is not None and second is not None:
-                src_id = robot_of(*halves_of_ends(ways)[1])
-                reporting = ReportDirection(
-                    scenario.reports, self.directions[0], self.phy, (first, second), src_id, **common
-                )
-                self.links.append(reporting.link)
+            if scenario.reports is not None:
+                common["delay_s"] = scenario.reports.delay_s
+                receivers = zip(live[1:], halves_of_ends(ways)[1:], scenario.report_channels(), strict=True)
+                for end, halves, channel in receivers:
+                    pair, src_id = (live[0], end), robot_of(*halves)
+                    reporting = ReportDirection(there, self.phy, pair, src_id, channel=channel, **common)
+                    self.links.append(reporting.link)
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
             run_observers.run_started(self._live())
@@ -275,7 +279,7 @@ class _Run:
         for link in self.links:
             link.stop()
         self.run_observers.settle()
-        self.recording.check()
+        self._check_recorders()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
@@ -290,6 +294,7 @@ class _Run:
             duration_s=played,
             config=dump(scenario),
             topics=topics,
+            receivers=self.further.finish(played, end, drained),
             packets=self.recorder.ledger.packets(),
             phy=phy_numbers(self.phy, len(self.directions), self.recorder),
             wall_s=time.monotonic() - wall,
@@ -347,7 +352,7 @@ class _Run:
         restarts that time."""
         limit = time.monotonic() + self.scenario.drain_s
         before = (0, 0)
-        while time.monotonic() < limit and self.recorder.ledger.unresolved():
+        while time.monotonic() < limit and self._unresolved():
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
             if self.scenario.time == "unthrottled" and (now := self.recorder.progress()) != before:
@@ -355,10 +360,18 @@ class _Run:
 
     def _empty(self) -> bool:
         """Whether nothing is left in any direction."""
-        return all(way.empty(bool(self.recorder.ledger.unresolved())) for way in self.directions)
+        return all(way.empty(bool(self._unresolved())) for way in self.directions)
+
+    def _check_recorders(self) -> None:
+        self.recording.check()
+        self.further.check()
+
+    def _unresolved(self) -> int:
+        """Messages whose result is open, at all receivers together."""
+        return self.recorder.ledger.unresolved() + self.further.unresolved()
 
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        self.recording.check()
+        self._check_recorders()
         if on_progress is not None:
             sent, delivered = self.recorder.progress()
             now = Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered)
@@ -367,9 +380,9 @@ class _Run:
     def _incomplete(self) -> list[str]:
         """What observers and the bag of delivered messages missed. The bag is closed first."""
         if self.listener is None:
-            return self.run_observers.told()
+            return self.run_observers.incomplete()
         self.listener.close()
-        return [*self.run_observers.told(), *self.listener.told()]
+        return [*self.run_observers.incomplete(), *self.listener.incomplete()]
 
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)

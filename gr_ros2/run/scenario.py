@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, AnyLink, ChannelConfig, OneWay, OverChannel, Seconds, Traffic, build
+from gr_ros2.config import STRICT, AnyLink, ChannelConfig, OneWay, OverChannel, Seconds, Traffic, build, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
@@ -84,8 +84,8 @@ class Scenario(Experiment, Traffic, AnyLink):
     :param sim: settings of the simulator; its seed is the scenario's unless given
     :param back: the way back, where both robots talk; null = one way only
     :param reports: the way back for reports alone (version 1); null = there is none
-    :param receivers: channels of further receivers of the same sender, in simulated time; what is not set in one is as
-        in ``channel``, but for the seed
+    :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
+        for the seed
     :param seed: of the simulator, the channel and the sender
     """
 
@@ -113,8 +113,6 @@ class Scenario(Experiment, Traffic, AnyLink):
             raise ValueError("reports: version 0 has none, and with back they go along; set reports to null")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
-        if self.receivers and not self.simulated:
-            raise ValueError("receivers: further ones are for simulated time; set time to samples or packets")
         return self
 
     def _check_back(self, back: Back) -> None:
@@ -136,6 +134,13 @@ class Scenario(Experiment, Traffic, AnyLink):
         there = replace(self, back=None, reports=None, receivers=())
         back = {item.name: getattr(self.back, item.name) for item in fields(self.back)}
         return there, replace(there, **back)
+
+    def report_channels(self) -> list[ChannelConfig]:
+        """The channel on which each receiver reports: that of ``reports``, with a seed of its own; [] without it."""
+        if self.reports is None:
+            return []
+        channel = self.reports.channel
+        return [replaced(channel, seed=channel.seed + number) for number in range(1 + len(self.receivers))]
 
     @property
     def simulated(self) -> bool:

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gr_ros2.config import ChannelConfig, replaced
+from gr_ros2.config import ChannelConfig
 from gr_ros2.guard import Guard
-from gr_ros2.link.events import Delivered, SenderEvent
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
-from gr_ros2.record.result import ReceiverResult, Result
+from gr_ros2.record.result import Result
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.ladder_air import LadderAir
@@ -32,6 +31,7 @@ from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.loss_table import packet_losses
 from gr_ros2.run.observers import LiveRun, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.recorders import FurtherRecorders, make_recorder
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import (
     AirtimeEnded,
@@ -43,8 +43,8 @@ from gr_ros2.run.simulate import (
     TimedEvent,
     make_ends,
     offered,
+    pass_on,
     report_ways,
-    tell,
 )
 
 if TYPE_CHECKING:
@@ -88,10 +88,12 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        recorder = _recorder(registry, ways, None if bag is None else bag.take)
+        recorder = make_recorder(registry, ways, None if bag is None else bag.take)
+        further = FurtherRecorders(registry, ways)
         run_observers = run_observers or RunObservers(threaded=False)
         link_observers = Observers[LinkObserver]()
         recorded = link_observers.add(recorder, needed=True)
+        link_observers.add(further)
         link_observers.add(run_observers)
         any_length = all(phy.any_length for phy in phys)
         ends = make_ends(ways, registry, any_length=any_length, ladder=phys[0].ladder)
@@ -99,7 +101,6 @@ def run_simulated(
             _Direction(way, registry, phy, (first, second))
             for way, phy, (first, second) in zip(ways, phys, (ends[:2], ends[1::-1]), strict=False)
         ]
-        others = [_recorder(registry, ways) for _ in scenario.receivers]
         loop = EventLoop(
             [*(direction.way for direction in directions), *_further(scenario, phys[0], directions[0], ends)]
         )
@@ -109,19 +110,17 @@ def run_simulated(
         for timed_event in _all_events(loop, directions):
             clock.now = timed_event[0]
             number = timed_event[1].number
-            if isinstance(timed_event[2], SenderEvent):
-                for other in others:
-                    tell(other, timed_event)
-            tell(others[number - 1] if number else link_observers, timed_event)
+            pass_on(further.at(number) if number else link_observers, timed_event)
             recorded.check()
+            further.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *recorder.progress()))
         recorded.check()
+        further.check()
     played = max(direction.way.duration_s for direction in directions)
     drained = all(direction.way.empty for direction in directions)
     topics = recorder.finish(played, played, drained)
-    more = tuple(ReceiverResult(place, other.finish(played, played, drained)) for place, other in enumerate(others, 2))
     there, *back = (direction.counters() for direction in directions)
     result = Result(
         scenario=scenario.name,
@@ -129,11 +128,11 @@ def run_simulated(
         duration_s=played,
         config=dump(scenario),
         topics=topics,
-        receivers=more,
+        receivers=further.finish(played, played, drained),
         packets=recorder.ledger.packets(),
         phy=phy_numbers(phys[0], len(ways), recorder),
         wall_s=time.monotonic() - began,
-        incomplete=tuple(run_observers.told()),
+        incomplete=tuple(run_observers.incomplete()),
         counters={**there, **({"back": back[0]} if back else {}), "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
@@ -272,19 +271,6 @@ class _Direction:
         }
 
 
-def _recorder(
-    registry: Registry,
-    ways: Sequence[Scenario],
-    on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
-) -> Recorder:
-    return Recorder(
-        registry,
-        {way.ros_source.src_id(): way.ros_source.namespace for way in ways},
-        {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
-        on_delivery=on_delivery,
-    )
-
-
 def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End]) -> list[LinkDirection]:
     """Connect the further receivers to the first direction, and return the directions on which receivers report."""
     first.way.branches = [
@@ -293,9 +279,8 @@ def _further(scenario: Scenario, phy: Phy, first: _Direction, ends: Sequence[End
     ]
     if scenario.reports is None:
         return []
-    channel = scenario.reports.channel
-    channels = [replaced(channel, seed=channel.seed + number) for number in range(len(ends) - 1)]
-    return report_ways(scenario, ends, phy.airtime, [_Air(scenario, phy, each).pass_one for each in channels])
+    airs = [_Air(scenario, phy, channel).pass_one for channel in scenario.report_channels()]
+    return report_ways(scenario, ends, phy.airtime, airs)
 
 
 def _all_events(loop: EventLoop, directions: Sequence[_Direction]) -> Iterator[TimedEvent]:

@@ -41,7 +41,7 @@ def stats(
         },
         "packets": {"out": 90, "in": 60, "refused": 0, "damaged": damaged},
         "phy": {"snr_db": snr_db},
-        "front_end": {"name": "uhd", "bursts_out": 90, "overflows": 0},
+        "front_end": {"name": "uhd", "passed": {"bursts_out": 90}, "lost": {"overflows": 0}},
     }
 
 

@@ -15,6 +15,7 @@ from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import Qos, TopicInfo
 from gr_ros2.registry import Registry
+from gr_ros2.service_rows import rows_of
 from tests.domains import domain
 from tests.waiting import wait_for
 
@@ -64,6 +65,26 @@ def test_chosen_topics_keep_their_order() -> None:
     text = registry_csv(FOUND, "robot_1", ["tf_static", "/robot_1/odom"])
     assert [line.split(",")[0] for line in text.splitlines()[1:]] == ["tf_static", "odom"]
     assert registry_csv(FOUND, "", ["/robot_2/odom"]) == "topic,type\nrobot_2/odom,nav_msgs/msg/Odometry\n"
+
+
+def test_services_and_actions_are_rows_too(tmp_path: Path) -> None:
+    services = rows_of(
+        {
+            "/robot_1/add": "example_interfaces/srv/AddTwoInts",
+            "/robot_1/go/_action/send_goal": "nav2_msgs/action/Spin_SendGoal",
+            "/robot_1/go/_action/get_result": "nav2_msgs/action/Spin_GetResult",
+            "/robot_1/planner/set_parameters": "rcl_interfaces/srv/SetParameters",
+            "/robot_1/_hidden": "std_srvs/srv/Empty",
+            "/robot_1/odom": "std_srvs/srv/Empty",  # the topic of this name is in the registry already
+            "/robot_2/add": "example_interfaces/srv/AddTwoInts",
+        }
+    )
+    text = registry_csv(FOUND, "robot_1", services=services)
+    assert text.splitlines()[3:] == ["add,example_interfaces/srv/AddTwoInts,", "go,nav2_msgs/action/Spin,"]
+    path = tmp_path / "r.csv"
+    path.write_text(text)
+    assert len(Registry.from_csv(path)) == 2 + 1 + 5
+    assert registry_csv(FOUND, "robot_1", ["go"], services=services) == "topic,type\ngo,nav2_msgs/action/Spin\n"
 
 
 def test_what_is_written_can_be_read(tmp_path: Path) -> None:
@@ -120,9 +141,9 @@ def test_what_no_registry_can_have_is_left_out_with_the_reason() -> None:
     found = [*FOUND, SERVICE, FEEDBACK, STATUS, *TWO, TopicInfo("/robot-1/odom", "nav_msgs/msg/Odometry", (Qos(),))]
     assert unfit(FOUND) == {}
     assert unfit(found) == {
-        SERVICE.topic: "it belongs to a service, whose row this command does not write (docs/how-to/services.md)",
-        FEEDBACK.topic: "it belongs to an action, whose row this command does not write (docs/how-to/services.md)",
-        STATUS.topic: "it belongs to an action, whose row this command does not write (docs/how-to/services.md)",
+        SERVICE.topic: "it belongs to a service, for which this registry has no row (docs/how-to/services.md)",
+        FEEDBACK.topic: "it belongs to an action, for which this registry has no row (docs/how-to/services.md)",
+        STATUS.topic: "it belongs to an action, for which this registry has no row (docs/how-to/services.md)",
         "/n": "it has several types, std_msgs/msg/Int32 and std_msgs/msg/String",
         "/robot-1/odom": "ROS allows no such name, '-' may not stand in a ROS name; letters, digits, _ and / may",
     }

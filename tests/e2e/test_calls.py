@@ -32,11 +32,14 @@ NEAR, FAR = "/rx_robot_2/add", "/robot_2/add"
 
 
 class Robots:
-    """Two links, a server and a client, each a process of its own."""
+    """Two links, a server and a client, each a process of its own.
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._domains = free_domains(2)
+    :param found: whether robot 2 finds its services on its graph, instead of in a registry
+    """
+
+    def __init__(self, folder: Path, *, found: bool = False) -> None:
+        self._folder, self._found = folder, found
+        self.domains = free_domains(2)
         self.stack = ExitStack()
         (folder / "services.csv").write_text(f"add,{ADD}\n")
         self._links = {number: self._link(number) for number in (1, 2)}
@@ -44,7 +47,7 @@ class Robots:
         self.clients = [self._program("client")]
         self.called = 0
         self.told: Counter[str] = Counter()
-        graph = self.stack.enter_context(DdsMiddleware(domain_id=self._domains[0], localhost_only=True))
+        graph = self.stack.enter_context(DdsMiddleware(domain_id=self.domains[0], localhost_only=True))
         graph.subscribe("/gr_ros2_link_1/statistics", "std_msgs/msg/String", Qos(), self._told)
 
     def replace(self, part: str) -> None:
@@ -79,7 +82,7 @@ class Robots:
         self.told = Counter(said["calls"]["counters"])
 
     def _program(self, role: str) -> Program:
-        domain, service = (self._domains[1], FAR) if role == "server" else (self._domains[0], NEAR)
+        domain, service = (self.domains[1], FAR) if role == "server" else (self.domains[0], NEAR)
         return self.stack.enter_context(closing(Program(domain, service, role)))
 
     def _link(self, number: int) -> subprocess.Popen[str]:
@@ -87,7 +90,7 @@ class Robots:
         path = self._folder / f"robot-{number}.yaml"
         path.write_text(
             f"""
-            {"registry: services.csv" if number == 2 else ""}
+            {"registry: services.csv" if number == 2 and not self._found else ""}
             packet_len: 64
             phy: {{name: ofdm, sample_rate: 4e5}}
             front_end: {{name: zmq, bind: "{own}", connect: ["{other}"]}}
@@ -95,9 +98,12 @@ class Robots:
             state: {self._folder}/state-{number}
             localhost_only: true
             diagnostics: {{period_s: 0.2}}
-            ros_source: {{namespace: /robot_{number}, domain_id: {self._domains[number - 1]}}}
+            ros_source:
+              namespace: /robot_{number}
+              topics: {"auto" if self._found else []}
+              domain_id: {self.domains[number - 1]}
             ros_sink:
-              domain_id: {self._domains[number - 1]}
+              domain_id: {self.domains[number - 1]}
               topic_options: {{add: {{deadline_s: {DEADLINE_S}}}}}
             """
         )
@@ -132,6 +138,38 @@ def test_every_call_is_answered_once_or_times_out_by_name_and_none_runs_twice(ro
     assert robots.told[ends[0]] == len(robots.answered) == len(set(robots.answered)) > 0.9 * CALLS
     assert len(robots.taken) == len(set(robots.taken))
     assert set(robots.answered) <= set(robots.taken)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_a_service_that_was_found_is_there_only_while_its_server_is(tmp_path: Path) -> None:
+    robots = Robots(tmp_path, found=True)
+    with robots.stack:
+        near, far = (
+            robots.stack.enter_context(DdsMiddleware(domain_id=domain, localhost_only=True))
+            for domain in robots.domains
+        )
+        for replaced in ("", "server", "2"):
+            if replaced:
+                robots.replace(replaced)
+            wait_for(lambda: robots.clients[0].there and FAR in far.discover_services(), "the service to appear")
+            assert set(near.discover_services()) == {NEAR}
+
+            def answered() -> bool:
+                """Whether a call is answered. One that a restart has overtaken is not."""
+                before, client = robots.told, robots.clients[0]
+                wait_for(lambda: client.there, "the service to appear again")
+                number = robots.call()
+                wait_for(
+                    lambda: number in robots.answered or robots.told != before or not client.there,
+                    "an answer, or news",
+                )
+                return number in robots.answered
+
+            wait_for(answered, "an answer")
+        robots.servers[-1].close()
+        wait_for(lambda: not near.discover_services(), "the service to vanish")
+        assert len(robots.taken) == len(set(robots.taken))
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
-"""Scenarios that speak version 1 in real time: repair one way, with reports over a channel of their own, and both
-ways."""
+"""Scenarios that speak version 1 in real time: repair one way, with reports over a channel of their own, to
+several receivers, and both ways."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from gr_ros2.link.events import Received, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.record.result import Result
 from gr_ros2.run.observers import LiveRun
 from gr_ros2.run.runner import run_scenario
@@ -17,6 +19,7 @@ from gr_ros2.settings_file import find_registry
 from gr_ros2.wire.control import Report
 from tests.domains import free_domains
 from tests.e2e.support import check_books, delivered_bag
+from tests.waiting import wait_for
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -114,6 +117,39 @@ def test_both_robots_report_what_they_hear_with_their_own_messages(tmp_path: Pat
     assert set(reports.sent) == set(reports.heard) == {1, 2}
     there, back_again = result.counters["source"], result.counters["back"]["source"]
     assert there["packets"] + back_again["packets"] == result.packets["sent"]
+
+
+def test_every_receiver_hears_and_reports_for_itself(tmp_path: Path) -> None:
+    settings = lossy(reports={}, receivers=[{}, {"packet_loss": 0.4}])
+    result, reports = run(settings, tmp_path)
+    assert [receiver.number for receiver in result.receivers] == [2, 3]
+    every = [result.topics[0], *(topic for receiver in result.receivers for topic in receiver.topics)]
+    assert [topic.sent for topic in every] == [result.topics[0].sent] * 3
+    assert all(sum(topic.ledger.values()) == topic.sent and not topic.corrupt for topic in every)
+    assert all(topic.ledger["repaired"] > 0 and "lost_fragments" not in topic.ledger for topic in every)
+    assert set(reports.sent) == set(reports.heard) == {RECEIVER, RECEIVER - 1, RECEIVER - 2}
+    assert len(delivered_bag(tmp_path, "/rx_robot_1/odom")) == every[0].delivered
+    assert reports.run is not None
+    assert [link.channel.seed for link in reports.run.links] == [0, 100_003, 100_004, 100_005]
+
+
+def test_further_receivers_publish_apart() -> None:
+    sending, receiving = free_domains()
+    graph = MemoryMiddleware(domain_id=receiving)
+    heard: list[str] = []
+    names = ["/rx_robot_1/odom", "/receiver_2/rx_robot_1/odom", "/receiver_3/rx_robot_1/odom"]
+    for name in names:
+        graph.subscribe(name, "nav_msgs/msg/Odometry", Qos(), lambda _payload, name=name: heard.append(name))
+    memory = {"middleware": "memory", "compression": True}
+    ends = {
+        "ros_source": {"namespace": "/robot_1", "domain_id": sending, **memory},
+        "ros_sink": {"domain_id": receiving, **memory},
+    }
+    result = run_scenario(lossy(version=0, receivers=[{}, {}], drain_s=1.0, **ends)).result
+    topics = [result.topics[0], *(receiver.topics[0] for receiver in result.receivers)]
+    assert all(topic.delivered > 0 for topic in topics)
+    wait_for(lambda: [heard.count(name) for name in names] == [topic.delivered for topic in topics], "every message")
+    graph.close()
 
 
 def test_packets_take_as_much_air_as_they_need(tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ def stats(**changes: Any) -> dict[str, Any]:
         },
         "packets": {"out": values["out"], "backlog": 0, "damaged": 0, "foreign": 0},
         "phy": {"airtime_s": 0.01, "snr_db": values["snr_db"]},
+        "front_end": {"name": "sim", "passed": {}, "lost": {}},
     }
 
 
@@ -146,16 +147,16 @@ def test_what_a_front_end_loses_warns_once_and_is_named() -> None:
     health = make()
     at = iter(range(10))
 
-    def front_end(**counters: int) -> Status:
-        values = {**stats(), "front_end": {"name": "uhd", **counters}}
+    def front_end(passed: dict[str, int], **lost: int) -> Status:
+        values = {**stats(), "front_end": {"name": "uhd", "passed": passed, "lost": lost}}
         (status,) = (status for status in health.judge(values, float(next(at))) if status.name == "link: front end")
         return status
 
-    assert front_end(underflows=0, bursts_out=5).message == "OK"
-    grown = front_end(underflows=2, sequence_errors=1, bursts_out=9, blanked=700)
+    assert front_end({"bursts_out": 5}, underflows=0).message == "OK"
+    grown = front_end({"bursts_out": 9, "blanked": 700}, underflows=2, sequence_errors=1)
     assert (grown.level, grown.message) == (Level.WARN, "2 underflows; 1 sequence errors")
     assert grown.values == {"underflows": "2", "sequence errors": "1", "bursts out": "9", "blanked": "700"}
-    assert front_end(underflows=2, sequence_errors=1, bursts_out=12, blanked=900).level == Level.OK
+    assert front_end({"bursts_out": 12, "blanked": 900}, underflows=2, sequence_errors=1).level == Level.OK
 
 
 def test_what_the_ros_graph_lost_and_what_was_not_published_warn_while_they_are_new() -> None:
@@ -177,10 +178,9 @@ def test_what_the_ros_graph_lost_and_what_was_not_published_warn_while_they_are_
 
 
 def test_what_a_front_end_lost_before_the_first_look_is_told() -> None:
-    values = {**stats(), "front_end": {"name": "uhd", "overflows": 3}}
+    values = {**stats(), "front_end": {"name": "uhd", "passed": {}, "lost": {"overflows": 3}}}
     assert [status.message for status in make().judge(values, 0.0)] == ["OK", "OK", "3 overflows", "OK"]
 
 
 def test_a_front_end_that_counts_nothing_is_no_part() -> None:
-    values = {**stats(), "front_end": {"name": "sim"}}
-    assert len(make().judge(values, 0.0)) == 3
+    assert len(make().judge(stats(), 0.0)) == 3

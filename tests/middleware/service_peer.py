@@ -46,9 +46,8 @@ class AddReply(IdlStruct, typename="example_interfaces::srv::dds_::AddTwoInts_Re
     sum: int64
 
 
-def endpoints(domain: int, service: str, role: str) -> tuple[Any, Any]:
+def endpoints(participant: DomainParticipant, service: str, role: str) -> tuple[Any, Any]:
     """Reader and writer of one end."""
-    participant = DomainParticipant(domain)
     names = ((f"rq{service}Request", AddRequest), (f"rr{service}Reply", AddReply))
     requests, replies = (Topic(participant, name, kind) for name, kind in names)
     reads, writes = (requests, replies) if role == "server" else (replies, requests)
@@ -71,7 +70,7 @@ def serve(reader: Any, writer: Any) -> None:
 
 
 def main(domain: str, service: str, role: str) -> None:
-    reader, writer = endpoints(int(domain), service, role)
+    reader, writer = endpoints(DomainParticipant(int(domain)), service, role)
     over = threading.Event()
     own = uuid.uuid4().int >> 64
 

@@ -10,7 +10,7 @@ import pytest
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_services import with_header, without_header
-from gr_ros2.middleware.ros_graph import NodeEntities, dds_service
+from gr_ros2.middleware.ros_graph import NodeEntities, dds_service, ros_service
 from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller, Program
 from tests.waiting import wait_for
@@ -80,7 +80,42 @@ def test_a_server_of_the_same_participant_does_not_count(graph: DdsMiddleware, d
         assert not caller.there
 
 
+def test_the_services_of_other_programs_are_found_as_long_as_they_have_a_server(
+    graph: DdsMiddleware, domain: int
+) -> None:
+    with closing(Program(domain, SERVICE, "server")), closing(Program(domain, "/robot_1/wanted", "client")) as client:
+        wait_for(lambda: graph.discover_services() == {SERVICE: ADD}, "the server to be found")
+        wait_for(lambda: client.ready, "the client")
+        Adder(graph, "/robot_1/own")
+        with DdsMiddleware(domain_id=domain, localhost_only=True) as other:
+            Adder(other, "/robot_1/another")
+            wait_for(lambda: len(graph.discover_services()) == 2, "the second server")
+            assert graph.discover_services() == {SERVICE: ADD, "/robot_1/another": ADD}
+            wait_for(lambda: "/robot_1/own" in other.discover_services(), "what others see")
+    wait_for(lambda: not graph.discover_services(), "the servers to be missed")
+
+
+def test_a_reader_of_requests_alone_is_no_server(graph: DdsMiddleware, domain: int) -> None:
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from tests.middleware.service_peer import AddRequest, endpoints
+
+    participant = DomainParticipant(domain)
+    alone = DataReader(participant, Topic(participant, f"rq{SERVICE}Request", AddRequest))
+    whole = endpoints(participant, "/robot_1/whole", "server")
+    wait_for(lambda: "/robot_1/whole" in graph.discover_services(), "a server that was made later")
+    assert graph.discover_services() == {"/robot_1/whole": ADD}
+    del alone, whole
+
+
 def test_names_and_types_are_those_of_ros() -> None:
+    for name, kind in (("/robot_1/add", ADD), ("/a/_action/send_goal", "b/action/C_SendGoal")):
+        (requests, request), (replies, reply) = dds_service(name, kind)
+        assert ros_service(requests, request) == (name, kind)
+        assert ros_service(replies, reply) is None
+    assert ros_service("rt/odomRequest", "nav_msgs::msg::dds_::Odometry_") is None
     assert dds_service("/robot_1/add", ADD) == (
         ("rq/robot_1/addRequest", "example_interfaces::srv::dds_::AddTwoInts_Request_"),
         ("rr/robot_1/addReply", "example_interfaces::srv::dds_::AddTwoInts_Response_"),

@@ -127,6 +127,9 @@ class Node(RclpyParticipant):
     def discover(self) -> list[TopicInfo]:
         raise NotImplementedError
 
+    def discover_services(self) -> dict[str, str]:
+        raise NotImplementedError
+
     def close(self) -> None:
         raise NotImplementedError
 

@@ -45,7 +45,7 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("lora", {"coding_rate": 1, "fec": "cc"}),
     ("wifi", {"encoding": "bpsk-3/4", "equalizer": "lms"}),
     ("wifi", {"encoding": "qpsk-3/4", "gap": 1000, "equalizer": "sta"}),
-    ("wifi", {"encoding": "16qam-1/2", "carrier_hz": 5.89e9}),
+    ("wifi", {"encoding": "16qam-1/2", "channel_hz": 5.89e9}),
     ("wifi", {"encoding": "64qam-3/4"}),
     ("lora", {"implementation": "lora_sdr"}),
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3, "oversampling": 4}),

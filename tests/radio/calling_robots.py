@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,16 @@ from tests.domains import free_domains
 class Robots:
     """Two robots; the second has the services of a row. ``graphs`` are those of their programs.
 
+    :param row: of the registry; '' for none
+    :param topics: words with which both find topics and services on their graphs
     :param channel: impairments at both receivers
     """
 
-    def __init__(self, folder: Path, row: str, middleware: str = "memory", **channel: Any) -> None:
-        self._folder, self._channel, self._middleware = folder, channel, middleware
+    def __init__(
+        self, folder: Path, row: str, middleware: str = "memory", *, topics: Sequence[str] = (), **channel: Any
+    ) -> None:
+        self._folder, self._channel, self._middleware, self._topics = folder, channel, middleware, list(topics)
+        self._registry = bool(row)
         self._domains = free_domains(2)
         (folder / "services.csv").write_text(f"{row}\n")
         self.stack = ExitStack()
@@ -38,13 +44,13 @@ class Robots:
         own, other = (f"ipc://{self._folder}/{robot}" for robot in (number, 3 - number))
         graph = {"middleware": self._middleware, "domain_id": self._domains[number - 1]}
         settings: dict[str, Any] = {
-            "registry": str(self._folder / "services.csv") if number == 2 else "",
+            "registry": str(self._folder / "services.csv") if number == 2 and self._registry else "",
             "packet_len": 64,
             "phy": {"name": "ofdm", "sample_rate": 4e5},
             "front_end": {"name": "zmq", "bind": own, "connect": [other]},
             "channel": {"seed": number, **self._channel},
             "state": str(self._folder / f"state-{number}"),
-            "ros_source": {"namespace": f"/robot_{number}", **graph},
+            "ros_source": {"namespace": f"/robot_{number}", "topics": self._topics, **graph},
             "ros_sink": graph,
         }
         link = self.links[number] = RobotLink(link_from({**settings, **values}))

@@ -55,7 +55,9 @@ def _run(number: int, front_end: dict[str, Any], first: int, values: Mapping[str
     counts, parent = _Counts(), os.getppid()
 
     def hear(payload: bytes) -> None:
-        pipe.send(Heard(int.from_bytes(payload[4:8], "little"), counts.packets, link.front_end.counters()["restarts"]))
+        pipe.send(
+            Heard(int.from_bytes(payload[4:8], "little"), counts.packets, link.front_end.counters().lost["restarts"])
+        )
 
     with MemoryMiddleware(domain_id=domain(number)) as graph:
         link = RobotLink(config(number, front_end, **values), observer=counts)

@@ -79,6 +79,11 @@ class Robot:
         self._chat.publish(payload)
         wait_for(lambda: self._taken() == before + 1, "the link to take what was said")
 
+    def counters(self) -> dict[str, int]:
+        """Counters of the front end: what passed, and what was lost."""
+        front_end = self.link.stats()["front_end"]
+        return {**front_end["passed"], **front_end["lost"]}
+
     @property
     def silent(self) -> bool:
         """Whether everything said is on the air or over."""

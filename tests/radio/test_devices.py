@@ -39,9 +39,9 @@ front_end, values, count, wanted, unsent = map(json.loads, sys.argv[1:])
 with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, **values) as robot:
     said = robot.say(*range(count))
     wait_for(lambda: robot.silent and len(robot.heard) >= wanted, "every message")
-    wait_for(lambda: robot.link.stats()["front_end"]["unsent"] >= unsent, "what the device does not take")
+    wait_for(lambda: robot.counters()["unsent"] >= unsent, "what the device does not take")
     print(json.dumps({"altered": [m for m in robot.heard if m not in said], "heard": len(robot.heard),
-                      "packets": robot.link.stats()["packets"], **robot.link.stats()["front_end"],
+                      "packets": robot.link.stats()["packets"], **robot.counters(),
                       "layout": robot.link.front_end.layout.total}, default=str))
 """
 """A robot that takes its own packets, as if they were another's, in a process where the driver can be found."""

@@ -147,7 +147,7 @@ def test_samples_that_are_no_numbers_are_zeros_and_counted(tmp_path: Path) -> No
     with Robot(2, {"name": "file", "read": str(tmp_path / "sent")}, hears=(1,)) as robot:
         wait_for(lambda: robot.link.finished and len(robot.heard) == len(said), "the end of the recording")
         assert robot.heard == said
-        assert robot.link.stats()["front_end"]["not_finite"] == len(bad)
+        assert robot.counters()["not_finite"] == len(bad)
 
 
 def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:

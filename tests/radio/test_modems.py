@@ -28,11 +28,6 @@ def robot(number: int, front_end: dict[str, Any], tmp_path: Path, **values: Any)
     return Robot(number, front_end, hears=(3 - number,), **{**own, **values})
 
 
-def counters(one: Robot) -> dict[str, Any]:
-    found: dict[str, Any] = one.link.stats()["front_end"]
-    return found
-
-
 def talk(one: Robot, two: Robot, first: int, count: int = 5) -> None:
     """Both robots say something, and hear all that the other one says."""
     heard = [len(one.heard), len(two.heard)]
@@ -59,8 +54,8 @@ def test_udp_with_losses(tmp_path: Path) -> None:
             wait_for(lambda: link.sink._end.knows(other), "a hello")  # noqa: B023 - called at once
         talk(one, two, 0, 20)
         assert one.link.stats()["sink"]["repaired"] + two.link.stats()["sink"]["repaired"] > 0
-        assert counters(one)["frames_out"] > 0
-        assert counters(one)["malformed"] == counters(one)["too_long"] == 0
+        assert one.counters()["frames_out"] > 0
+        assert one.counters()["malformed"] == one.counters()["too_long"] == 0
 
 
 def test_datagrams_that_are_no_packets_are_counted(tmp_path: Path) -> None:
@@ -69,8 +64,8 @@ def test_datagrams_that_are_no_packets_are_counted(tmp_path: Path) -> None:
     with robot(1, ends[0], tmp_path) as one, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for datagram in (b"", bytes(5000), b"no packet"):
             stranger.sendto(datagram, (host, int(port)))
-        wait_for(lambda: counters(one)["frames_in"] == 1, "the one that may be a packet")
-        assert (counters(one)["malformed"], counters(one)["too_long"]) == (1, 1)
+        wait_for(lambda: one.counters()["frames_in"] == 1, "the one that may be a packet")
+        assert (one.counters()["malformed"], one.counters()["too_long"]) == (1, 1)
         wait_for(lambda: sum(one.link.stats()["sink"]["rejected"].values()) == 1, "its refusal")
 
 
@@ -81,7 +76,7 @@ def test_a_serial_line_that_is_pulled_out_and_plugged_in(framing: str, tmp_path:
         with robot(1, ends[0], tmp_path) as one, robot(2, ends[1], tmp_path) as two:
             talk(one, two, 0)
             cable.pull()
-            wait_for(lambda: counters(one)["interruptions"] and counters(two)["interruptions"], "the interruption")
+            wait_for(lambda: one.counters()["interruptions"] and two.counters()["interruptions"], "the interruption")
             cable.plug()
             talk(one, two, 10)
             assert cable.carried > 0
@@ -95,11 +90,11 @@ def test_a_device_that_takes_no_more_costs_packets_and_nobody_waits(tmp_path: Pa
         with robot(1, end, tmp_path, phy=phy, packet_len=4095) as one:
             tnc, _ = server.accept()
             number = 0
-            while not counters(one)["not_taken"]:
+            while not one.counters()["not_taken"]:
                 one.say(*range(number, number + 100))
                 number += 100
             tnc.close()
-            wait_for(lambda: counters(one)["interruptions"], "the end of the connection")
+            wait_for(lambda: one.counters()["interruptions"], "the end of the connection")
             again, _ = server.accept()
             one.say(number)
             assert again.recv(1)
@@ -120,7 +115,7 @@ def test_two_tnc_that_hear_each_other(tmp_path: Path) -> None:
             wait_for(lambda: two.heard == said, f"the messages; {tncs.log()}")
             answers = two.say(4, 5, 6)
             wait_for(lambda: one.heard == answers, "the answers")
-            assert counters(two)["foreign"] == 0
+            assert two.counters()["foreign"] == 0
         assert "N0CALL" in tncs.log()
 
 

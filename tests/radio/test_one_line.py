@@ -52,7 +52,16 @@ def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     values = settled(one_line(1, "sim", "mine.csv", {}), Path())
     assert portable_registry(values["registry"]) == str(tmp_path / "mine.csv")
-    assert portable_registry(settled(one_line(1, "sim", None, {}), Path())["registry"]) == "table4"
+    assert portable_registry(settled(one_line(1, "sim", "table4", {}), Path())["registry"]) == "table4"
+
+
+def test_a_number_and_a_radio_are_enough() -> None:
+    settings = link_from(settled(one_line(1, "sim", None, {}), Path()))
+    assert (settings.version, settings.registry, settings.ros_source.topics) == (1, "", ("auto",))
+    assert settings.ros_source.compression
+    assert not link_from(settled(one_line(1, "sim", "table4", {}), Path())).ros_source.topics
+    with pytest.raises(ConfigError, match="registry is missing, and version 0 needs the same one at every robot"):
+        link_from(settled(one_line(1, "sim", None, {}), Path(), ["version=0"]))
 
 
 def test_topics_of_the_graph_need_no_registry(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def test_on_every_phy_what_goes_out_comes_back(phy: str) -> None:
     assert stats["packets"]["backlog"] == stats["packets"]["refused"] == 0
     assert stats["phy"]["name"] == phy
     assert (stats["phy"]["snr_db"] is None) == (phy in ("direct", "modem"))
-    assert stats["front_end"] == {"name": "sim"}
+    assert stats["front_end"] == {"name": "sim", "passed": {}, "lost": {}}
     assert stats["uptime_s"] > 0
 
 

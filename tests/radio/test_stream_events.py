@@ -144,11 +144,6 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     Source.made.clear()
 
 
-def counters(robot: Robot) -> dict[str, Any]:
-    found: dict[str, Any] = robot.link.stats()["front_end"]
-    return found
-
-
 def look(robot: Robot, now: float) -> None:
     """Whether the device is found well, at a time when samples have come."""
     (source,) = Source.made
@@ -161,15 +156,15 @@ def look(robot: Robot, now: float) -> None:
 def test_whatever_a_usrp_tells_is_counted_by_name() -> None:
     with Robot(1, FRONT_END) as robot:
         (sink,), (source,) = Sink.made, Source.made
-        wait_for(lambda: "overflows" in counters(robot), "the first sample")
-        assert counters(robot) == {
-            **{"name": "uhd", "clipped": 0, "overflows": 0},
+        wait_for(lambda: "overflows" in robot.counters(), "the first sample")
+        assert robot.counters() == {
+            **{"clipped": 0, "overflows": 0},
             **{"bursts_out": 0, "underflows": 0, "sequence_errors": 0, "late": 0},
         }
         robot.say(*range(3))
         wait_for(lambda: robot.silent, "the last packet")
         packets = robot.link.stats()["packets"]["out"]
-        wait_for(lambda: counters(robot)["bursts_out"] == packets, "every acknowledgement")
+        wait_for(lambda: robot.counters()["bursts_out"] == packets, "every acknowledgement")
         front_end: Any = robot.link.front_end
         assert sink.lengths == [front_end.layout.total] * packets
 
@@ -178,12 +173,12 @@ def test_whatever_a_usrp_tells_is_counted_by_name() -> None:
         sink.tell("underflow", "seq_error")
         sink.tell("of a later version")
         source.overflows = 1
-        wait_for(lambda: counters(robot)["overflows"] == 1, "the first gap")
+        wait_for(lambda: robot.counters()["overflows"] == 1, "the first gap")
         source.overflows = 2
-        wait_for(lambda: counters(robot)["overflows"] == 2, "the second")
-        wait_for(lambda: "of a later version" in counters(robot), "the last message")
+        wait_for(lambda: robot.counters()["overflows"] == 2, "the second")
+        wait_for(lambda: "of a later version" in robot.counters(), "the last message")
         expected = {"underflows": 3, "sequence_errors": 3, "late": 1, "of a later version": 1}
-        assert {name: counters(robot)[name] for name in expected} == expected
+        assert {name: robot.counters()[name] for name in expected} == expected
 
 
 @pytest.mark.usefixtures("stand_ins")
@@ -204,7 +199,7 @@ def test_a_transmitter_that_has_nothing_to_send_is_well() -> None:
     with Robot(1, FRONT_END) as robot:
         for now in (100.0, 200.0, 300.0):
             look(robot, now)
-        assert counters(robot)["bursts_out"] == 0
+        assert robot.counters()["bursts_out"] == 0
 
 
 @pytest.mark.usefixtures("stand_ins")

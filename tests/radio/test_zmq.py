@@ -48,11 +48,6 @@ def stranger(ends: list[dict[str, Any]]) -> Iterator[Any]:
         yield publisher
 
 
-def counters(robot: Robot) -> dict[str, int]:
-    found: dict[str, int] = robot.link.stats()["front_end"]
-    return found
-
-
 def hear_each_other(robots: list[Robot]) -> None:
     """Wait until each hears what the other says from now on: a subscriber needs a moment to find its publisher."""
     for robot, other in (robots, reversed(robots)):
@@ -74,8 +69,8 @@ def test_both_ways_at_once_and_nobody_takes_its_own(ends: list[dict[str, Any]]) 
             wait_for(lambda: other.heard[-20:] == said, "every message")  # noqa: B023 - called at once
         assert one.link.sink.config.robot_id == 1
         for robot in (one, two):
-            assert counters(robot)["missed"] == counters(robot)["malformed"] == counters(robot)["restarts"] == 0
-            assert counters(robot)["bursts_out"] == robot.link.stats()["packets"]["out"]
+            assert robot.counters()["missed"] == robot.counters()["malformed"] == robot.counters()["restarts"] == 0
+            assert robot.counters()["bursts_out"] == robot.link.stats()["packets"]["out"]
 
 
 @pytest.mark.slow
@@ -84,7 +79,7 @@ def test_a_robot_that_comes_again_is_heard_again(ends: list[dict[str, Any]]) -> 
         for times in range(3):
             with Robot(2, ends[1], hears=(1,)) as two:
                 hear_each_other([one, two])
-                wait_for(lambda: counters(one)["restarts"] == times, "the new sender")  # noqa: B023 - called at once
+                wait_for(lambda: one.counters()["restarts"] == times, "the new sender")  # noqa: B023 - called at once
 
 
 def test_messages_that_are_none_of_ours_are_counted_and_dropped(
@@ -98,23 +93,23 @@ def test_messages_that_are_none_of_ours_are_counted_and_dropped(
         def arrives(message: bytes, name: str, count: int) -> None:
             def seen() -> bool:
                 stranger.send(message)
-                return counters(robot)[name] >= count
+                return robot.counters()[name] >= count
 
             wait_for(seen, name)
 
         for number, junk in enumerate((b"", b"hello", header(0, magic=b"GRI9"), header(0) + b"odd")):
-            arrives(junk, "malformed", counters(robot)["malformed"] + 1)
-            assert counters(robot)["bursts_in"] == 0, number
+            arrives(junk, "malformed", robot.counters()["malformed"] + 1)
+            assert robot.counters()["bursts_in"] == 0, number
         arrives(header(0, 3e6), "wrong_rate", 1)
         for number in (np.nan, np.inf, -np.inf):
             poison = np.array([0, number], "<f4").tobytes()
-            arrives(header(0) + poison, "malformed", counters(robot)["malformed"] + 1)
-        assert counters(robot)["bursts_in"] == 0
+            arrives(header(0) + poison, "malformed", robot.counters()["malformed"] + 1)
+        assert robot.counters()["bursts_in"] == 0
         noise = np.random.default_rng(1).normal(size=100).astype("<f4").tobytes()
         arrives(header(0) + noise, "bursts_in", 1)
-        missed = counters(robot)["missed"]
+        missed = robot.counters()["missed"]
         arrives(header(10**6) + noise, "missed", missed + 1)
-        assert counters(robot)["restarts"] == 0
+        assert robot.counters()["restarts"] == 0
         assert robot.link.stats()["packets"]["in"] == 0
     assert "a peer sends 3e+06 samples/s, not 2e+06; set the same phy at both ends" in caplog.text
 
@@ -127,7 +122,7 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
     most, restarts, sent = 5, 3, 0
     address = ends[1]["bind"]
     front_end = ZmqFrontEnd(PHY.load("psk")(64, RATE), bind=ends[0]["bind"], connect=[address], burst_queue=most)
-    arrivals, counters = front_end.source.arrivals, front_end.counters
+    arrivals = front_end.source.arrivals
     try:
         for sender in range(1 + restarts):
             with strange_robot(address) as publisher:
@@ -138,10 +133,11 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
                         samples = np.full(1000, sent, "<c8").tobytes()
                         publisher.send(HEADER.pack(MAGIC, sender, sent, RATE) + samples)
                         sent += 1
-                    return counters()["restarts"] == sender and counters()["overflows"] > 1000 * (sender + 1)
+                    lost = front_end.counters().lost
+                    return lost["restarts"] == sender and lost["overflows"] > 1000 * (sender + 1)
 
                 wait_for(dropped, "bursts that are dropped")
-        assert counters()["bursts_in"] == most
+        assert front_end.counters().passed["bursts_in"] == most
         numbers = [int(burst[0].real) for burst in (arrivals.take(10.0) for _ in range(most)) if burst is not None]
         assert len(numbers) == most
         assert numbers == sorted(set(numbers))
@@ -165,7 +161,7 @@ def test_the_sender_forgotten_is_the_one_heard_longest_ago(ends: list[dict[str, 
         def bursts(*numbers: tuple[int, int]) -> int:
             for sender, number in numbers:
                 arrivals.arrived(HEADER.pack(MAGIC, sender, number, RATE))
-            return counters(robot)["missed"]
+            return robot.counters()["missed"]
 
         bursts(*((sender, 0) for sender in range(MAX_SENDERS)))
         assert bursts((0, 1), (MAX_SENDERS, 0)) == 0

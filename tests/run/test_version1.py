@@ -122,6 +122,20 @@ def test_through_the_flowgraph_too() -> None:
     assert odom.pdr >= 0.9
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.05])
+def test_without_a_pace_reports_still_repair(delay_s: float) -> None:
+    direct = {"phy": {"name": "direct"}, "reports": {"delay_s": delay_s}}
+    result = run(**direct)
+    (odom,) = map(checked, result.topics)
+    assert odom.pdr == 1
+    assert odom.ledger["repaired"] > 0
+    assert odom.latency_s.p99 is not None
+    assert odom.latency_s.p99 >= delay_s, "a repair waits for the report"
+    assert result.packets["air_repair"] < odom.sent
+    assert run(**direct, channel={}).packets["air_repair"] == 0
+    assert run(phy={"name": "direct"}).packets["air_repair"] == 0, "nobody says what is lost"
+
+
 def test_channels_take_over_what_is_not_set_but_the_seed() -> None:
     made = scenario(reports={}, receivers=[{"packet_loss": 0.5}], seed=3)
     assert made.reports is not None
@@ -135,7 +149,6 @@ def test_channels_take_over_what_is_not_set_but_the_seed() -> None:
     ("settings", "message"),
     [
         ({"version": 0, "reports": {}}, "reports: version 0 has none"),
-        ({"time": "real", "receivers": [{}]}, "receivers: further ones are for simulated time; set time"),
         ({"packet_len": 30}, "version 1 needs at least 40"),
         ({"version": 2}, "version = 2"),
         ({"back": {"ros_source": {"namespace": "/robot_2"}}, "receivers": [{}]}, "one receiver each way"),

@@ -152,10 +152,10 @@ def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_kee
     air = Air(one, two, loss=0.2)
     air.run(2.0)
     for number in range(MAX_TOPICS):
-        one.end.add(f"topic_{number}", "std_msgs/msg/String", TopicOptions())
+        one.end.add([(f"topic_{number}", "std_msgs/msg/String", TopicOptions())])
         one.end.follow(number, reliable=True, latched=number == 7)
     with pytest.raises(ConfigError, match="241 topics; a link carries at most 240"):
-        one.end.add("one_more", "std_msgs/msg/String", TopicOptions())
+        one.end.add([("one_more", "std_msgs/msg/String", TopicOptions())])
     sent = [text(number) for number in range(MAX_TOPICS)]
     for number in reversed(range(MAX_TOPICS)):
         one.end.submit(number, sent[number], air.now)
