@@ -163,7 +163,7 @@ def _noise(count: int, seed: int) -> Samples:
 
 def _receive(modem: BurstModem, samples: Samples) -> list[bytes]:
     engine = modem.receiver()
-    return [packet for at in range(0, len(samples), PIECE) for packet in engine.feed(samples[at : at + PIECE])]
+    return [heard.data for at in range(0, len(samples), PIECE) for heard in engine.feed(samples[at : at + PIECE])]
 
 
 def _ffts(samples: Samples) -> float:

@@ -153,6 +153,8 @@ def make_endpoint(
         )
     version = source.version if source is not None else 0 if sink is None else sink.version
     if not version:
+        if start is not None and start.ladder:
+            raise ConfigError("phy.options.rate = 'adaptive' with version 0, which has no reports; set version to 1")
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or Start()
     dictionaries = () if sink is None else sink.dictionaries
@@ -166,7 +168,13 @@ def make_endpoint(
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
-        decoder_for=lambda rows: codec or known.of(Topic(row.topic_id, row.name, row.type_name) for row in rows),
+        decoder_for=lambda rows: (
+            codec
+            or known.of(
+                [Topic(row.topic_id, row.name, row.type_name) for row in rows],
+                {row.topic_id: row.codec for row in rows},
+            )
+        ),
         heard=start.heard,
         save=start.save,
         observer=observer,
@@ -181,6 +189,7 @@ def start_of(
     reports: bool,
     half_duplex: bool = False,
     any_length: bool = False,
+    ladder: Sequence[Rung] = (),
 ) -> Start:
     """Count this start of a robot in its state file, and read the robot's keys.
 
@@ -189,16 +198,16 @@ def start_of(
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
     if not config.version:
-        return Start()
+        return Start(ladder=ladder)
     if not config.state and not config.key and src_id < 0:
-        return Start(int(time.time()), reports=reports, half_duplex=half_duplex, any_length=any_length)
+        return Start(int(time.time()), reports=reports, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
     path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
     file = BootFile(path, time.time())
-    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length)
+    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length, ladder)
 
 
 def state_folder() -> Path:

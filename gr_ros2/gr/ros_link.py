@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry,
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware
 from gr_ros2.registry import MAX_TOPICS, Registry
 from gr_ros2.setting import AUTO
@@ -38,7 +39,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
     :param half_duplex: whether sending and receiving share the airtime
-    :param any_length: see :class:`RosSource`
+    :param any_length, ladder: see :class:`RosSource`
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -52,13 +53,21 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         middleware: tuple[Middleware, Middleware] | None = None,
         half_duplex: bool = False,
         any_length: bool = False,
+        ladder: Sequence[Rung] = (),
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        start = start_of(source, source.src_id(), reports=True, half_duplex=half_duplex, any_length=any_length)
+        start = start_of(
+            source,
+            source.src_id(),
+            reports=True,
+            half_duplex=half_duplex,
+            any_length=any_length,
+            ladder=ladder,
+        )
         rng = random.Random(seed)
         calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
         self.end = LiveEnd(

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import ConfigError, GrRos2Error, SealError
+from gr_ros2.errors import ConfigError, DescriptionError, GrRos2Error, SealError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
@@ -30,8 +30,12 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_definitions import known
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.names import topic_fault
-from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, packets_of, snr_db_of
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import Registry, Topic, announced, check_outputs
 from gr_ros2.setting import AUTO
@@ -116,6 +120,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._delivered_at: dict[tuple[int, int], float] = {}
         self._stamped: dict[str, bool] = {}
         """Whether messages of a type begin with a header."""
+        self._types: TypeSearch | None = None
         self._said: set[str] = set()
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
@@ -169,9 +174,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._running = True
         self._thread.start(self._watch_timeouts, "gr-ros2-sink")
+        if isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._unknown_types, self._define)
         return True
 
     def stop(self) -> bool:
+        self._stop_search()
         with self._lock:
             self._running = False
             self._timer_due.notify_all()
@@ -180,6 +188,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
+        self._stop_search()
         if self._clock_subscription is not None:
             self._clock_subscription.close()
             self._clock_subscription = None
@@ -231,6 +240,26 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self.config = replaced(self.config, debug=debug)
         self._log = debug_logger(self._log.name, self.config.debug)
+
+    def _stop_search(self) -> None:
+        if self._types is not None:
+            self._types.close()
+            self._types = None
+
+    def _unknown_types(self) -> list[tuple[str, str]]:
+        """The topics published whose types ROS does not ship."""
+        topics = [(key, self._topic(key)) for key in list(self._publishers)]
+        return [(self._name(key), topic.type_name) for key, topic in topics if not known(topic.type_name)]
+
+    def _define(self, described: Described) -> None:
+        """Take a definition that a subscriber has given, for frame names and latencies."""
+        try:
+            store = described.store()
+        except DescriptionError as error:
+            self._log.info("ros2_sink: %s", error)
+            return
+        self._prefix.learn(described.type_name, store)
+        self._stamped[described.type_name] = has_header(described.type_name, store)
 
     def _name(self, key: tuple[int, int]) -> str:
         return self._topic(key).republished(self.config.namespace_format, key[0])
@@ -297,7 +326,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if problem:
                 self._refuse(problem)
             else:
-                self._take(packets)
+                self._take(packets, snr_db_of(message))
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
         self.handled += max(len(packets), 1)
@@ -318,11 +347,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if first:
             self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
 
-    def _take(self, packets: Iterable[bytes]) -> None:
+    def _take(self, packets: Iterable[bytes], snr_db: float | None) -> None:
         events: list[ReceiverEvent] = []
         with self._lock:
             for data in packets:
-                events += self._end.receive(data, self._clock())
+                events += self._end.receive(data, self._clock(), snr_db)
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
             if self._end.answers and not self._end.out_of_credit:

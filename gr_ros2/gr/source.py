@@ -31,8 +31,12 @@ from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.registry import MAX_TOPICS, NewRow, Registry, Topic, normalize_type, options_of
@@ -63,6 +67,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param seed: seed of sequence number and entry ids; None: random
     :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
         packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
+    :param ladder: the rungs of an adaptive rate (:attr:`gr_ros2.phy.Phy.ladder`). Each packet then is a PDU whose
+        metadata names its ``rung``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -77,6 +83,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
         any_length: bool = False,
+        ladder: Sequence[Rung] = (),
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -87,7 +94,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False, any_length=any_length)
+            start = start_of(self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -131,6 +138,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
+        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
@@ -167,6 +175,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
         return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
 
+    def rate(self) -> dict[str, str]:
+        """With an adaptive rate, the name of the rung of the newest packet as ``rung``; otherwise nothing."""
+        ladder = self._end.ladder
+        return {"rung": ladder[self._end.rung].name} if ladder else {}
+
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
         with self._lock:
@@ -188,6 +201,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
+        if self.config.version and self.config.compression and isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
     def stop(self) -> bool:
@@ -312,9 +327,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         subscription.follow(partial(self._follow, topic))
 
     def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search.close()
-            self._search = None
+        for search in (self._search, self._types):
+            if search is not None:
+                search.close()
+        self._search = self._types = None
+
+    def _types_in_use(self) -> list[tuple[str, str]]:
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def _learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        with self._lock:
+            self._end.learn(described.type_name, described.types)
+            self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
         """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
@@ -473,12 +498,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-        if self._port.bundles:
+        if self._port.bundles and not self._end.ladder:
             self._port.send([sent.data for sent in packets])
         else:
             wall = time.time()
             for sent in packets:
-                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall))
+                rung = sent.rung if self._end.ladder else None
+                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall, rung))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:

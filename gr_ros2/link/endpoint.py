@@ -8,13 +8,14 @@ immediately; the receiving half returns its events, so that the caller can act o
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.rate import Rung
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
@@ -71,6 +72,12 @@ class Endpoint(Protocol):
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Code messages of a type by its definition, which was not known before, or another one.
+
+        :param definitions: of the type and of those that it is made of, as the codec takes them
         """
 
     def follow(
@@ -131,6 +138,10 @@ class Endpoint(Protocol):
         """The next packet that may go at ``now``, or None."""
 
     @property
+    def ladder(self) -> Sequence[Rung]:
+        """The rungs of an adaptive rate, the most robust one first; () for a fixed rate."""
+
+    @property
     def rung(self) -> int:
         """With an adaptive rate, the rung of the last packet from ``next_packet`` (:mod:`gr_ros2.link.rate`);
         otherwise 0."""
@@ -163,6 +174,7 @@ class EndpointV0:
     """
 
     answers = False
+    ladder: Sequence[Rung] = ()
 
     def __init__(
         self,
@@ -211,6 +223,9 @@ class EndpointV0:
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """See :class:`Endpoint`."""
         raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Do nothing: both ends of version 0 code by the same dictionaries."""
 
     def follow(
         self,

@@ -17,7 +17,7 @@ from gnuradio import gr
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS
+from gr_ros2.phy.pdus import CREDIT, PDUS, rung_of
 from gr_ros2.phy.threads import BlockThread
 
 _ONE = pmt.from_long(1)
@@ -27,7 +27,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
-    :param airtime_of: the airtime for a packet's bytes, at most ``airtime``; None = all packets have the same
+    :param airtime_of: the airtime for a packet's bytes and rung, at most ``airtime``; None = all packets have the same
     :param lead: s before the channel is free at which a credit is given
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
@@ -40,7 +40,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self,
         airtime: float,
         *,
-        airtime_of: Callable[[int], float] | None = None,
+        airtime_of: Callable[[int, int], float] | None = None,
         lead: float = LEAD_S,
         ahead: float | None = None,
         times: bool = False,
@@ -79,7 +79,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return True
 
     def _arrive(self, pdu: Any) -> None:
-        airtime = None if self._airtime_of is None else self._airtime_of(int(pmt.length(pmt.cdr(pdu))))
+        airtime = None if self._airtime_of is None else self._airtime_of(int(pmt.length(pmt.cdr(pdu))), rung_of(pdu))
         with self._changed:
             self._clock.offer(pdu, time.monotonic(), airtime)
             self._changed.notify_all()

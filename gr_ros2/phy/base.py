@@ -125,6 +125,11 @@ class Phy(ABC):
         """The PHY of each rung, with its rate fixed; this PHY alone where the rate is fixed."""
         return (self,)
 
+    def on_rung(self, rung: int) -> Phy:
+        """The PHY of a rung by its index; that of the most robust one for an index of other settings."""
+        rungs = self.rungs
+        return rungs[rung if 0 <= rung < len(rungs) else 0]
+
     @abstractmethod
     def airtime_samples(self, packet_len: int | None = None) -> int:
         """Samples one packet occupies on the air, gap included; 0 for a PHY without samples.
@@ -136,9 +141,9 @@ class Phy(ABC):
         """Seconds one packet occupies on the air, gap included.
 
         :param packet_len: its bytes, as in :meth:`airtime_samples`
-        :param rung: index of its rung in :attr:`rungs`
+        :param rung: see :meth:`on_rung`
         """
-        return self.rungs[rung].airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
+        return self.on_rung(rung).airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
 
     @abstractmethod
     def burst_power(self) -> float:

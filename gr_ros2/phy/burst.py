@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from math import isfinite, log10
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ _LOOKED_BACK = 16
 """Packets whose SNRs are averaged (median): a single preamble is short, and gives the SNR only to 1 dB."""
 _LEAST_SNR_DB, _MOST_SNR_DB = -40.0, 60.0
 """Limits of a measured SNR: no packet arrives below it; only rounding errors remain above it."""
+_HUGE = 1e15
+"""Magnitude from which on the power of a burst is no finite number in single precision."""
 _SPARE = 1 << 16
 """Samples that a receiver's memory holds in addition to one burst; a larger memory is moved less often."""
 
@@ -44,11 +46,15 @@ class Frame:
     :param mask: whitening sequence of the bytes
     :param code: code for all bits of the frame
     :param order: whether a byte's highest or lowest bit is sent first
+    :param head: what the head of the burst says and the CRC covers too, before the packet
     """
 
-    def __init__(self, packet_len: int, fill: int, mask: Octets, code: Code, order: BitOrder) -> None:
+    def __init__(
+        self, packet_len: int, fill: int, mask: Octets, code: Code, *, order: BitOrder, head: bytes = b""
+    ) -> None:
         self.packet_len = packet_len
         self._fill, self._mask, self._code, self._order = bytes(fill), mask, code, order
+        self._crc = zlib.crc32(head)
 
     @property
     def bits(self) -> int:
@@ -63,14 +69,14 @@ class Frame:
     def wrap(self, packet: bytes) -> Bits:
         """A frame's bits, in the order in which they are sent."""
         filled = packet + self._fill
-        whole = filled + zlib.crc32(filled).to_bytes(CRC_LEN, "little")
+        whole = filled + zlib.crc32(filled, self._crc).to_bytes(CRC_LEN, "little")
         return self._code.encode(np.unpackbits(np.frombuffer(whole, np.uint8) ^ self._mask, bitorder=self._order))
 
     def unwrap(self, soft: Soft) -> bytes | None:
         """The packet of these soft bits, or None if the CRC-32 does not match."""
         whole = (np.packbits(self._code.decode(soft[: self.bits]), bitorder=self._order) ^ self._mask).tobytes()
         filled = whole[:-CRC_LEN]
-        if zlib.crc32(filled) != int.from_bytes(whole[-CRC_LEN:], "little"):
+        if zlib.crc32(filled, self._crc) != int.from_bytes(whole[-CRC_LEN:], "little"):
             return None
         return filled[: self.packet_len]
 
@@ -84,6 +90,8 @@ class Frames:
     :param order: whether a byte's highest or lowest bit is sent first
     :param multiple: a frame's bytes are filled up with zeros to a multiple of this
     :param mask: whitening sequence of the longest frame; shorter frames use its beginning; None = PN9
+    :param rung: with an adaptive rate the number of its rung. The CRC-32 then covers rung and packet length too, so
+        that no frame is taken for one of another rung or length
     """
 
     def __init__(
@@ -95,9 +103,14 @@ class Frames:
         order: BitOrder = "big",
         multiple: int = 1,
         mask: Octets | None = None,
+        rung: int | None = None,
     ) -> None:
-        self._again = partial(Frames, packet_len, fec, fixed=fixed, order=order, multiple=multiple, mask=mask)
+        form: dict[str, Any] = {"fixed": fixed, "order": order, "multiple": multiple, "mask": mask, "rung": rung}
+        self._again = partial(Frames, packet_len, fec, **form)
+        self._rung = rung
         self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
+        self.plain = not self.coded and rung is None
+        """Whether a frame is packet, filling and their CRC-32, whitened, and nothing else."""
         self.order, self.multiple = order, multiple
         self.mask = whitening(self.length(packet_len)) if mask is None else mask
         self._codes = Codes(fec)
@@ -132,7 +145,8 @@ class Frames:
     def _make(self, packet_len: int) -> Frame:
         mask = self.mask[: self.length(packet_len)]
         code = self._codes.of(self.data_bits(packet_len))
-        return Frame(packet_len, self.fill(packet_len), mask, code, self.order)
+        head = b"" if self._rung is None else bytes((self._rung,)) + packet_len.to_bytes(2, "big")
+        return Frame(packet_len, self.fill(packet_len), mask, code, order=self.order, head=head)
 
 
 @lru_cache
@@ -159,20 +173,41 @@ class Search:
 
 @dataclass(frozen=True)
 class Reading:
-    """A demodulated burst.
+    """A demodulated burst, or what its head says while samples are missing.
 
     :param length: bytes of its packet
-    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; fill bits may follow
+    :param soft: log-likelihood ratios of the frame's bits, above 0 for a 1; fill bits may follow. None while the burst
+        is cut: the samples given end before ``end``
     :param points: the received constellation points, for display; magnitude about 1
     :param snr: mean power of the burst over that of the noise in the sampled band, measured on its preamble
-    :param end: index after its last sample that was needed
+    :param end: index after the last sample that is needed
+    :param rung: with an adaptive rate the rung that it was sent with, an index of :attr:`BurstModem.rungs`
     """
 
     length: int
-    soft: Soft
+    soft: Soft | None
     points: Samples
     snr: float
     end: int
+    rung: int = 0
+
+
+class Heard(NamedTuple):
+    """A packet that was received.
+
+    :param data: its bytes
+    :param snr: of its burst, as in :class:`Reading`
+    :param rung: as in :class:`Reading`
+    """
+
+    data: bytes
+    snr: float
+    rung: int = 0
+
+    @property
+    def snr_db(self) -> float:
+        """The SNR in dB, -40..60."""
+        return _in_db(self.snr)
 
 
 @dataclass(frozen=True)
@@ -194,7 +229,7 @@ class ModemConstants:
 class BurstModem(ABC):
     """A modulation for the frames of a link.
 
-    :param frames: the frames that bursts carry
+    :param frames: the frames that bursts carry; with an adaptive rate those of the most robust rung
     """
 
     margin = 0
@@ -204,6 +239,12 @@ class BurstModem(ABC):
 
     def __init__(self, frames: Frames) -> None:
         self.frames = frames
+
+    @property
+    def rungs(self) -> Sequence[BurstModem]:
+        """The modems that send the rungs of an adaptive rate, the most robust one first; this modem alone where the
+        rate is fixed. This modem reads the bursts of all of them."""
+        return (self,)
 
     @abstractmethod
     def samples_of(self, packet_len: int) -> int:
@@ -217,7 +258,7 @@ class BurstModem(ABC):
     @property
     @abstractmethod
     def span(self) -> int:
-        """Samples from the reference sample on that ``end`` needs; at most those of the shortest burst."""
+        """Samples from the reference sample on that hold the head of a burst; at most those of the shortest burst."""
 
     @property
     @abstractmethod
@@ -233,22 +274,30 @@ class BurstModem(ABC):
     def modulate(self, packet: bytes) -> Samples:
         """One burst."""
 
-    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
-        """The bursts of these packets, each followed by ``gap`` zero samples."""
-        silence = np.zeros(gap, np.complex64)
-        return np.concatenate([part for packet in packets for part in (self.modulate(packet), silence)])
+    def modulate_into(self, packets: Sequence[bytes], gap: int, out: Samples) -> None:
+        """Write the bursts of these packets, each followed by ``gap`` zero samples, to the beginning of an array."""
+        begin = 0
+        for packet in packets:
+            burst = self.modulate(packet)
+            end = begin + len(burst)
+            out[begin:end] = burst
+            begin = end + gap
+            out[end:begin] = 0
 
     @abstractmethod
     def find(self, samples: Samples) -> Search:
         """Look for the first burst."""
 
     @abstractmethod
-    def end(self, samples: Samples, start: int) -> int:
-        """Index after the last sample that ``read`` needs of the burst whose reference sample is ``start``."""
-
-    @abstractmethod
     def read(self, samples: Samples, start: int) -> Reading | None:
-        """The burst whose reference sample is at ``start``; None if the close examination finds no burst."""
+        """The burst whose reference sample is at ``start``, of which at least ``span`` samples are given; None if the
+        close examination finds no burst."""
+
+    def unwrap(self, reading: Reading) -> bytes | None:
+        """The packet of a burst, or None if it is cut or its CRC-32 does not match."""
+        if reading.soft is None:
+            return None
+        return self.rungs[reading.rung].frames.of(reading.length).unwrap(reading.soft)
 
     def receiver(self) -> BurstReceiver:
         """A receiver for these bursts."""
@@ -292,12 +341,11 @@ class BurstReceiver:
         """
         if not self._snrs:
             return None
-        snr = max(median(self._snrs), 10 ** (_LEAST_SNR_DB / 10))
-        return min(10 * log10(snr), _MOST_SNR_DB)
+        return _in_db(median(self._snrs))
 
-    def feed(self, samples: Samples) -> list[bytes]:
+    def feed(self, samples: Samples) -> list[Heard]:
         """Take the next samples; returns the packets they complete."""
-        packets = []
+        packets: list[Heard] = []
         while len(samples):
             room = self._make_room()
             self._buffer[self._end : self._end + len(samples[:room])] = samples[:room]
@@ -318,25 +366,20 @@ class BurstReceiver:
                 self._last -= first
         return len(self._buffer) - self._end
 
-    def _finite(self, last: int) -> bool:
-        """Whether the burst's samples up to ``last`` are finite numbers."""
+    def _usable(self) -> int:
+        """Index of the first sample that is no finite number, in or near the burst; otherwise that after the last
+        sample."""
         assert self._start is not None
-        burst = self._buffer[max(0, self._start - self._modem.margin) : min(last + self._modem.margin, self._end)]
-        return isfinite(np.vdot(burst, burst).real)
-
-    def _ending(self) -> int:
-        """Index after the last sample that reading the burst needs."""
-        assert self._start is not None
-        head = self._start + self._modem.span
-        # A head with values that are not finite gives no length, and such a burst is not read.
-        return self._modem.end(self._buffer[: self._end], self._start) if self._finite(head) else head
+        modem, first = self._modem, max(0, self._start - self._modem.margin)
+        burst = self._buffer[first : min(self._start + modem.burst_samples + modem.margin, self._end)]
+        return self._end if isfinite(np.vdot(burst, burst).real) else first + int(np.argmin(np.abs(burst) < _HUGE))
 
     def _remember(self, snrs: list[float]) -> None:
         self._snrs = (*self._snrs, *snrs)[-_LOOKED_BACK:]
 
-    def _take(self) -> list[bytes]:
+    def _take(self) -> list[Heard]:
         """The packets that are complete now."""
-        packets: list[bytes] = []
+        packets: list[Heard] = []
         while True:
             if self._start is None:
                 stretch = self._buffer[self._cursor : min(self._end, self._cursor + self._stretch)]
@@ -348,19 +391,25 @@ class BurstReceiver:
                     continue
             if self._start is None or self._end - self._start < self._modem.span:
                 return packets
-            if self._last is None:
-                self._last = self._ending()
-            if self._end < self._last:
+            if self._last is not None and self._end < self._last:
                 return packets
-            whole = self._finite(self._last)
-            reading = self._modem.read(self._buffer[: self._end], self._start) if whole else None
-            packet = None if reading is None else self._modem.frames.of(reading.length).unwrap(reading.soft)
+            usable = self._usable()
+            whole = usable - self._start >= self._modem.span
+            reading = self._modem.read(self._buffer[:usable], self._start) if whole else None
+            if reading is not None and reading.soft is None and reading.end > self._end:
+                self._last = reading.end
+                return packets
+            packet = None if reading is None else self._modem.unwrap(reading)
             if reading is None or packet is None:
                 self.damaged += 1
                 self._cursor = self._start + self._modem.peak_samples
             else:
-                packets.append(packet)
+                packets.append(Heard(packet, reading.snr, reading.rung))
                 self.points = reading.points
                 self._remember([reading.snr])
-                self._cursor = self._last - self._modem.margin
+                self._cursor = reading.end - self._modem.margin
             self._start = self._last = None
+
+
+def _in_db(snr: float) -> float:
+    return min(10 * log10(max(snr, 10 ** (_LEAST_SNR_DB / 10))), _MOST_SNR_DB)

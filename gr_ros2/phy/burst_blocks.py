@@ -10,7 +10,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections import deque
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,11 +20,11 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import fastest, which
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
@@ -148,14 +148,17 @@ class TakesPackets(KeptAlive):
         PduPort.readable_by(self)
 
     @abstractmethod
-    def take_packets(self, packets: list[bytes]) -> None:
-        """Process packets that came together."""
+    def take_packets(self, packets: list[bytes], rung: int) -> None:
+        """Process packets that came together.
+
+        :param rung: the rung that their PDU says, 0 where it says none
+        """
 
     def _take(self, message: Any) -> None:
         packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
         good = [packet for packet in packets if len(packet) in self._lengths]
         self._refuse(len(packets) - len(good) + bool(problem))
-        self.take_packets(good)
+        self.take_packets(good, rung_of(message))
 
     def _refuse(self, count: int) -> None:
         first = bool(count and not self.refused)
@@ -178,49 +181,75 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
-        self._modem = phy.running_modem
+        self._rungs = phy.running_modem.rungs
         self._gap = phy.gap
-        self._waiting: deque[bytes] = deque()
-        self._bursts: deque[Samples] = deque()
-        """Bursts that are modulated, each with its gap."""
-        self._rest = np.empty(0, np.complex64)
+        self._waiting: deque[tuple[BurstModem, bytes]] = deque()
+        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
+        self._rest = self._whole[:0]
+        """What has not left yet of a burst that did not fit."""
         self.sent = 0
         """Packets that have left as samples."""
+        self._tag = self.add_item_tag  # stored: each look-up would pass through two proxies
         log_warnings_only([self])
         self.set_min_output_buffer(_BUFFER)
 
-    def take_packets(self, packets: list[bytes]) -> None:
-        self._waiting.extend(packets)
+    def take_packets(self, packets: list[bytes], rung: int) -> None:
+        # A rung that this end does not have is one of settings that differ: the most robust one is sent.
+        modem = self._rungs[rung if 0 <= rung < len(self._rungs) else 0]
+        self._waiting.extend((modem, packet) for packet in packets)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
-        out, done = output_items[0], 0
-        while done < len(out):
-            if not len(self._rest):
-                if not self._bursts:
-                    self._modulate(len(out) - done)
-                if not self._bursts:
-                    break
-                self._rest = self._bursts.popleft()
-                if self._tagged:
-                    self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
-            count = min(len(out) - done, len(self._rest))
-            out[done : done + count] = self._rest[:count]
-            self._rest = self._rest[count:]
-            done += count
-            self.sent += not len(self._rest)
+        out = output_items[0]
+        done = self._go_on(out)
+        while self._waiting and done < len(out):
+            modem = self._waiting[0][0]
+            packets, sizes = self._fitting(modem, len(out) - done)
+            if packets:
+                modem.modulate_into(packets, self._gap, out[done:])
+                for size in sizes:
+                    self._begin(done, size)
+                    done += size
+                self.sent += len(packets)
+            else:
+                _, packet = self._waiting.popleft()
+                self._rest = self._whole[: self._size(modem, packet)]
+                modem.modulate_into([packet], self._gap, self._rest)
+                self._begin(done, len(self._rest))
+                done += self._go_on(out[done:])
         return done
 
-    def _modulate(self, room: int) -> None:
-        """Modulate as many waiting packets as there is room for, at least one."""
+    def _size(self, modem: BurstModem, packet: bytes) -> int:
+        """Samples of a packet's burst and gap."""
+        return modem.samples_of(len(packet)) + self._gap
+
+    def _fitting(self, modem: BurstModem, room: int) -> tuple[list[bytes], list[int]]:
+        """The next packets whose bursts fit, all of one modem, and the samples of each."""
         packets: list[bytes] = []
-        ends: list[int] = []
-        end = 0
-        while self._waiting and end < room:
-            packets.append(self._waiting.popleft())
-            end += self._modem.samples_of(len(packets[-1])) + self._gap
-            ends.append(end)
-        if packets:
-            self._bursts.extend(np.split(self._modem.modulate_all(packets, self._gap), ends[:-1]))
+        sizes: list[int] = []
+        while self._waiting and self._waiting[0][0] is modem and (size := self._size(*self._waiting[0])) <= room:
+            packets.append(self._waiting.popleft()[1])
+            sizes.append(size)
+            room -= size
+        return packets, sizes
+
+    def _begin(self, place: int, size: int) -> None:
+        """A burst begins at a place of this call's samples."""
+        if self._tagged:
+            self._tag(0, self.nitems_written(0) + place, _LENGTH, _number(size))
+
+    def _go_on(self, out: Samples) -> int:
+        """Send as much as fits of the burst that has begun; returns its number of samples."""
+        count = min(len(out), len(self._rest))
+        if count:
+            out[:count] = self._rest[:count]
+            self._rest = self._rest[count:]
+            self.sent += not len(self._rest)
+        return count
+
+
+@lru_cache
+def _number(value: int) -> Any:
+    return pmt.from_long(value)
 
 
 class BurstSink(ReceiverBlock):
@@ -279,8 +308,8 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._port.find_readers()
-        send = self._port.send
-        self._engine = ReceiverProcess(self._modem, send) if self._own_process else self._modem.receiver()
+        modem = self._modem
+        self._engine = ReceiverProcess(modem, self._send) if self._own_process else modem.receiver()
         return super().start()
 
     def stop(self) -> bool:
@@ -288,10 +317,17 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
-        self._port.send(self._packets(input_items[0]))
+        self._send(self._packets(input_items[0]))
         return len(input_items[0])
 
-    def _packets(self, samples: Samples) -> list[bytes]:
+    def _send(self, packets: list[Heard]) -> None:
+        if len(self._modem.rungs) == 1:
+            self._port.send([packet.data for packet in packets])
+        else:
+            for packet in packets:
+                self._port.send_pdu(pdu_heard(packet.data, packet.rung, packet.snr_db))
+
+    def _packets(self, samples: Samples) -> list[Heard]:
         assert self._engine is not None
         try:
             return self._engine.feed(samples)

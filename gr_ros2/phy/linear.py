@@ -187,20 +187,16 @@ class LinearModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
-    def end(self, samples: Samples, start: int) -> int:
-        length = self.frames.packet_len
-        if self._word is not None:
-            frequency, phase, _ = self._measure(samples, start)
-            length = self._length(samples, start, frequency, phase)
-        return start + self._needed(length)
-
     def read(self, samples: Samples, start: int) -> Reading:
         frequency, phase, snr = self._measure(samples, start)
         length, skipped = self.frames.packet_len, 0
         if self._word is not None:
             length, skipped = self._length(samples, start, frequency, phase), WORD_BITS
+        end = start + self._needed(length)
+        if end > len(samples):
+            return Reading(length, None, samples[:0], snr, end)
         points, soft = self._payload(samples, start, frequency, phase, self.payload_symbols(length))
-        return Reading(length, soft[skipped:], points, snr, start + self._needed(length))
+        return Reading(length, soft[skipped:], points, snr, end)
 
     def _length(self, samples: Samples, start: int, frequency: float, phase: float) -> int:
         """Bytes of the packet, from the symbols that even the shortest burst has."""

@@ -175,13 +175,8 @@ class LoraModem(BurstModem):
         late = int(np.argmax(np.minimum(powers[best : best + _LOOK], _LIMIT).sum(axis=0)))
         return Search(first * self.chips, best * self.chips + (self.chips - late) % self.chips)
 
-    def end(self, samples: Samples, start: int) -> int:
-        place = self._place(samples, start)
-        # Samples without a burst are read without waiting; the end of a burst may be a few samples late, because of the
-        # clocks and the channel.
-        return start + self.span if place is None else self._end(place, self._length(samples, place))
-
     def _end(self, place: _ChirpPlace, length: int) -> int:
+        # The end of a burst may be a few samples late, because of the clocks and the channel.
         return round(place.begin) + (self._before + self.symbols(length)) * self.chips - _SINC
 
     def _tones(self, samples: Samples, place: _ChirpPlace, first: float, count: int) -> NDArray[np.complex64]:
@@ -203,6 +198,9 @@ class LoraModem(BurstModem):
         if place is None:
             return None
         length = self._length(samples, place)
+        end = self._end(place, length)
+        if end > len(samples):
+            return Reading(length, None, samples[:0], place.snr, end)
         symbols = self.symbols(length)
         begin = place.begin + self._before * self.chips
         soft = np.empty((symbols, self.spreading_factor), np.float32)
@@ -220,7 +218,7 @@ class LoraModem(BurstModem):
             late = self._late(tones, peaks)
             pace -= _PACE_GAIN * late
             begin += pace - _GAIN * late
-        return Reading(length, self._collect(soft), points, place.snr, self._end(place, length))
+        return Reading(length, self._collect(soft), points, place.snr, end)
 
     def constants(self) -> ModemConstants:
         symbols = self.symbols(self.frames.packet_len)

@@ -176,7 +176,7 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._frame = frame
         self.message_port_register_out(PDUS)
 
-    def take_packets(self, packets: list[bytes]) -> None:
+    def take_packets(self, packets: list[bytes], rung: int) -> None:  # noqa: ARG002 - one rate
         for packet in packets:
             self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
 

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.errors import ConfigError
 from gr_ros2.link.rate import Rung
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
-from gr_ros2.phy.ofdm_modem import OfdmModem
+from gr_ros2.phy.ofdm_modem import OfdmLadder, OfdmModem
 from gr_ros2.phy.ofdm_rate import RUNGS, rung_of
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
@@ -44,7 +44,8 @@ class OfdmOptions(BurstOptions):
         at closely; auto = what noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their
         0.9, which need 5 to 7 dB more SNR; at a lower one these lose packets without any noise
     :param rate: ``adaptive`` = the sender chooses modulation and code of each packet by what its receivers report
-        (version 1 with reports, simulated time); ``payload_modulation`` and ``fec`` are then left out
+        (version 1, and a way back), and the header of each burst says which; ``payload_modulation`` and ``fec`` are
+        then left out. The same at both ends
     :param rungs: names of the modulations and codes that ``adaptive`` may choose from, the most robust one first;
         auto = all: bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc, 16qam, 64qam
     :param gap: zero samples after each packet, up to 100000; auto = 32, with stock two symbols. The stock receiver
@@ -87,16 +88,27 @@ class OfdmPhy(BurstPhy):
         edge = None if chosen.carriers == AUTO else chosen.carriers
         pilots = None if chosen.pilots == AUTO else chosen.pilots
         self._rungs = self._adaptive(options) if chosen.rate == "adaptive" else ()
-        self.layout = layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, edge, pilots)
+        self.layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, edge, pilots)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
         if threshold == "stock":
             self._stock = self._checked_stock()
             self.gap = self._stock.gap
+        elif self._rungs:
+            self.layout = self._rungs[0].layout
+            self.modem: OfdmModem = OfdmLadder([phy.modem_of(rung) for rung, phy in enumerate(self._rungs)])
         else:
-            mask = layout.mask(packet_len + layout.fill(packet_len) + CRC_LEN)
-            frames = self.frames(order="little", multiple=layout.multiple, mask=mask)
-            self.modem: OfdmModem = OfdmModem(frames, layout, None if threshold == AUTO else threshold)
+            self.modem = self.modem_of(None)
+
+    def modem_of(self, rung: int | None) -> OfdmModem:
+        """The modem of our own receiver.
+
+        :param rung: number that the header carries, see :class:`OfdmModem`
+        """
+        layout, threshold = self.layout, self.options.detection_threshold
+        mask = layout.mask(self.packet_len + layout.fill(self.packet_len) + CRC_LEN)
+        frames = self.frames(order="little", multiple=layout.multiple, mask=mask, rung=rung)
+        return OfdmModem(frames, layout, None if threshold == AUTO else threshold, rung)
 
     def _adaptive(self, options: dict[str, Any]) -> tuple[OfdmPhy, ...]:
         """The PHYs of the rungs."""
@@ -108,9 +120,25 @@ class OfdmPhy(BurstPhy):
                     f"phy ofdm: {name} = {value!r} with rate: adaptive, which chooses modulation and code for our own "
                     "receiver; leave it out, or set rate to fixed"
                 )
+        if chosen.lengths == "fixed":
+            raise ConfigError(
+                "phy ofdm: lengths = 'fixed' with rate: adaptive, whose bursts differ in length; leave lengths out, or "
+                "set rate to fixed"
+            )
+        names = self._names()
+        if list(names) != [name for name in RUNGS if name in names]:
+            raise ConfigError(f"phy ofdm: rungs = {names}: each once, the most robust one first: {', '.join(RUNGS)}")
         fixed = {**options, "rate": "fixed", "rungs": AUTO}
-        made = (dict(zip(("payload_modulation", "fec"), RUNGS[name][:2], strict=True)) for name in self._names())
+        made = (dict(zip(("payload_modulation", "fec"), RUNGS[name][:2], strict=True)) for name in names)
         return tuple(OfdmPhy(self.packet_len, self.sample_rate, **{**fixed, **rung}) for rung in made)
+
+    def pad_all(self) -> None:
+        if self._rungs:
+            raise ConfigError(
+                "phy ofdm: rate = 'adaptive' sends bursts of different lengths, and this front end needs them all of "
+                "one length; set rate to fixed, or choose another front end"
+            )
+        super().pad_all()
 
     def _names(self) -> tuple[str, ...]:
         chosen: OfdmOptions = self.options
@@ -151,6 +179,8 @@ class OfdmPhy(BurstPhy):
         return self.layout.power(self.frame_bits())
 
     def computed_pdr(self, snr_db: float) -> float:
+        if self._rungs:
+            return self._rungs[0].computed_pdr(snr_db)
         noise = self.burst_power() / 10 ** (snr_db / 10)
         snr = point_power(self.options.payload_modulation) * self.options.fft_len / noise
         if self._stock is None and self.modem.frames.coded:
@@ -171,15 +201,7 @@ class OfdmPhy(BurstPhy):
             idle_spinning_threads()
 
     def transmitter(self) -> PacketTransmitter:
-        self._refuse_adaptive()
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
     def receiver(self, own_process: bool = False) -> PacketReceiver:
-        self._refuse_adaptive()
         return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)
-
-    def _refuse_adaptive(self) -> None:
-        if self._rungs:
-            raise PhyError(
-                "phy ofdm: rate = 'adaptive' runs in simulated time only, as yet; set time to packets, or rate to fixed"
-            )

@@ -4,19 +4,20 @@ reference.
 Invariants: a detected preamble is a burst only if its two sync words are those of the layout; the channel is a short
 impulse response, so its estimate at one carrier uses all carriers; the estimate is tracked through the payload with the
 decided payload symbols, weighted by their certainty; if packets may have different lengths, the header carries the
-length.
+length; with an adaptive rate it also carries the rung, whose modulation and code the payload has.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, Frames, ModemConstants, Reading, Samples, Search
-from gr_ros2.phy.fec import Soft
-from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits
+from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
+from gr_ros2.phy.fec import Bits, Soft
+from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, rung_mark
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
 
@@ -76,10 +77,15 @@ class OfdmModem(BurstModem):
     :param frames: the frames that bursts carry, lowest bit of a byte first
     :param layout: carriers and constellation
     :param threshold: threshold of the preamble's metric, 0..1; None = from the share of false alarms
+    :param rung: with an adaptive rate the number of its rung, which the header carries; None = a fixed rate
     """
 
-    def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None) -> None:
+    _counted = True
+    """Whether the headers of GNU Radio's blocks, which count frames, are understood."""
+
+    def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None, rung: int | None = None) -> None:
         super().__init__(frames)
+        self._threshold = threshold
         self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
         self._bpsk = Points(np.array([-1, 1], complex), "little")
         self._layout = layout
@@ -97,7 +103,7 @@ class OfdmModem(BurstModem):
         self._known = np.zeros(len(self._carriers), np.complex64)
         self._known[self._pilots] = layout.pilot_symbols[0]
         self._header_mask = layout.header_mask()
-        self._prepare_header()
+        self._prepare_header(rung)
         words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
         self._words = words[:, self._carriers].astype(np.complex64)
         self._twice, self._once = np.flatnonzero(self._words[0]), np.flatnonzero(self._words[0] == 0)
@@ -106,28 +112,36 @@ class OfdmModem(BurstModem):
         self._prepare_search(words)
         self._prepare_estimate()
 
-    def _prepare_header(self) -> None:
+    def _prepare_header(self, rung: int | None) -> None:
         frames = self.frames
         self._word: LengthWord | None = None
+        self.headers: Bits
+        """The bits of the headers, one row for each packet length."""
         if frames.fixed:
-            self._full = header_bits([-(-frames.bits(frames.packet_len) // 8)], 0)[0]
+            self.headers = header_bits([-(-frames.bits(frames.packet_len) // 8)], 0)
             return
-        fields = [frames.length(length) for length in frames.lengths]
-        self._word = LengthWord(frames.lengths, fields, [frames.fill(length) * _FILL_MARK for length in frames.lengths])
-        self._full = self._word.word(frames.packet_len)
+        if rung is None:
+            fields = [frames.length(length) for length in frames.lengths]
+            marks = [frames.fill(length) * _FILL_MARK for length in frames.lengths]
+            self._word = LengthWord(frames.lengths, fields, marks)
+        else:
+            fields = [length + CRC_LEN for length in frames.lengths]
+            self._word = LengthWord(frames.lengths, fields, rung_mark(rung))
+        self.headers = self._word.bits
 
     def _header(self, packet_len: int) -> Samples:
         """The header's points."""
         bits = self._header_mask.copy()
-        bits[:WORD_BITS] ^= self._full if self._word is None else self._word.word(packet_len)
+        bits[:WORD_BITS] ^= self.headers[packet_len - self.frames.lengths[0]]
         return self._bpsk.map(bits)
 
-    def _said(self, soft: Soft) -> int:
-        """Bytes of the packet, from soft bits of the header."""
-        if self._word is None:
-            return self.frames.packet_len
-        word = soft[:WORD_BITS] * (1 - 2.0 * self._header_mask[:WORD_BITS])
-        return self._word.read_header(word)
+    def _word_soft(self, soft: Soft) -> Soft:
+        """Soft bits of the word that a header carries."""
+        return np.asarray(soft[:WORD_BITS] * (1 - 2.0 * self._header_mask[:WORD_BITS]), np.float32)
+
+    def _said(self, soft: Soft) -> tuple[int, int]:
+        """Rung, and bytes of the packet, from soft bits of the header."""
+        return 0, self.frames.packet_len if self._word is None else self._word.read_header(self._word_soft(soft))
 
     def _prepare_search(self, words: NDArray[np.complex128]) -> None:
         even = np.flatnonzero(np.abs(words[0]) > 0)
@@ -154,12 +168,20 @@ class OfdmModem(BurstModem):
         self._smooth = smoother(np.ones(len(self._carriers)))
         self._degrees = 2 * len(self._carriers) - len(delays)
 
+    @property
+    def rungs(self) -> Sequence[OfdmModem]:
+        return (self,)
+
+    def symbols_of(self, packet_len: int) -> int:
+        """Symbols of the burst of a packet of ``packet_len`` bytes."""
+        return self._layout.symbols(self.frames.bits(packet_len))
+
     def samples_of(self, packet_len: int) -> int:
-        return self._layout.symbols(self.frames.bits(packet_len)) * self._symbol
+        return self.symbols_of(packet_len) * self._symbol
 
     @property
     def span(self) -> int:
-        return self.samples_of(self.frames.lengths[0]) - self._back
+        return min(modem.samples_of(self.frames.lengths[0]) for modem in self.rungs) - self._back
 
     @property
     def preamble_samples(self) -> int:
@@ -170,7 +192,7 @@ class OfdmModem(BurstModem):
         return self._symbol
 
     def modulate(self, packet: bytes) -> Samples:
-        symbols = self._layout.symbols(self.frames.bits(len(packet)))
+        symbols = self.symbols_of(len(packet))
         grid = np.zeros((symbols, self._size), np.complex64)
         grid[:2, self._carriers] = self._words
         payload = np.zeros((symbols - 2, len(self._carriers)), np.complex64)
@@ -211,51 +233,50 @@ class OfdmModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
-    def end(self, samples: Samples, start: int) -> int:
-        if self._word is None:
-            return start + self._needed(self.frames.packet_len)
-        begin, frequency, _ = self._place(samples, start)
-        rows = self._rows(samples, _SymbolClock(float(begin), 0.0), frequency, 0, HEAD_SYMBOLS)
-        return start + self._needed(self._head(rows)[1])
-
-    def _needed(self, packet_len: int) -> int:
-        """Samples from the reference sample on that are needed to read a packet of ``packet_len`` bytes."""
-        return self.samples_of(packet_len) - self._back
-
-    def _head(self, rows: Complexes) -> tuple[_Channel, int]:
-        """Evaluates sync words and header: the channel, and the bytes of the packet."""
+    def _head(self, rows: Complexes) -> tuple[_Channel, int, int]:
+        """Evaluates sync words and header: the channel, the rung, and the bytes of the packet."""
         all_used = np.ones((1, len(self._data)), bool)
         channel = self._first_estimate(rows[:2])
         channel, likely, _, _ = self._decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
-        return channel, self._said(self._bpsk.soft(likely))
+        return channel, *self._said(self._bpsk.soft(likely))
 
     def read(self, samples: Samples, start: int) -> Reading:
         begin, frequency, _ = self._place(samples, start)
         clock = _SymbolClock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
         snr = self._snr(rows[:2])
-        channel, length = self._head(rows)
-        bits = self.frames.bits(length)
-        count = self._layout.symbols(bits) - HEAD_SYMBOLS
-        points = -(-bits // self.constellation.bits)
+        channel, rung, length = self._head(rows)
+        sent = self.rungs[rung]
+        end = start + sent.samples_of(length) - self._back
+        if end > len(samples):
+            return Reading(length, None, samples[:0], snr, end, rung)
+        count = sent.symbols_of(length) - HEAD_SYMBOLS
+        points = sent.points_of(length)
         used = np.arange(count * len(self._data)).reshape(count, -1) < points
         soft, looked = [], []
         for first in range(0, count, _CHUNK):
             last = min(count, first + _CHUNK)
             rows = self._rows(samples, clock, frequency, HEAD_SYMBOLS + first, last - first)
-            channel, likely, seen, late = self._decide(rows, channel, self.constellation, used[first:last])
-            soft.append(self.constellation.soft(likely))
+            channel, likely, seen, late = self._decide(rows, channel, sent.constellation, used[first:last])
+            soft.append(sent.constellation.soft(likely))
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
             clock = _SymbolClock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
-        end = start + self._needed(length)
-        return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end)
+        return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end, rung)
+
+    def points_of(self, packet_len: int) -> int:
+        """Payload points of the burst of a packet of ``packet_len`` bytes."""
+        return -(-self.frames.bits(packet_len) // self.constellation.bits)
 
     def constants(self) -> ModemConstants:
-        points = -(-self.frames.bits(self.frames.packet_len) // self.constellation.bits)
+        constellations = [modem.constellation for modem in self.rungs]
+        most = [modem.points_of(modem.frames.packet_len) for modem in self.rungs]
         values = {
             **self.lengths(),
-            "headers": self._full if self._word is None else self._word.bits,
+            "frame_bits": np.concatenate([modem.lengths()["frame_bits"] for modem in self.rungs]),
+            "rung_count": len(self.rungs),
+            "counted": self._counted,
+            "headers": np.concatenate([modem.headers for modem in self.rungs]),
             "header_mask": self._header_mask,
             "size": self._size,
             "prefix": self._prefix,
@@ -268,8 +289,8 @@ class OfdmModem(BurstModem):
             "once_count": len(self._once),
             "twice_count": len(self._twice),
             "shift_count": len(_SHIFTS),
-            "point_count": len(self.constellation.points),
-            "point_bits": self.constellation.bits,
+            "point_counts": [len(each.points) for each in constellations],
+            "point_bits": [each.bits for each in constellations],
             "level": self._level,
             "alike": _ALIKE,
             "energy": self._energy,
@@ -293,11 +314,12 @@ class OfdmModem(BurstModem):
             "smooth": self._smooth,
             "smooth_words": self._smooth_words,
             "crosswise": self._crosswise,
-            "points": self.constellation.points,
+            "points": np.concatenate([each.points for each in constellations]),
             "word_weight": self._word_weight,
-            "marks": self.constellation.marks,
+            "marks": np.concatenate([each.marks.reshape(-1) for each in constellations]),
         }
-        return ModemConstants("ofdm", values, points * self.constellation.bits, points)
+        soft_bits = max(points * each.bits for points, each in zip(most, constellations, strict=True))
+        return ModemConstants("ofdm", values, soft_bits, max(most))
 
     def _place(self, samples: Samples, at: int) -> _FramePlace:
         """Examine closely a position at which the first half of a symbol is repeated."""
@@ -432,6 +454,29 @@ class OfdmModem(BurstModem):
         """Delay of symbols in samples, from the phase slope over their carriers."""
         slope = float(self._carriers @ turns.imag) / max(float(self._carriers**2 @ np.abs(turns.real)), _TINY)
         return -slope * self._size / (2 * np.pi)
+
+
+class OfdmLadder(OfdmModem):
+    """A modem that reads the bursts of all rungs of an adaptive rate, and sends the most robust one.
+
+    :param rungs: the modems of the rungs, the most robust one first
+    """
+
+    _counted = False
+
+    def __init__(self, rungs: Sequence[OfdmModem]) -> None:
+        first = rungs[0]
+        super().__init__(first.frames, first._layout, first._threshold, 0)
+        self._rungs = tuple(rungs)
+        self._signs = 2 * np.concatenate([modem.headers for modem in rungs]).astype(np.float32) - 1
+
+    @property
+    def rungs(self) -> Sequence[OfdmModem]:
+        return self._rungs
+
+    def _said(self, soft: Soft) -> tuple[int, int]:
+        rung, row = divmod(int(np.argmax(self._signs @ self._word_soft(soft))), len(self.frames.lengths))
+        return rung, self.frames.lengths[row]
 
 
 def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:

@@ -5,8 +5,9 @@ packets at once sends them in one message, a *bundle*, if all blocks that read i
 blocks of this package; all other blocks get one PDU per packet.
 
 Invariants: a PDU is a PMT pair of a dictionary and a u8vector; a bundle is a pair of the symbol ``bundle`` and a
-u8vector with the length (u32, big-endian) and the bytes of each packet; metadata is for people and other blocks, so a
-bundle has none.
+u8vector with the length (u32, big-endian) and the bytes of each packet; of the metadata, blocks of this package read
+``rung`` and ``snr_db`` only; the rest is for people and other blocks. A bundle has no metadata, so packets with a rung
+are not bundled.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 """The message ports of the blocks: packets, and the credits that request them."""
 
 _BUNDLE = pmt.intern("bundle")
+_RUNG, _SNR_DB = pmt.intern("rung"), pmt.intern("snr_db")
 _LENGTH_LEN = 4
 _NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
@@ -41,9 +43,36 @@ def octets(vector: Any) -> bytes:
     return serialized[_OFFSET:]
 
 
-def pdu_of(data: bytes) -> Any:
-    """A packet as a PDU without metadata."""
-    return pmt.cons(_NO_METADATA, u8vector(data))
+def pdu_of(data: bytes, metadata: Any = _NO_METADATA) -> Any:
+    """A packet as a PDU."""
+    return pmt.cons(metadata, u8vector(data))
+
+
+def with_rung(metadata: Any, rung: int) -> Any:
+    """Metadata that says with which rung of an adaptive rate a packet is sent."""
+    return pmt.dict_add(metadata, _RUNG, pmt.from_long(rung))
+
+
+def pdu_heard(data: bytes, rung: int, snr_db: float) -> Any:
+    """A packet that was received as a PDU that says with which rung, and the SNR of its burst in dB."""
+    return pdu_of(data, pmt.dict_add(with_rung(_NO_METADATA, rung), _SNR_DB, pmt.from_double(snr_db)))
+
+
+def rung_of(message: Any) -> int:
+    """The rung that the metadata of a PDU says; 0 if it says none."""
+    rung = _said(message, _RUNG)
+    return int(pmt.to_long(rung)) if pmt.is_integer(rung) else 0
+
+
+def snr_db_of(message: Any) -> float | None:
+    """The SNR in dB that the metadata of a PDU says; None if it says none."""
+    snr_db = _said(message, _SNR_DB)
+    return float(pmt.to_double(snr_db)) if pmt.is_number(snr_db) and not pmt.is_complex(snr_db) else None
+
+
+def _said(message: Any, key: Any) -> Any:
+    metadata = pmt.car(message) if pmt.is_pair(message) else _NO_METADATA
+    return pmt.dict_ref(metadata, key, pmt.PMT_NIL) if pmt.is_dict(metadata) else pmt.PMT_NIL
 
 
 def packets_of(message: Any) -> tuple[list[bytes], str]:

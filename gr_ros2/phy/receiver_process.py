@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Heard, Samples
 
 _START_S = 30.0
 """Time limit for loading Python and its libraries, on a small and busy computer."""
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 class _Report(NamedTuple):
     """A report of the process: packets since the last report, and the current counters."""
 
-    packets: list[bytes]
+    packets: list[Heard]
     damaged: int
     points: Samples
     snr_db: float | None
@@ -48,7 +48,7 @@ class ReceiverProcess:
     :param deliver: called with the packets of each report, in a thread of its own
     """
 
-    def __init__(self, modem: BurstModem, deliver: Callable[[list[bytes]], None]) -> None:
+    def __init__(self, modem: BurstModem, deliver: Callable[[list[Heard]], None]) -> None:
         self._modem = modem
         self._deliver = deliver
         self._report = _Report([], 0, np.empty(0, np.complex64), None)
@@ -90,7 +90,7 @@ class ReceiverProcess:
         """SNR over the sampled band, dB: the median of the newest packets; None before the first."""
         return self._report.snr_db if self._here is None else self._here.snr_db
 
-    def feed(self, samples: Samples) -> list[bytes]:
+    def feed(self, samples: Samples) -> list[Heard]:
         """Take the next samples, and wait while the process is behind; returns packets that were decoded in this
         process."""
         if self._here is None:
@@ -165,6 +165,6 @@ def serve(descriptor: int) -> None:
                 _send_report(reports, receiver, packets)
 
 
-def _send_report(reports: BinaryIO, receiver: BurstReceiver, packets: list[bytes]) -> None:
+def _send_report(reports: BinaryIO, receiver: BurstReceiver, packets: list[Heard]) -> None:
     pickle.dump(_Report(packets, receiver.damaged, receiver.points, receiver.snr_db), reports, pickle.HIGHEST_PROTOCOL)
     reports.flush()

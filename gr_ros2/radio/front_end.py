@@ -122,12 +122,13 @@ class FrontEnd(ABC):
         """Frequency at which it receives, Hz; None if there is no radio."""
         return None
 
-    def airtime(self, packet_len: int | None = None) -> float:
+    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
         """Time from the start of one packet to the earliest start of the next, s.
 
         :param packet_len: length of the packet, bytes; None: that of the longest
+        :param rung: with an adaptive rate, the rung that it is sent with
         """
-        return self.phy.airtime(packet_len) + float(self.options.guard_s)
+        return self.phy.airtime(packet_len, rung) + float(self.options.guard_s)
 
     def ahead(self) -> float | None:
         """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a

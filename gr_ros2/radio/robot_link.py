@@ -105,6 +105,7 @@ class RobotLink(Flowgraph):
             middleware=graphs,
             half_duplex=getattr(self.front_end.options, "half_duplex", False),
             any_length=self.phy.any_length,
+            ladder=self.phy.ladder,
             observer=observer,
             clock=self._clock,
         )
@@ -118,8 +119,8 @@ class RobotLink(Flowgraph):
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        any_length = self.phy.any_length
-        self.source = RosSource(self._registry, middleware=graphs[0], any_length=any_length, **common, **source)
+        carried: dict[str, Any] = {"any_length": self.phy.any_length, "ladder": self.phy.ladder}
+        self.source = RosSource(self._registry, middleware=graphs[0], **carried, **common, **source)
         self._stack.callback(self.source.close)
         self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
@@ -201,7 +202,7 @@ class RobotLink(Flowgraph):
 
     def incomplete(self) -> list[str]:
         """What observers missed and what the recording lacks: one line each, with reason and number; often none."""
-        return [*self._observers.told(), *self.radio.incomplete()]
+        return [*self._observers.incomplete(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
         """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
@@ -226,6 +227,7 @@ class RobotLink(Flowgraph):
                 "sample_rate": phy.sample_rate if phy.has_samples else None,
                 "airtime_s": self.front_end.airtime(),
                 "snr_db": self.radio.snr_db,
+                **self.source.rate(),
             },
             "front_end": {
                 "name": self.front_end.name,

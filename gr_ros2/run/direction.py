@@ -21,6 +21,7 @@ from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
@@ -48,12 +49,15 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     )
 
 
-def live_ends(ways: Sequence[Scenario], registry: Registry, *, any_length: bool) -> list[LiveEnd]:
+def live_ends(
+    ways: Sequence[Scenario], registry: Registry, *, any_length: bool, ladder: Sequence[Rung] = ()
+) -> list[LiveEnd]:
     """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`.
 
     :param any_length: whether the PHY carries shorter packets in less time
+    :param ladder: the rungs of an adaptive rate; () for a fixed rate
     """
-    start = start_of_run(ways, any_length=any_length)
+    start = start_of_run(ways, any_length=any_length, ladder=ladder)
     return [
         LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
         for halves in halves_of_ends(ways)

@@ -94,7 +94,7 @@ class DeliveryRecorder:
                 subscription.close()
             self._guard.last(self._bag.close)
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What is missing in the bag, as one line; empty if nothing is missing. To be called after :meth:`close`."""
         missed = sum(self._bag.counters.values())
         if self._guard.error is not None:  # a storage writes in chunks: earlier messages may be missing too
@@ -194,7 +194,7 @@ class _Run:
             live: list[LiveEnd] = []
             if scenario.version:
                 any_length = all(phy.any_length for phy in phys)
-                live = live_ends(ways, self.registry, any_length=any_length)
+                live = live_ends(ways, self.registry, any_length=any_length, ladder=self.phy.ladder)
             ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
             further = [self.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
             there = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
@@ -380,9 +380,9 @@ class _Run:
     def _incomplete(self) -> list[str]:
         """What observers and the bag of delivered messages missed. The bag is closed first."""
         if self.listener is None:
-            return self.run_observers.told()
+            return self.run_observers.incomplete()
         self.listener.close()
-        return [*self.run_observers.told(), *self.listener.told()]
+        return [*self.run_observers.incomplete(), *self.listener.incomplete()]
 
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)

@@ -184,7 +184,7 @@ def test_nothing_is_lost_without_noise_wherever_a_packet_begins() -> None:
     for packet in packets(64, 1500):
         silence = np.zeros(draw.randrange(1, 400), np.complex64)
         burst = phy.modem.modulate(packet)
-        assert receiver.feed(np.concatenate((silence, burst))) == [packet]
+        assert [heard.data for heard in receiver.feed(np.concatenate((silence, burst)))] == [packet]
     assert receiver.damaged == 0
 
 

@@ -18,6 +18,7 @@ from gr_ros2.phy import PHY, receiver_process
 from gr_ros2.phy.burst import BurstReceiver, Samples
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.receiver_process import ReceiverProcess
+from tests.phy.test_burst import data_of
 from tests.waiting import wait_for
 
 PACKETS = [bytes([number]) * 64 for number in range(20)]
@@ -40,7 +41,7 @@ class Elsewhere:
 
     def __init__(self, phy: BurstPhy) -> None:
         self.packets: list[bytes] = []
-        self.receiver = ReceiverProcess(phy.modem, self.packets.extend)
+        self.receiver = ReceiverProcess(phy.modem, lambda heard: self.packets.extend(data_of(heard)))
 
     def kill(self) -> None:
         self.receiver._process.kill()
@@ -61,7 +62,7 @@ def elsewhere() -> Iterator[Elsewhere]:
 def test_it_says_what_a_receiver_here_says(name: str, options: dict[str, object]) -> None:
     phy = make(name, **options)
     samples, here = samples_of(phy), BurstReceiver(phy.modem)
-    assert here.feed(samples) == PACKETS
+    assert data_of(here.feed(samples)) == PACKETS
     there = Elsewhere(phy)
     try:
         for part in np.array_split(samples, 37):
@@ -92,8 +93,8 @@ def test_where_the_process_dies_receiving_goes_on(elsewhere: Elsewhere, caplog: 
     elsewhere.receiver.feed(samples)
     wait_for(lambda: elsewhere.packets == PACKETS, "the packets")
     elsewhere.kill()
-    assert elsewhere.receiver.feed(samples) == PACKETS
-    assert elsewhere.receiver.feed(samples) == PACKETS
+    assert data_of(elsewhere.receiver.feed(samples)) == PACKETS
+    assert data_of(elsewhere.receiver.feed(samples)) == PACKETS
     assert elsewhere.receiver.points.size
     assert caplog.text.count("reception continues in this one") == 1
 
@@ -102,7 +103,7 @@ def test_where_it_does_not_start_receiving_is_here(monkeypatch: pytest.MonkeyPat
     for executable in ("/nowhere/python", "/bin/true"):
         monkeypatch.setattr(sys, "executable", executable)
         one = Elsewhere(make())
-        assert one.receiver.feed(samples_of(make())) == PACKETS
+        assert data_of(one.receiver.feed(samples_of(make()))) == PACKETS
         one.receiver.close()
 
 
@@ -113,7 +114,7 @@ def test_a_process_that_never_gets_ready_is_given_up(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(sys, "executable", str(sleeper))
     monkeypatch.setattr(receiver_process, "_START_S", 0.01)
     one = Elsewhere(make())
-    assert one.receiver.feed(samples_of(make())) == PACKETS
+    assert data_of(one.receiver.feed(samples_of(make()))) == PACKETS
     one.receiver.close()
 
 

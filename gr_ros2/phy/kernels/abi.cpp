@@ -30,7 +30,7 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 // Version of this interface and of the parameters in `modem.h`. Increase it with each change, here and in
 // `kernels/library.py`.
-GR_ROS2_API int kernels_version() { return 3; }
+GR_ROS2_API int kernels_version() { return 4; }
 
 // What it was compiled for.
 GR_ROS2_API const char* kernels_target() {
@@ -81,15 +81,7 @@ GR_ROS2_API int64_t modem_find(const void* modem, const void* samples, int64_t c
     }
 }
 
-GR_ROS2_API int64_t modem_end(const void* modem, const void* samples, int64_t count, int64_t start) {
-    try {
-        return static_cast<const Modem*>(modem)->end(view(samples, count), start);
-    } catch (const std::exception&) {
-        return kNoMemory;
-    }
-}
-
-// 1, or 0 where there is no burst, or -1 without memory.
+// A `Result`, or -1 without memory.
 GR_ROS2_API int modem_read(const void* modem, const void* samples, int64_t count, int64_t start, float* soft, void* points,
                            void* report) {
     try {

@@ -1,4 +1,4 @@
-// The bytes of frames, and the bits that are sent for them where there is no code: class Frames of gr_ros2/phy/burst.py.
+// The bytes of plain frames, and the bits that are sent for them: class Frames of gr_ros2/phy/burst.py.
 
 #pragma once
 
@@ -51,9 +51,9 @@ inline const Crc32& crc32() {
 struct FrameForm {
     int32_t multiple;       // a frame's bytes are filled up with zeros to a multiple of this
     int32_t high_first;     // whether a byte's highest or lowest bit is sent first
-    const uint8_t* mask;    // whitening sequence of the longest frame; null if a code follows, which Python applies
+    const uint8_t* mask;    // whitening sequence of the longest frame; null where there is more to a frame: Python makes it
 
-    bool coded() const { return !mask; }
+    bool plain() const { return mask; }
 
     // Bytes of the frame of a packet.
     int bytes(int length) const {

@@ -16,7 +16,7 @@ from typing import Any
 _FOLDER = Path(__file__).parent
 _EVERYWHERE, _AVX2 = "_baseline", "_avx2"
 """Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
-VERSION = 3
+VERSION = 4
 """Version of ``abi.cpp``. A library that was built before a change of it is not used."""
 _POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
@@ -26,7 +26,6 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "modem_new": (_POINTER, [_INT, _POINTER, _LONG]),
     "modem_free": (None, [_POINTER]),
     "modem_find": (_LONG, [_POINTER, _POINTER, _LONG, _POINTER]),
-    "modem_end": (_LONG, [_POINTER, _POINTER, _LONG, _LONG]),
     "modem_read": (_INT, [_POINTER, _POINTER, _LONG, _LONG, _POINTER, _POINTER, _POINTER]),
     "modem_take": (_INT, [_POINTER, _POINTER]),
     "modem_modulate": (_INT, [_POINTER, _POINTER]),

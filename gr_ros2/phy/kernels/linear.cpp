@@ -71,34 +71,25 @@ class Linear final : public Modem {
         return {positions, kNone};
     }
 
-    int64_t end(Samples samples, int64_t start) const override {
-        int length = lengths_.longest();
-        Scratch& s = prepared();
-        if (!lengths_.fixed() && start >= 1 && start < samples.count) {
-            const Carrier found = carrier(samples, start, s);
-            length = said(samples, measured(samples, start, found, s), s);
-        }
-        return start + needed(length);
-    }
-
-    bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
-        if (start < 1 || start >= samples.count) return false;
+    Result read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
+        if (start < 1 || start >= samples.count) return kNoBurst;
         Scratch& s = prepared();
         const Carrier found = carrier(samples, start, s);
         const Track track = measured(samples, start, found, s);
         report->snr = track.snr;
         const int length = lengths_.fixed() ? lengths_.longest() : said(samples, track, s);
         const int payload = symbols(length);
-        if (!follow(samples, track, payload, points, s)) return false;
+        report->length = length;
+        report->end = start + needed(length);
+        if (report->end > samples.count) return kCut;
+        if (!follow(samples, track, payload, points, s)) return kNoBurst;
         decide(points, payload, soft, s);
         if (p_.differential) differ(soft, payload);
         const int skipped = lengths_.fixed() ? 0 : kWordBits;
         report->soft = static_cast<int64_t>(payload) * p_.point_bits - skipped;
         if (skipped) std::memmove(soft, soft + skipped, sizeof(float) * report->soft);
         report->points = payload;
-        report->length = length;
-        report->end = start + needed(length);
-        return true;
+        return kRead;
     }
 
    private:

@@ -79,24 +79,16 @@ class Lora final : public Modem {
         return {first * chips, best * chips + (chips - late) % chips};
     }
 
-    int64_t end(Samples samples, int64_t start) const override {
+    Result read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
         Scratch& s = prepared();
         const Place place = look(samples, start, s);
-        // If there is no burst, there is no need to wait for its samples.
-        if (!place.found) return start + static_cast<int64_t>(p_.head + 1 + (p_.before ? p_.before + 1 : 0)) * p_.chips;
-        straighten(place, s);
-        return ending(place, said(samples, place, s));
-    }
-
-    bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const override {
-        Scratch& s = prepared();
-        const Place place = look(samples, start, s);
-        if (!place.found) return false;
+        if (!place.found) return kNoBurst;
         const int chips = p_.chips;
         straighten(place, s);
         const int length = said(samples, place, s), payload = symbols(length);
         *report = {place.snr, ending(place, length), length, static_cast<int64_t>(payload / p_.code_bits) *
-                   p_.spreading_factor * kNibble, payload};
+                   p_.spreading_factor * kNibble, payload, 0};
+        if (report->end > samples.count) return kCut;
         double begin = place.begin + static_cast<double>(p_.before) * chips, pace = 0;
         for (int first = 0; first < payload; first += p_.step) {
             const int count = std::min(p_.step, payload - first);
@@ -107,7 +99,7 @@ class Lora final : public Modem {
             begin += pace - p_.gain * late;
         }
         collect(s.soft.data(), payload, soft);
-        return true;
+        return kRead;
     }
 
    private:

@@ -28,10 +28,15 @@ struct Search {
 // Values of a burst in addition to its bits.
 struct Report {
     double snr;
-    int64_t end;           // index after its last sample that was needed
+    int64_t end;           // index after the last sample that is needed
     int64_t length;        // bytes of the packet
     int64_t soft, points;  // number of soft bits and of points
+    int64_t rung;          // with an adaptive rate, what it was sent with
 };
+
+// What reading gave: no burst; its bits; or, where the samples end before the burst does, `snr`, `end`, `length` and
+// `rung` of the report only.
+enum Result { kNoBurst, kRead, kCut };
 
 // The allowed packet lengths, `shortest` to `longest` bytes, and the bits sent for each. If there is only one length,
 // a burst does not carry it.
@@ -75,11 +80,8 @@ class Modem {
 
     virtual Search find(Samples samples) const = 0;
 
-    // Index behind the last sample that `read` needs.
-    virtual int64_t end(Samples samples, int64_t start) const = 0;
-
-    // Soft bits, points and other values of a burst; false if it proves not to be a burst.
-    virtual bool read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const = 0;
+    // Soft bits, points and other values of a burst.
+    virtual Result read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const = 0;
 
     // The samples of the burst of a packet of `length` bytes, from the bits of its frame; false if numpy does this.
     virtual bool modulate(const uint8_t* bits, int32_t length, Sample* out) const {
@@ -92,10 +94,10 @@ class Modem {
 
 struct OfdmParameters {
     int32_t shortest, longest;
-    int32_t size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count, once_count, twice_count,
-        shift_count, point_count, point_bits;
+    int32_t rung_count, counted, size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count,
+        once_count, twice_count, shift_count;
     double level, alike, energy, power, pair_weight, word_weight_sum, pace_gain, memory, reach, doubt;
-    const int32_t *frame_bits, *carriers, *data, *pilots, *once, *twice, *shifts;
+    const int32_t *frame_bits, *point_counts, *point_bits, *carriers, *data, *pilots, *once, *twice, *shifts;
     const Sample *words, *known, *turns, *whole, *smooth, *smooth_words, *crosswise, *points;
     const float* word_weight;
     const uint8_t *marks, *headers, *header_mask;

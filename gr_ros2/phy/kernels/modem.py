@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, ModemConstants, Reading, Samples, Search
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.kernels.library import loaded
 
 _NONE = -(2**63)
 _NO_MEMORY = 2**63 - 1
-_NEEDS_SAMPLES, _FULL, _CODED = range(3)
+_NEEDS_SAMPLES, _FULL, _NOT_PLAIN = range(3)
 """Why a call of :meth:`CompiledModem.take` ended: ``Taken`` in ``stream.h``."""
 _ROOM = 32
 """Packets that one call may find."""
@@ -38,10 +38,10 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "ofdm": (
         0,
         _fields(
-            int32="shortest longest size prefix repeat degrees chunk carrier_count data_count pilot_count once_count "
-            "twice_count shift_count point_count point_bits",
+            int32="shortest longest rung_count counted size prefix repeat degrees chunk carrier_count data_count "
+            "pilot_count once_count twice_count shift_count",
             float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
-            int32s="frame_bits carriers data pilots once twice shifts",
+            int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
             complex64s="words known turns whole smooth smooth_words crosswise points",
             float32s="word_weight",
             uint8s="marks headers header_mask",
@@ -82,6 +82,7 @@ class _Report(ctypes.Structure):
         ("length", ctypes.c_int64),
         ("soft", ctypes.c_int64),
         ("points", ctypes.c_int64),
+        ("rung", ctypes.c_int64),
     )
 
 
@@ -92,7 +93,7 @@ class _FrameForm(ctypes.Structure):
 
     def __init__(self, frames: Frames) -> None:
         self._mask = np.ascontiguousarray(frames.mask, np.uint8)
-        super().__init__(frames.multiple, frames.order == "big", None if frames.coded else _address(self._mask))
+        super().__init__(frames.multiple, frames.order == "big", _address(self._mask) if frames.plain else None)
 
 
 class _Batch(ctypes.Structure):
@@ -117,12 +118,19 @@ class _Stream(ctypes.Structure):
         ("samples", ctypes.c_void_p),
         ("count", ctypes.c_int64),
         ("frames", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ["margin", "span", "peak", "stretch", "cursor", "start", "last", "room"]),
+        *(
+            (name, ctypes.c_int64)
+            for name in ["margin", "span", "peak", "burst", "stretch", "cursor", "start", "last", "room"]
+        ),
         *((name, ctypes.c_void_p) for name in ["packets", "lengths", "snrs", "soft", "points"]),
         *((name, ctypes.c_int64) for name in ["row_size", "row", "whole", "damaged"]),
         ("report", _Report),
         ("row_points", ctypes.c_int64),
     )
+
+
+_NO_BURST, _READ, _CUT = range(3)
+"""``Result`` of ``modem.h``."""
 
 
 class CompiledModem(BurstModem):
@@ -145,9 +153,15 @@ class CompiledModem(BurstModem):
         """Most soft bits and points of a reading."""
         self._samples_of = lru_cache(maxsize=None)(reference.samples_of)
         self._form = _FrameForm(reference.frames)
+        given = reference.rungs
+        self._rungs = tuple(CompiledModem(modem) for modem in given) if len(given) > 1 else ()
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
+
+    @property
+    def rungs(self) -> Sequence[BurstModem]:
+        return self._rungs or (self,)
 
     def samples_of(self, packet_len: int) -> int:
         return self._samples_of(packet_len)
@@ -165,20 +179,21 @@ class CompiledModem(BurstModem):
         return self._reference.peak_samples
 
     def modulate(self, packet: bytes) -> Samples:
-        return self.modulate_all([packet], 0)
+        out = np.empty(self.samples_of(len(packet)), np.complex64)
+        self.modulate_into([packet], 0, out)
+        return out
 
-    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
+    def modulate_into(self, packets: Sequence[bytes], gap: int, out: Samples) -> None:
         frames = self.frames
-        data = [frames.of(len(one)).wrap(one).tobytes() for one in packets] if frames.coded else packets
+        data = packets if frames.plain else [frames.of(len(one)).wrap(one).tobytes() for one in packets]
         lengths = [len(packet) for packet in packets]
         sizes = np.array([self._samples_of(length) + gap for length in lengths], np.int64)
         numbers = np.array((lengths, [len(one) for one in data]), np.int32)
-        out = np.empty(int(sizes.sum()), np.complex64)
+        assert len(out) >= sizes.sum()
         arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
         batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(_address, arrays))
-        if _done(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
-            return out
-        return self._reference.modulate_all(packets, gap)
+        if not _checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
+            self._reference.modulate_into(packets, gap, out)
 
     def receiver(self) -> BurstReceiver:
         return CompiledReceiver(self)
@@ -200,23 +215,24 @@ class CompiledModem(BurstModem):
         found = self._functions.modem_find(self._kernel, _address(samples), len(samples), ctypes.addressof(start))
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
-    def end(self, samples: Samples, start: int) -> int:
-        samples = np.ascontiguousarray(samples, np.complex64)
-        return _counted(self._functions.modem_end(self._kernel, _address(samples), len(samples), start))
-
     def read(self, samples: Samples, start: int) -> Reading | None:
         samples = np.ascontiguousarray(samples, np.complex64)
         soft_bits, most_points = self.reading_size
         soft, points = np.empty(soft_bits, np.float32), np.empty(most_points, np.complex64)
         report = _Report()
         given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(report))
-        if not _done(self._functions.modem_read(self._kernel, *given)):
+        result = _checked(self._functions.modem_read(self._kernel, *given))
+        if result == _NO_BURST:
             return None
-        return Reading(report.length, soft[: report.soft], points[: report.points], report.snr, report.end)
+        if result == _CUT:
+            return Reading(report.length, None, points[:0], report.snr, report.end, report.rung)
+        read = (soft[: report.soft], points[: report.points])
+        return Reading(report.length, *read, report.snr, report.end, report.rung)
 
 
 class CompiledReceiver(BurstReceiver):
-    """A :class:`BurstReceiver` that takes all packets of its samples in one call, or one at a time with a code.
+    """A :class:`BurstReceiver` that takes all packets of its samples in one call, or one at a time where
+    Python unwraps the frames.
 
     :param modem: modulation and frames
     """
@@ -233,17 +249,17 @@ class CompiledReceiver(BurstReceiver):
         self._stream = stream = _Stream()
         stream.samples = _address(self._buffer)
         stream.margin, stream.span = modem.margin, modem.span
-        stream.peak, stream.stretch = modem.peak_samples, self._stretch
+        stream.peak, stream.burst, stream.stretch = modem.peak_samples, modem.burst_samples, self._stretch
         stream.room, stream.row_size = _ROOM, points
         stream.packets, stream.lengths = _address(self._packets), _address(self._lengths)
         stream.snrs = _address(self._newest_snrs)
         stream.soft, stream.points = _address(self._soft), _address(self._points)
 
-    def _take(self) -> list[bytes]:
+    def _take(self) -> list[Heard]:
         stream = self._stream
         stream.count, stream.cursor = self._end, self._cursor
         stream.start, stream.last = (_NONE if at is None else at for at in (self._start, self._last))
-        packets: list[bytes] = []
+        packets: list[Heard] = []
         reason = None
         while reason != _NEEDS_SAMPLES:
             stream.whole = stream.damaged = 0
@@ -251,35 +267,36 @@ class CompiledReceiver(BurstReceiver):
             self.damaged += stream.damaged
             if stream.whole:
                 packets += self._whole()
-            if reason == _CODED:
-                packets += self._decoded()
+            if reason == _NOT_PLAIN:
+                packets += self._unwrapped()
         self._cursor = stream.cursor
         self._start, self._last = (None if at == _NONE else at for at in (stream.start, stream.last))
         return packets
 
-    def _whole(self) -> list[bytes]:
+    def _whole(self) -> list[Heard]:
         """The packets of the last call."""
-        stream = self._stream
-        lengths = self._lengths[: stream.whole].tolist()
-        joined, packets, begin = self._packets[: sum(lengths)].tobytes(), [], 0
-        for length in lengths:
-            packets.append(joined[begin : begin + length])
+        stream, packets, begin = self._stream, [], 0
+        lengths, snrs = self._lengths[: stream.whole].tolist(), self._newest_snrs[: stream.whole].tolist()
+        joined = self._packets[: sum(lengths)].tobytes()
+        for length, snr in zip(lengths, snrs, strict=True):
+            packets.append(Heard(joined[begin : begin + length], snr))
             begin += length
-        self._measured(self._points[stream.row, : stream.row_points], self._newest_snrs[: stream.whole].tolist())
+        self._measured(self._points[stream.row, : stream.row_points], snrs)
         return packets
 
-    def _decoded(self) -> list[bytes]:
+    def _unwrapped(self) -> list[Heard]:
         """The packet of the burst that was read, if its CRC-32 matches."""
         stream, report = self._stream, self._stream.report
-        packet = self._modem.frames.of(report.length).unwrap(self._soft[: report.soft])
+        frames = self._modem.rungs[report.rung].frames
+        packet = frames.of(report.length).unwrap(self._soft[: report.soft])
         if packet is None:
             self.damaged += 1
             stream.cursor = stream.start + stream.peak
         else:
-            stream.cursor = stream.last - stream.margin
+            stream.cursor = report.end - stream.margin
             self._measured(self._points[stream.row, : report.points], [report.snr])
         stream.start = stream.last = _NONE
-        return [] if packet is None else [packet]
+        return [] if packet is None else [Heard(packet, report.snr, report.rung)]
 
     def _measured(self, points: Samples, snrs: list[float]) -> None:
         self.points = points.copy()
@@ -317,7 +334,7 @@ def _counted(result: int) -> int:
     return result
 
 
-def _done(result: int) -> bool:
+def _checked(result: int) -> int:
     if result < 0:
         raise MemoryError("no memory for a compiled kernel to work in")
-    return bool(result)
+    return result

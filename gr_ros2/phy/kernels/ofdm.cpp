@@ -87,13 +87,22 @@ class Ofdm final : public Modem {
           smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
           smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
           crosswise_(copied(p.crosswise, 2 * p.twice_count)),
-          headers_(copied(p.headers, static_cast<size_t>(lengths_.count()) * kWordBits)),
+          headers_(copied(p.headers, static_cast<size_t>(p.rung_count) * lengths_.count() * kWordBits)),
           header_mask_(copied(p.header_mask, p.data_count)),
           word_weight_(copied(p.word_weight, used_)),
-          points_(p.points, p.point_count, p.point_bits, p.marks),
           bpsk_(bpsk()),
           fft_(p.size),
           roots_(kToneSize) {
+        const Sample* points = p.points;
+        const uint8_t* marks = p.marks;
+        for (int rung = 0; rung < p.rung_count; rung++) {
+            const int count = p.point_counts[rung], bits = p.point_bits[rung];
+            rungs_.push_back({Lengths(p.shortest, p.longest, p.frame_bits + rung * lengths_.count()),
+                              Constellation(points, count, bits, marks)});
+            most_points_ = std::max(most_points_, count);
+            points += count;
+            marks += count * bits;
+        }
         for (uint8_t bit : headers_) signs_.push_back(bit ? 1.0f : -1.0f);
         for (int carrier : carriers_) bins_.push_back((carrier + p.size) % p.size);
         for (int k = 0; k < kToneSize; k++) roots_[k] = unit(-kTau * k / kToneSize);
@@ -141,46 +150,43 @@ class Ofdm final : public Modem {
         return {positions, kNone};
     }
 
-    int64_t end(Samples samples, int64_t start) const override {
-        if (lengths_.fixed()) return start + needed(lengths_.longest());
-        Scratch& s = prepared();
-        const Place place = look(samples, start, s);
-        spectra(samples, {static_cast<double>(place.begin), 0.0}, place.frequency, 0, kHead, s);
-        return start + needed(head(s, first_estimate(s)));
-    }
-
-    bool read(Samples samples, int64_t start, float* soft, Sample* seen, Report* report) const override {
+    Result read(Samples samples, int64_t start, float* soft, Sample* seen, Report* report) const override {
         Scratch& s = prepared();
         const Place place = look(samples, start, s);
         Clock clock{static_cast<double>(place.begin), 0.0};
         spectra(samples, clock, place.frequency, 0, kHead, s);
         const float noise = first_estimate(s);
         report->snr = signal_to_noise(s);
-        const int length = head(s, noise);
-        const int count = symbols(length) - kHead, all = (lengths_.bits(length) + p_.point_bits - 1) / p_.point_bits;
-        report->length = length;
-        report->end = start + needed(length);
+        const Told told = head(s, noise);
+        const Constellation& points = rungs_[told.rung].points;
+        const int all = points_of(told), count = symbols(told) - kHead;
+        report->length = told.length;
+        report->rung = told.rung;
+        report->end = start + static_cast<int64_t>(symbols(told)) * symbol_ - back_;
+        if (report->end > samples.count) return kCut;
         report->points = all;
-        report->soft = static_cast<int64_t>(all) * p_.point_bits;
+        report->soft = static_cast<int64_t>(all) * points.bits();
         int done = 0;
         for (int first = 0; first < count; first += p_.chunk) {
             const int rows = std::min(p_.chunk, count - first);
             const int used = std::min(rows * p_.data_count, all - first * p_.data_count);
             spectra(samples, clock, place.frequency, kHead + first, rows, s);
-            const double late = decide(s, 0, rows, noise, points_, used, 2);
-            if (!(std::abs(late) < kFar)) return false;
-            points_.soft(s.seen, used, soft + static_cast<size_t>(done) * p_.point_bits);
+            const double late = decide(s, 0, rows, noise, points, used, 2);
+            if (!(std::abs(late) < kFar)) return kNoBurst;
+            points.soft(s.seen, used, soft + static_cast<size_t>(done) * points.bits());
             std::copy_n(s.seen.points.begin(), used, seen + done);
             done += used;
             const double pace = clock.pace + p_.pace_gain * late / p_.chunk;
             clock = {clock.begin + late + (clock.pace - pace) * (kHead + first + rows), pace};
         }
-        return true;
+        return kRead;
     }
 
     bool modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
         Scratch& s = prepared();
-        const int frame_bits = lengths_.bits(length), count = symbols(length);
+        const Told sent{0, length};
+        const Constellation& points = rungs_[0].points;
+        const int frame_bits = lengths_.bits(length), count = symbols(sent);
         const uint8_t* header = &headers_[static_cast<size_t>(lengths_.row(length)) * kWordBits];
         int taken = 0;
         for (int symbol = 0; symbol < count; symbol++, out += symbol_) {
@@ -193,8 +199,8 @@ class Ofdm final : public Modem {
                 if (symbol == 2) at = (d < kWordBits ? header[d] : 0) ^ header_mask_[d] ? 1.0f : -1.0f;
                 else if (taken < frame_bits) {
                     int value = 0;
-                    for (int bit = 0; bit < p_.point_bits && taken < frame_bits; bit++) value |= bits[taken++] << bit;
-                    at = points_.point(value);
+                    for (int bit = 0; bit < points.bits() && taken < frame_bits; bit++) value |= bits[taken++] << bit;
+                    at = points.point(value);
                 }
             }
             // The inverse of a spectrum is the conjugate of the forward FFT of its conjugate.
@@ -207,36 +213,55 @@ class Ofdm final : public Modem {
     }
 
    private:
-    int symbols(int length) const {
-        const int each = p_.point_bits * p_.data_count;
-        return kHead + (lengths_.bits(length) + each - 1) / each;
+    // What packets of one rung are sent with.
+    struct Rung {
+        Lengths lengths;
+        Constellation points;
+    };
+
+    // What a header says.
+    struct Told {
+        int rung, length;
+    };
+
+    int points_of(Told told) const {
+        const Rung& rung = rungs_[told.rung];
+        return (rung.lengths.bits(told.length) + rung.points.bits() - 1) / rung.points.bits();
     }
 
-    // Number of samples from the reference sample on.
-    int64_t needed(int length) const { return static_cast<int64_t>(symbols(length)) * symbol_ - back_; }
+    int symbols(Told told) const { return kHead + (points_of(told) + p_.data_count - 1) / p_.data_count; }
 
-    // Read the header with the channel estimate of the sync words, and improve that estimate; returns the packet length.
-    int head(Scratch& s, float noise) const {
+    // Read the header with the channel estimate of the sync words, and improve that estimate.
+    Told head(Scratch& s, float noise) const {
         std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
         decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
-        if (lengths_.fixed()) return lengths_.longest();
+        if (lengths_.fixed()) return {0, lengths_.longest()};
         s.header.resize(p_.data_count);
         bpsk_.soft(s.seen, p_.data_count, s.header.data());
         for (int bit = 0; bit < kWordBits; bit++) s.header[bit] = header_mask_[bit] ? -s.header[bit] : s.header[bit];
         return said(s.header.data());
     }
 
-    // The length in a header, also for headers of GNU Radio's blocks, which count frames and send only the longest.
-    int said(const float* soft) const {
+    // Rung and length in a header. Also for headers of GNU Radio's blocks, which count frames and send only the longest.
+    Told said(const float* soft) const {
+        const int row = counted(soft);
+        if (row >= 0) return {0, lengths_.shortest() + row};
+        const int likeliest = likeliest_word(signs_.data(), p_.rung_count * lengths_.count(), soft);
+        return {likeliest / lengths_.count(), lengths_.shortest() + likeliest % lengths_.count()};
+    }
+
+    // The row of the length in an undamaged header of the longest frame, whose number may count frames; -1 for others.
+    int counted(const float* soft) const {
+        if (!p_.counted) return -1;
         uint32_t hard = 0;
         for (int bit = 0; bit < kWordBits; bit++) hard |= static_cast<uint32_t>(soft[bit] > 0) << bit;
         const int last = lengths_.count() - 1;
         if (field(hard) == field(own(last)) && hard >> 2 * kFieldBits == crc8(hard)) {
             for (int row = last; row >= 0 && field(own(row)) == field(hard); row--)
-                if (own(row) == hard) return lengths_.shortest() + row;
-            return lengths_.longest();
+                if (own(row) == hard) return row;
+            return last;
         }
-        return lengths_.shortest() + likeliest_word(signs_.data(), lengths_.count(), soft);
+        return -1;
     }
 
     static uint32_t field(uint32_t header) { return header & ((1u << kFieldBits) - 1); }
@@ -272,7 +297,7 @@ class Ofdm final : public Modem {
         s.inverse.resize(p_.data_count);
         s.sharpness.resize(p_.data_count);
         for (auto* one : {&s.tone, &s.straight}) one->resize(rows);
-        s.seen.resize(rows * p_.data_count, points_.count());
+        s.seen.resize(rows * p_.data_count, most_points_);
         return s;
     }
 
@@ -590,14 +615,15 @@ class Ofdm final : public Modem {
     }
 
     OfdmParameters p_;  // its numbers; arrays are copied below
-    Lengths lengths_;
-    int symbol_, half_, window_, back_, used_;
+    Lengths lengths_;   // of the first rung
+    int symbol_, half_, window_, back_, used_, most_points_ = 0;
     std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
     std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_;
     std::vector<uint8_t> headers_, header_mask_;
     std::vector<float> signs_;
     std::vector<float> word_weight_;
-    Constellation points_, bpsk_;
+    std::vector<Rung> rungs_;
+    Constellation bpsk_;
     Fft fft_;
     std::vector<Sample> roots_;
 };

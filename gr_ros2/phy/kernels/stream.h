@@ -14,8 +14,8 @@ struct Stream {
     const Sample* samples;
     int64_t count;
     const FrameForm* frames;
-    int64_t margin, span, peak, stretch;  // constants of the modem
-    int64_t cursor, start, last;          // the place; kNone where Python has None
+    int64_t margin, span, peak, burst, stretch;  // constants of the modem
+    int64_t cursor, start, last;         // the place; kNone where Python has None
     int64_t room;                         // number of packets for which there is room
     uint8_t* packets;                     // their bytes, one packet after the other
     int32_t* lengths;
@@ -23,26 +23,29 @@ struct Stream {
     float* soft;       // of the newest burst
     Sample* points;    // two rows: the newest whole packet's, and one to read into
     int64_t row_size;
-    int64_t row;       // that of the newest burst if it is coded, otherwise that of the newest whole packet
+    int64_t row;       // that of the newest burst if Python unwraps it, otherwise that of the newest whole packet
     int64_t whole, damaged;
     Report report;     // of the newest burst
     int64_t row_points;  // number of points of the newest whole packet
 };
 
-enum class Taken { kNeedsSamples, kFull, kCoded };
+enum class Taken { kNeedsSamples, kFull, kNotPlain };
 
-// Whether the samples of the burst up to `last` are finite numbers.
-inline bool finite(const Stream& s, int64_t last) {
-    const int64_t first = std::max<int64_t>(0, s.start - s.margin), end = std::min(last + s.margin, s.count);
+// Index of the first sample in or near the burst that is no finite number; otherwise that after the last sample.
+inline int64_t usable(const Stream& s) {
+    constexpr float huge = 1e15f;
+    const int64_t first = std::max<int64_t>(0, s.start - s.margin), end = std::min(s.start + s.burst + s.margin, s.count);
     float sum = 0;
     for (int64_t k = first; k < end; k++) sum += square(s.samples[k]);
-    return std::isfinite(sum);
+    if (std::isfinite(sum)) return s.count;
+    for (int64_t k = first; k < end; k++)
+        if (!(std::abs(s.samples[k]) < huge)) return k;
+    return first;
 }
 
-// Packets until more samples are needed, there is no room, or a burst has a code, which Python decodes.
+// Packets until more samples are needed, there is no room, or a burst was read whose frame Python unwraps.
 inline Taken take(const Modem& modem, Stream& s) {
     const FrameForm& frames = *s.frames;
-    const Samples all{s.samples, s.count};
     uint8_t* packet = s.packets;
     while (true) {
         if (s.start == kNone) {
@@ -53,19 +56,21 @@ inline Taken take(const Modem& modem, Stream& s) {
             if (found.start == kNone && found.searched) continue;
         }
         if (s.start == kNone || s.count - s.start < s.span) return Taken::kNeedsSamples;
-        if (s.last == kNone) {
-            const int64_t head = s.start + s.span;
-            s.last = finite(s, head) ? modem.end(all, s.start) : head;
-        }
-        if (s.count < s.last) return Taken::kNeedsSamples;
+        if (s.last != kNone && s.count < s.last) return Taken::kNeedsSamples;
         if (s.whole == s.room) return Taken::kFull;
-        const int64_t row = 1 - s.row;
-        bool good = finite(s, s.last) && modem.read(all, s.start, s.soft, s.points + row * s.row_size, &s.report);
-        if (good && frames.coded()) {
-            s.row = row;
-            return Taken::kCoded;
+        const int64_t row = 1 - s.row, count = usable(s);
+        Result result = kNoBurst;
+        if (count - s.start >= s.span)
+            result = modem.read({s.samples, count}, s.start, s.soft, s.points + row * s.row_size, &s.report);
+        if (result == kCut && s.report.end > s.count) {
+            s.last = s.report.end;
+            return Taken::kNeedsSamples;
         }
-        good = good && frames.unwrap(s.soft, static_cast<int>(s.report.length), packet);
+        if (result == kRead && !frames.plain()) {
+            s.row = row;
+            return Taken::kNotPlain;
+        }
+        const bool good = result == kRead && frames.unwrap(s.soft, static_cast<int>(s.report.length), packet);
         if (good) {
             packet += s.report.length;
             s.lengths[s.whole] = static_cast<int32_t>(s.report.length);
@@ -76,7 +81,7 @@ inline Taken take(const Modem& modem, Stream& s) {
         } else {
             s.damaged++;
         }
-        s.cursor = good ? s.last - s.margin : s.start + s.peak;
+        s.cursor = good ? s.report.end - s.margin : s.start + s.peak;
         s.start = s.last = kNone;
     }
 }
@@ -85,7 +90,7 @@ inline Taken take(const Modem& modem, Stream& s) {
 struct Batch {
     const FrameForm* frames;
     int64_t count, gap;        // packets, and zero samples after each
-    const uint8_t* data;       // the packets' bytes, or the bits of their frames if these are coded, one after the other
+    const uint8_t* data;       // the packets' bytes, or the bits of frames that are not plain, one after the other
     const int32_t* lengths;    // bytes of each packet
     const int32_t* data_sizes;  // bytes in `data` of each packet
     const int64_t* sizes;      // samples of each packet, gap included
@@ -97,7 +102,7 @@ inline bool modulate(const Modem& modem, const Batch& b) {
     const uint8_t* data = b.data;
     Sample* out = b.out;
     for (int64_t k = 0; k < b.count; k++) {
-        const uint8_t* bits = b.frames->coded() ? data : b.frames->wrap(data, b.lengths[k]);
+        const uint8_t* bits = b.frames->plain() ? b.frames->wrap(data, b.lengths[k]) : data;
         if (!modem.modulate(bits, b.lengths[k], out)) return false;
         data += b.data_sizes[k];
         out += b.sizes[k];

@@ -1,8 +1,8 @@
-// The kernels without Python: one modem from a file, its search, end and reading of samples to standard output. For other
+// The kernels without Python: one modem from a file, its search and reading of samples to standard output. For other
 // architectures, where an emulator runs this and nothing else.
 //
 // File: kind, bytes of numbers, number of arrays, samples, soft bits, points (int64 each); numbers; each array as its
-// bytes (int64) and itself; samples. Output: searched, start, end, read (int64), the report, soft
+// bytes (int64) and itself; samples. Output: searched, start, read (int64), the report, soft
 // bits, points.
 
 #include <cstdint>
@@ -15,14 +15,13 @@ const char* kernels_target();
 void* modem_new(int, const void*, int64_t);
 void modem_free(void*);
 int64_t modem_find(const void*, const void*, int64_t, int64_t*);
-int64_t modem_end(const void*, const void*, int64_t, int64_t);
 int modem_read(const void*, const void*, int64_t, int64_t, float*, void*, void*);
 }
 
 // That of modem.h.
 struct Report {
     double snr;
-    int64_t end, length, soft, points;
+    int64_t end, length, soft, points, rung;
 };
 
 static std::vector<char> taken(FILE* file, int64_t bytes) {
@@ -56,13 +55,12 @@ int main(int count, char** arguments) {
     const std::vector<char> stream = taken(file, 8 * samples);
     void* modem = modem_new(static_cast<int>(kind), parameters.data(), static_cast<int64_t>(parameters.size()));
     if (!modem) return 3;
-    int64_t found[4] = {};
+    int64_t found[3] = {};
     Report report{};
     std::vector<float> soft(soft_bits), seen(2 * points);
     found[0] = modem_find(modem, stream.data(), samples, &found[1]);
     if (found[1] >= 0) {
-        found[2] = modem_end(modem, stream.data(), samples, found[1]);
-        found[3] = modem_read(modem, stream.data(), samples, found[1], soft.data(), seen.data(), &report);
+        found[2] = modem_read(modem, stream.data(), samples, found[1], soft.data(), seen.data(), &report);
     }
     std::fwrite(found, sizeof found, 1, stdout);
     std::fwrite(&report, sizeof report, 1, stdout);

@@ -18,6 +18,8 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     *(("ofdm", {"payload_modulation": name}) for name in ("qpsk", "8psk", "16qam", "64qam")),
     *(("ofdm", {"fec": name}) for name in ("cc", "ldpc", "polar")),
     ("ofdm", {"payload_modulation": "64qam", "fec": "cc"}),
+    ("ofdm", {"rate": "adaptive"}),
+    ("ofdm", {"rate": "adaptive", "rungs": ("qpsk-cc", "64qam-cc"), "fft_len": 128, "scramble": True}),
     ("ofdm", {"fft_len": 256, "scramble": True}),
     ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "16qam"}),
     ("ofdm", {"carriers": 25, "pilots": (-24, -8, 8, 24), "detection_threshold": 0.5}),
@@ -74,5 +76,5 @@ def hear(modem: BurstModem, samples: Samples, cuts: list[int]) -> Heard:
         piece = samples[at : at + cuts[number % len(cuts)]]
         at += len(piece)
         number += 1
-        packets += [(at, packet) for packet in engine.feed(piece)]
+        packets += [(at, heard.data) for heard in engine.feed(piece)]
     return Heard(packets, engine.damaged)
