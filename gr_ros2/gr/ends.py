@@ -168,7 +168,13 @@ def make_endpoint(
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
-        decoder_for=lambda rows: codec or known.of(Topic(row.topic_id, row.name, row.type_name) for row in rows),
+        decoder_for=lambda rows: (
+            codec
+            or known.of(
+                [Topic(row.topic_id, row.name, row.type_name) for row in rows],
+                {row.topic_id: row.codec for row in rows},
+            )
+        ),
         heard=start.heard,
         save=start.save,
         observer=observer,

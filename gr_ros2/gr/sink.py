@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import ConfigError, GrRos2Error, SealError
+from gr_ros2.errors import ConfigError, DescriptionError, GrRos2Error, SealError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
@@ -31,6 +31,10 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_definitions import known
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS, PduPort, packets_of, snr_db_of
 from gr_ros2.phy.threads import BlockThread
@@ -130,6 +134,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         # Publishers are kept when a robot has gone. Late subscribers still get its map, and a robot that comes back
         # needs no new discovery. There are at most as many as source ids times topics of the registry.
         self._outputs: dict[tuple[int, int], _Output] = {}
+        self._stamped: dict[str, bool] = {}
+        """Whether messages of a type begin with a header."""
+        self._types: TypeSearch | None = None
         self._said: set[str] = set()
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
@@ -185,9 +192,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._running = True
         self._thread.start(self._watch_timeouts, "gr-ros2-sink")
+        if isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._unknown_types, self._define)
         return True
 
     def stop(self) -> bool:
+        self._stop_search()
         with self._lock:
             self._running = False
             self._timer_due.notify_all()
@@ -196,6 +206,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
+        self._stop_search()
         if self._clock_subscription is not None:
             self._clock_subscription.close()
             self._clock_subscription = None
@@ -248,6 +259,30 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self.config = replaced(self.config, debug=debug)
         self._log = debug_logger(self._log.name, self.config.debug)
+
+    def _stop_search(self) -> None:
+        if self._types is not None:
+            self._types.close()
+            self._types = None
+
+    def _unknown_types(self) -> list[tuple[str, str]]:
+        """The topics published whose types ROS does not ship."""
+        outputs = [(key, output) for key, output in list(self._outputs.items()) if output.publisher is not None]
+        types = [(self._name(key), output.topic.type_name) for key, output in outputs]
+        return [(name, type_name) for name, type_name in types if not known(type_name)]
+
+    def _define(self, described: Described) -> None:
+        """Take a definition that a subscriber has given, for frame names and latencies."""
+        try:
+            store = described.store()
+        except DescriptionError as error:
+            self._log.info("ros2_sink: %s", error)
+            return
+        self._prefix.learn(described.type_name, store)
+        stamped = self._stamped[described.type_name] = has_header(described.type_name, store)
+        for output in list(self._outputs.values()):
+            if output.topic.type_name == described.type_name:
+                output.stamped = stamped
 
     def _name(self, key: tuple[int, int]) -> str:
         return self._topic(key).republished(self.config.namespace_format, key[0])
@@ -414,17 +449,23 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         output = self._outputs.get(key)
         if output is None:
             topic = self._topic(key)
-            output = self._outputs[key] = _Output(topic, has_header(topic.type_name))
+            output = self._outputs[key] = _Output(topic, self._is_stamped(topic.type_name))
         return output
 
     def _change(self, output: _Output, topic: Topic) -> None:
         """A topic id means this topic now. A publisher of another name or type is closed."""
         before, output.topic = output.topic, topic
         if (before.name, before.type_name) != (topic.name, topic.type_name):
-            output.stamped = has_header(topic.type_name)
+            output.stamped = self._is_stamped(topic.type_name)
             if output.publisher is not None:
                 output.publisher.close()
                 output.publisher = None
+
+    def _is_stamped(self, type_name: str) -> bool:
+        stamped = self._stamped.get(type_name)
+        if stamped is None:
+            stamped = self._stamped[type_name] = has_header(type_name)
+        return stamped
 
     def _publishers(self) -> list[Publisher]:
         return [publisher for output in list(self._outputs.values()) if (publisher := output.publisher) is not None]

@@ -8,7 +8,7 @@ immediately; the receiving half returns its events, so that the caller can act o
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
@@ -72,6 +72,12 @@ class Endpoint(Protocol):
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Code messages of a type by its definition, which was not known before, or another one.
+
+        :param definitions: of the type and of those that it is made of, as the codec takes them
         """
 
     def follow(
@@ -217,6 +223,9 @@ class EndpointV0:
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """See :class:`Endpoint`."""
         raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Do nothing: both ends of version 0 code by the same dictionaries."""
 
     def follow(
         self,

@@ -42,10 +42,10 @@ from gr_ros2.middleware.base import (
     TopicInfo,
     finite,
 )
-from gr_ros2.middleware.rcl import told, translated
+from gr_ros2.middleware.rcl import ros_localhost_only, translated
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
-from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
+from gr_ros2.middleware.services import DESCRIPTION, ReplyCallback, RequestCallback, ServerCallback, Witness
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -158,7 +158,7 @@ class RclpyMiddleware(RclpyParticipant):
         try:
             # Context.init does not touch signal handlers, unlike rclpy.init; without args=[] it would parse the command
             # line.
-            with told(localhost_only):
+            with ros_localhost_only(localhost_only):
                 self._context.init(args=[], domain_id=domain_id)
             self._node = Node(
                 node_name,
@@ -257,6 +257,23 @@ class RclpyMiddleware(RclpyParticipant):
         with translated("the graph cannot be read"):
             found = self._node.get_service_names_and_types()
         return {name: type_names[0] for name, type_names in found if type_names and name not in own}
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:
+        """See services. rclpy gives type hashes since Jazzy."""
+        self.check_open()
+        node = self._node
+        with translated(f"endpoints of {topic} cannot be read"):
+            infos = [
+                *self._foreign(node.get_publishers_info_by_topic(topic), topic, node.publishers),
+                *self._foreign(node.get_subscriptions_info_by_topic(topic), topic, node.subscriptions),
+            ]
+        found: dict[str, set[str]] = {}
+        for info in infos:
+            digest = getattr(info, "topic_type_hash", None)
+            if info.topic_type == type_name and digest is not None and digest.version > 0:
+                service = f"{info.node_namespace.rstrip('/')}/{info.node_name}/{DESCRIPTION}"
+                found.setdefault(str(digest), set()).add(service)
+        return [Witness(digest, tuple(sorted(services))) for digest, services in sorted(found.items())]
 
     def close(self) -> None:
         """Leave the graph; waits ``JOIN_S`` for a callback that is running, unless called from it."""

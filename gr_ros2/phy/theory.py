@@ -91,8 +91,8 @@ def coded_success(points: NDArray[np.complex64], snr: float, data_bits: int, cod
     :param snr: mean energy of a point over N0
     :param coded_bits: number of bits sent; each point carries log2 of the number of points
     """
-    told = _information(points.tobytes(), round(10 * log10(max(snr, 1e-6)), 2))
-    return _enough(coded_bits / log2(len(points)), *told, data_bits)
+    moments = _information(points.tobytes(), round(10 * log10(max(snr, 1e-6)), 2))
+    return _enough(coded_bits / log2(len(points)), *moments, data_bits)
 
 
 def coded_orthogonal_success(order: int, error: float, data_bits: int, count: int) -> float:
@@ -124,9 +124,9 @@ def _information(points: bytes, snr_db: float) -> tuple[float, float]:
     added = sqrt(noise) * (nodes[:, None] + 1j * nodes).reshape(-1)
     share = (weights[:, None] * weights).reshape(-1) / pi
     apart = np.abs(sent[:, None, None] - sent[None, :, None] + added) ** 2
-    told = log2(len(sent)) - np.logaddexp.reduce((np.abs(added) ** 2 - apart) / noise, axis=1) / log(2)
-    mean = float(np.mean(told @ share))
-    return mean, float(np.mean(told**2 @ share)) - mean**2
+    information = log2(len(sent)) - np.logaddexp.reduce((np.abs(added) ** 2 - apart) / noise, axis=1) / log(2)
+    mean = float(np.mean(information @ share))
+    return mean, float(np.mean(information**2 @ share)) - mean**2
 
 
 def half_point(success: object) -> float:

@@ -119,7 +119,7 @@ class Radio(PacketPath, HierBlock):
 
     def incomplete(self) -> list[str]:
         """What the recording lacks and why, as one line. Empty if nothing is missing, or if there is no recording."""
-        return [] if self._recorder is None else self._recorder.told()
+        return [] if self._recorder is None else self._recorder.incomplete()
 
     @property
     def refused(self) -> int:

@@ -201,6 +201,15 @@ class Endpoint:
             self._repeat_at = self._now + self.settings.repeat_s
         return together
 
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one are told."""
+        if self._codec is None:
+            return
+        self._codec.learn(type_name, definitions)
+        if self.outbox.recoded() and self._started:
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
+
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
         new = total - self.sent.missed[topic_id]

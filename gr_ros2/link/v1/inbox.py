@@ -50,7 +50,7 @@ _SNR_SMOOTHING = 0.25
 _SNR_CHANGE_DB = 1.5
 """Change of the SNR that is reported at once."""
 _WAITING = 256
-"""Number of messages of unknown topics that are kept until the table arrives."""
+"""Number of messages of unknown topics, or coded in an unknown way, that are kept until the table arrives."""
 
 
 @dataclass(slots=True)
@@ -225,7 +225,7 @@ class Inbox:
         for waiting in [ready for line in self._ready.values() for ready in line]:
             self._events.append(Lost(self.src_id, waiting.topic_id, reason, self._key(waiting.order)))
         for waiting in self._unknown:
-            self._events.append(Lost(self.src_id, waiting.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(waiting.order)))
+            self._never_known(waiting)
         self._ready.clear()
         self._unknown.clear()
         return self._given()
@@ -362,17 +362,26 @@ class Inbox:
             self._table(ready.payload)
             return
         row = self.rows.get(ready.topic_id)
-        if row is None:
+        if row is None or self._awaits_table(ready):
             self._unknown.append(ready)
             self._waiting += len(ready.payload)
             while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
                 lost = self._unknown.popleft()
                 self._waiting -= len(lost.payload)
-                self._events.append(Lost(self.src_id, lost.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(lost.order)))
+                self._never_known(lost)
         elif row.reliable and ready.order[0] > self._low:
             self._ready.setdefault(ready.topic_id, []).append(ready)
         else:
             self._deliver(ready, row)
+
+    def _awaits_table(self, ready: _Ready) -> bool:
+        """Whether a message cannot be decoded before a newer table is here."""
+        return ready.coded and self._codec is not None and self._codec.lacks(ready.topic_id, ready.payload)
+
+    def _never_known(self, ready: _Ready) -> None:
+        """A message is given up for which the table did not arrive."""
+        reason = LedgerRow.UNKNOWN_DICTIONARY if ready.topic_id in self.rows else LedgerRow.UNKNOWN_TOPIC
+        self._events.append(Lost(self.src_id, ready.topic_id, reason, self._key(ready.order)))
 
     def _settle(self) -> None:
         """Find up to which packet everything is here or given up, and deliver the messages that waited for that."""

@@ -176,6 +176,15 @@ class Outbox:
         self._find_deadlines()
         self._tabulate()
 
+    def recoded(self) -> bool:
+        """Announce how topics are coded now.
+
+        :return: whether the table of topics has changed
+        """
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
+
     def offer(self, topic_id: int, *, offered: bool) -> bool:
         """Announce a service, or no longer.
 
@@ -356,7 +365,7 @@ class Outbox:
             ordered = line.ordered if options.reliability == AUTO else options.reliability == "reliable"
             ordered = ordered and line.queue.policy != "latest"
             depth = min(line.depth if options.depth == AUTO else options.depth, 255)
-            codec = "" if self._codec is None else options.codec
+            codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
             rows.append(
                 TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec)
             )
