@@ -122,6 +122,8 @@ class Endpoint:
         """What arrived and what did not."""
         self.answers = bool(topics) or settings.hears
         """Whether what it receives can change what it sends."""
+        self.urged = False
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
         self._observer = observer
         self._decoder_for = decoder_for
         self._rows = rows
@@ -354,10 +356,10 @@ class Endpoint:
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
         return min(times, default=None)
 
-    def next_departure(self) -> float | None:
-        """When ``next_packet`` may have something, if no other method is called before."""
+    def next_departure(self, *, credited: bool = False) -> float | None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         now = self._now
-        if self.out_of_credit or not self.answers:
+        if (self.out_of_credit and not credited) or not self.answers:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
@@ -368,7 +370,7 @@ class Endpoint:
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self._mode() != "off" and self.window.unconfirmed(now):
+        if min(leaving) > now and self._mode() != "off" and self.window.unconfirmed(now):
             poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
             doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
@@ -377,6 +379,7 @@ class Endpoint:
     # ---- what leaves
 
     def _compose(self, now: float) -> bytes | None:
+        self.urged = False
         if not self._started:
             self._start(now)
         outbox, talk = self.outbox, self._talk
@@ -583,6 +586,8 @@ class Endpoint:
     def _use(self, data: bytes, opened: Opened, now: float) -> None:
         self.received.packets += 1
         neighbour, number, standing = opened.neighbour, opened.number, opened.standing
+        control = standing is not None and not standing.mask
+        self.urged = self.urged or control or self._talk.lacking
         if opened.met:
             self._meet(opened, now)
         inbox = neighbour.inbox

@@ -58,6 +58,34 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert one.end.sent.air["repair"] == 0
 
 
+def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+    air.run(1.5)
+    one.end.submit(ODOM, text(1), air.now)
+    air.run(3 * SLOT_S)
+    now = air.now
+    one.end.submit(ODOM, text(2), now)
+    message = one.slot(now)
+    assert message is not None
+    two.end.receive(message, now)
+    due = two.end.next_departure(credited=True)
+    assert not two.end.urged, "a message alone lets nothing leave"
+    assert due is not None
+    assert due > now, "its report may wait"
+    assert one.end.next_departure() is None, "its credit is used"
+    later = one.end.next_departure(credited=True)
+    assert later is not None
+    assert later > now, "a credit alone lets nothing leave"
+    one.end.add([("late", "std_msgs/msg/String", TopicOptions())])
+    hello = one.slot(now)
+    assert hello is not None
+    two.end.receive(hello, now)
+    assert two.end.urged, "it asks for the table of topics"
+    two.slot(now)
+    assert not two.end.urged
+
+
 def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_loss() -> None:
     one, two = Robot(1, registry()), Robot(2)
     air = Air(one, two)
