@@ -135,7 +135,7 @@ class Endpoint:
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
         """Number of bytes to which the packet with its padded body extends."""
         self._trailer = self.keys.own(settings.src_id, boot)
-        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
+        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=observer)
         self.sent = self.outbox.stats
         """What left and what did not."""
         self.window = RepairWindow(
@@ -217,7 +217,8 @@ class Endpoint:
         new = total - self.sent.missed[topic_id]
         if new > 0:
             self.sent.missed[topic_id] = total
-            self._tell(Missed(topic_id, new))
+            if self._observer is not None:
+                self._observer(Missed(topic_id, new))
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """Policy and deadline (s, 0 for none) of a topic's queue."""
@@ -421,7 +422,7 @@ class Endpoint:
 
     def _new(self, filling: Filling, due: Sequence[Neighbour], now: float) -> bytes:
         """A source packet, with a report where there is room for one."""
-        entries: list[Entry] = list(filling.parts)
+        entries = filling.parts
         free = self._room - filling.used
         for neighbour in due:
             if free >= neighbour.inbox.report_len:
@@ -430,7 +431,7 @@ class Endpoint:
                 self._unheard = 0
             else:
                 self._unheard += 1
-        return self._source(entries, filling.lives, filling.qos, tuple(filling.sent), now)
+        return self._source(entries, filling.lives, filling.qos, filling.sent, now)
 
     def _source(
         self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentEntry, ...], now: float
@@ -523,7 +524,8 @@ class Endpoint:
         stats.packets += 1
         if self._rate is not None:
             self._choose_rung(kind, now)
-        self._tell(SentPacket(data, packet, parts, now, kind, self.rung))
+        if self._observer is not None:
+            self._observer(SentPacket(data, packet, parts, now, kind, self.rung))
         return data
 
     def _choose_rung(self, kind: AirKind, now: float) -> None:
@@ -678,7 +680,3 @@ class Endpoint:
             elif isinstance(event, Lost):
                 stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
                 stats.message_loss_est += 1
-
-    def _tell(self, event: SenderEvent) -> None:
-        if self._observer is not None:
-            self._observer(event)
