@@ -59,7 +59,7 @@ WORTH = 0.85
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
 REPORTED_DEPTH = 160
 """Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
-known."""
+known; but it is repaired for as long as a receiver waits for it (``hold_s``)."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -126,7 +126,7 @@ class Outbox:
         self._depths: dict[int, int] = {}
         self._latched: dict[int, bool] = {}
         """Whether the publishers of a topic keep messages for late joiners."""
-        self._lives: dict[int, deque[tuple[Life, int]]] = {TABLE_TOPIC: deque()}
+        self._lives: dict[int, deque[tuple[Life, int, float]]] = {TABLE_TOPIC: deque()}
         self._packets_of: Counter[int] = Counter()
         """Lifetimes that packets refer to, by topic."""
         self._kept: dict[int, deque[_Kept]] = {}
@@ -425,18 +425,23 @@ class Outbox:
         self._newest[topic_id] = max(message.submitted, self._newest.get(topic_id, 0.0))
         self.stats.sent[topic_id] += not message.repeat
         lives = self._lives[topic_id]
-        most = self._settings.depth
+        most, least_s = self._settings.depth, 0.0
         if queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = self._depths.get(topic_id, 0) or REPORTED_DEPTH
+            most = self._depths.get(topic_id, 0)
+            if not most:
+                most, least_s = REPORTED_DEPTH, self._settings.hold_s
         elif lives:
-            before, _ = lives[-1]
+            before, _, _ = lives[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((message.life, message.index))
+        lives.append((message.life, message.index, now))
         self._packets_of[topic_id] += message.index
-        while len(lives) > 1 and (len(lives) > most or (self._packets_of[topic_id] > GROUP and not self.reported)):
-            life, count = lives.popleft()
+        while len(lives) > 1 and (
+            (len(lives) > most and now - lives[0][2] >= least_s)
+            or (self._packets_of[topic_id] > GROUP and not self.reported)
+        ):
+            life, count, _ = lives.popleft()
             life.over = True
             self._packets_of[topic_id] -= count
         for kept in self._kept.get(topic_id, ()):
