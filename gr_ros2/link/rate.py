@@ -42,6 +42,8 @@ _SMOOTHING = 0.25
 """Share of a new report in the average of the time between reports."""
 _LOOK_BACK_S = 0.02
 """s over which the change of the SNR is measured: long against the errors of single reports."""
+_REPORT_S = 0.01
+"""s for which the SNR of a report is old when it comes: measured on several packets, waited, and was on the air."""
 _ERROR_DB = 1.0
 """Change of the SNR within this time that may be an error of measurement, dB."""
 _CHANGE_DB = 1.5
@@ -126,9 +128,10 @@ class _Robot:
         return gap
 
     def snr_db(self, now: float) -> float:
-        """The SNR to count on: as reported, less what it may have fallen since."""
+        """The SNR to count on: as it was when it was reported, less what it may have fallen since."""
         falling = max(-self.trend_db_s, self.drift_db_s)
-        return self.reported_db - self.correction_db - falling * max(now - self.heard, 0.0)
+        reported_db = self.reported_db + _REPORT_S * self.trend_db_s
+        return reported_db - self.correction_db - falling * max(now - self.heard, 0.0)
 
     @property
     def fades(self) -> bool:
@@ -199,7 +202,7 @@ class RateController:
         # A change of the SNR explains that a rung is left. Without one, its choice was an error of measurement.
         changed = abs(snr_db - known.changed_db) > _CHANGE_DB
         if best > known.rung:
-            if known.reports < (SETTLED if changed else known.patience):
+            if not changed and known.reports < known.patience:
                 return
         elif known.climbed and not changed:
             hasty = known.reports <= _HASTY * known.patience
