@@ -46,10 +46,10 @@ def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
         owners[keys] = owner
     # A wrong value at the top level that several parts inherit is reported once, not for every part.
     top = [(keys, group[0]["input"]) for keys, group in places.items() if len(keys) == 1]
-    told = {
+    groups = {
         keys: group for keys, group in places.items() if len(keys) == 1 or (keys[-1:], group[0]["input"]) not in top
     }
-    return "; ".join(prefix + _complaint(keys, owners[keys], group) for keys, group in told.items())
+    return "; ".join(prefix + _complaint(keys, owners[keys], group) for keys, group in groups.items())
 
 
 def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[Any] | None]:
@@ -82,10 +82,10 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
             return f"unknown key {key}: write {new}"
         return f"unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
     setting = next((found for found in settings_of(owner) if found.name == keys[-1]), None) if owner else None
-    said = re.split(r"[.;](?: |$)", setting.meaning.replace("``", ""))[0] if setting else ""  # its first sentence
-    said = f" ({said})" if said else ""
+    purpose = re.split(r"[.;](?: |$)", setting.meaning.replace("``", ""))[0] if setting else ""  # its first sentence
+    purpose = f" ({purpose})" if purpose else ""
     if item["type"] in ("missing", "missing_argument"):
-        return f"{key} is missing{said}"
+        return f"{key} is missing{purpose}"
     value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
     if (
         setting is not None
@@ -93,8 +93,8 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
         and not isinstance(item["input"], bool)
         and item["input"] in _DERIVED_ONCE
     ):
-        return f"{key}{value}: write {AUTO}{said}"
-    ranges = [_asked(one, said) for one in group if one["type"] != "literal_error"][:1]
+        return f"{key}{value}: write {AUTO}{purpose}"
+    ranges = [_asked(one, purpose) for one in group if one["type"] != "literal_error"][:1]
     choices = [f"must be {_either(setting.choices)}"] if setting is not None and setting.choices else []
     return f"{key}{value}: {', or '.join([*ranges, *choices]).replace(', or must be', ', or')}"
 
@@ -104,14 +104,14 @@ def _either(choices: Sequence[Any]) -> str:
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def _asked(item: Any, said: str) -> str:
+def _asked(item: Any, purpose: str) -> str:
     """What pydantic expects, in our words.
 
-    :param said: what the setting is for; it is given if the value is of the wrong kind
+    :param purpose: what the setting is for; it is given if the value is of the wrong kind
     """
     kind, _, problem = item["type"].partition("_")
     if kind in _KINDS and problem in ("type", "parsing", "str_parsing", "from_float"):
-        return f"must be {_KINDS[kind]}{said}"
+        return f"must be {_KINDS[kind]}{purpose}"
     message = str(item["msg"]).removeprefix("Value error, ")
     asked = re.fullmatch(r"\w+ should (.+?)(?: after validation.*)?", message)
     return f"must {asked[1]}" if asked else f"{message[0].lower()}{message[1:]}"

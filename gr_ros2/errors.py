@@ -13,7 +13,8 @@
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
     │   └── UnknownDictionaryError · DamagedError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
-    │   └── BagError                    a bag cannot be read or written
+    │   ├── BagError                    a bag cannot be read or written
+    │   └── DescriptionError            a node's description of a type cannot be used
     ├── PhyError (RuntimeError)         the flowgraph or radio failed
     │   └── RadioError                  a device or recording cannot be opened, set up or used
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
@@ -197,6 +198,10 @@ class DamagedError(CodecError):
 
 class MiddlewareError(GrRos2Error, RuntimeError):
     """The ROS side failed."""
+
+
+class DescriptionError(MiddlewareError):
+    """What a node says about a type cannot be used."""
 
 
 class BagError(MiddlewareError):

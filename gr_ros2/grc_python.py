@@ -104,17 +104,17 @@ def ask(program: str, environ: Mapping[str, str] = os.environ) -> OtherPython:
         done = subprocess.run(
             [program, "-c", _ASK], env=_clean(environ), capture_output=True, text=True, cwd="/", check=True
         )
-        told = json.loads(done.stdout.splitlines()[-1])
+        answer = json.loads(done.stdout.splitlines()[-1])
     except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
         raise ConfigError(f"{program}: the Python of GNU Radio Companion does not run ({error})") from error
     return OtherPython(
         program,
-        (told["version"][0], told["version"][1]),
-        told["abi"] or "",
-        Path(told["user"]),
-        told["enabled"],
-        told["where"],
-        {_plain(name): version for name, version in told["has"].items()},
+        (answer["version"][0], answer["version"][1]),
+        answer["abi"] or "",
+        Path(answer["user"]),
+        answer["enabled"],
+        answer["where"],
+        {_plain(name): version for name, version in answer["has"].items()},
     )
 
 

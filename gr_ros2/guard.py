@@ -73,7 +73,7 @@ class Guard:
         if self.error is not None:
             raise RunError(f"{self.name}: failed ({one_line(self.error)})") from self.error
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What it missed and why, as one line; an empty list where it received everything."""
         if self.error is None and not self.missed:
             return []

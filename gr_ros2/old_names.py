@@ -27,5 +27,5 @@ def new_name(old: str, known: Collection[str]) -> str:
 
     :param known: the present names of the settings in the class
     """
-    field, said = OLD_NAMES.get(old, ("", ""))
-    return said if field in known else ""
+    field, message = OLD_NAMES.get(old, ("", ""))
+    return message if field in known else ""

@@ -272,8 +272,8 @@ def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
     if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
         raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
     known = options_of(row.name, options)
-    said = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
-    chosen = {name: value for name, value in said.items() if getattr(known, name) == AUTO}
+    from_row = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
+    chosen = {name: value for name, value in from_row.items() if getattr(known, name) == AUTO}
     merged = build(TopicOptions, {**asdict(known), **chosen})
     special = row.type_name == CALLS_TYPE or is_service(row.type_name)
     return Topic(row.topic_id, row.name, row.type_name if special else normalize_type(row.type_name), merged)

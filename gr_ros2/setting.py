@@ -81,8 +81,8 @@ class Setting:
 
 def settings_of(cls: type[Any]) -> list[Setting]:
     """Every field of a settings class, in their order."""
-    said, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
-    return [_setting(item, hints[item.name], said.get(item.name, ""), called) for item in fields(cls)]
+    described, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
+    return [_setting(item, hints[item.name], described.get(item.name, ""), called) for item in fields(cls)]
 
 
 def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> Setting:
@@ -119,11 +119,13 @@ def label(name: str) -> str:
 
 def meanings(cls: type[Any]) -> dict[str, str]:
     """The text for each setting in the docstrings of a settings class and its bases, one line each."""
-    said: dict[str, str] = {}
+    described: dict[str, str] = {}
     for part in reversed(cls.__mro__):  # the text of a class replaces that of its base
         text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
-        said |= {name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)}
-    return said
+        described |= {
+            name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)
+        }
+    return described
 
 
 def titles(cls: type[Any]) -> dict[str, str]:

@@ -15,6 +15,8 @@ import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
 import fuzz.receiver
+import fuzz.structure
+import fuzz.type_description
 import fuzz.wire
 import fuzz.wire_v1
 from fuzz.loop import Harness, inputs, run, within
@@ -32,6 +34,8 @@ HARNESSES = {
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
+    "structure": (fuzz.structure.structure, fuzz.structure.corpus),
+    "type_description": (fuzz.type_description.type_description, fuzz.type_description.corpus),
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
     "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
@@ -43,6 +47,8 @@ COUNTS = {
     "receiver": 1_500,
     "calls": 4_000,
     "compression": 2_000,
+    "structure": 1_500,
+    "type_description": 1_000,
     "control_socket": 1_000,
     "dashboard": 300,
     "framing": 1_000,

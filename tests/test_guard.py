@@ -17,7 +17,7 @@ def fails(error: Exception) -> None:
 def test_the_first_failure_ends_it_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
     guard, heard = Guard("capture x"), list[int]()
     guard(heard.append, 1)
-    assert guard.told() == []
+    assert guard.incomplete() == []
     guard(fails, OSError(28, "No space left on device"))
     for number in range(5):
         guard(heard.append, number)
@@ -25,7 +25,7 @@ def test_the_first_failure_ends_it_in_one_line(caplog: pytest.LogCaptureFixture)
     assert [record.message for record in caplog.records] == [
         "capture x: ended (No space left on device); the link goes on without it"
     ]
-    assert guard.told() == ["capture x: ended (No space left on device); 6 events missed"]
+    assert guard.incomplete() == ["capture x: ended (No space left on device); 6 events missed"]
 
 
 def test_who_falls_behind_is_named_once_and_goes_on(caplog: pytest.LogCaptureFixture) -> None:
@@ -35,7 +35,7 @@ def test_who_falls_behind_is_named_once_and_goes_on(caplog: pytest.LogCaptureFix
     guard(heard.append, 1)
     assert heard == [1]
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert guard.told() == ["dashboard: slower than the link; 3 events missed"]
+    assert guard.incomplete() == ["dashboard: slower than the link; 3 events missed"]
 
 
 def test_what_a_result_needs_is_raised_and_not_logged(caplog: pytest.LogCaptureFixture) -> None:
@@ -59,7 +59,7 @@ def test_the_last_call_reaches_it_all_the_same() -> None:
     guard.last(heard.append, "two")
     guard.last(fails, ValueError("another"))
     assert heard == ["one", "two"]
-    assert guard.told() == ["x: ended (ValueError); 1 events missed"]
+    assert guard.incomplete() == ["x: ended (ValueError); 1 events missed"]
 
 
 def test_ctrl_c_is_no_failure_of_an_observer() -> None:
@@ -70,7 +70,7 @@ def test_ctrl_c_is_no_failure_of_an_observer() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         guard(interrupted)
-    assert guard.told() == []
+    assert guard.incomplete() == []
 
 
 def test_errors_in_one_line() -> None:

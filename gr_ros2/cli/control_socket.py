@@ -28,7 +28,7 @@ from gr_ros2.errors import GrRos2Error, RunError
 _LINE = 4096
 _MAX_CLIENTS = 32
 """Most clients at a time. When one more connects, the client that connected first is disconnected."""
-_SPEAK_S = 2.0
+_REQUEST_S = 2.0
 """s that a client may take to send its request."""
 _PAUSE_S = 0.1
 _WAIT_S = 10.0
@@ -91,48 +91,48 @@ class ControlSocket:
 
     def _serve(self) -> None:
         try:
-            while self._turn():
+            while self._handle_next():
                 pass
         finally:
             for client in list(self._clients):
-                self._leave(client)
+                self._disconnect(client)
 
-    def _turn(self) -> bool:
+    def _handle_next(self) -> bool:
         """Wait for the next event and handle it. Return False when the socket is closed."""
         first = min((client.deadline for client in self._clients.values()), default=None)
         wait = None if first is None else max(0.0, first - time.monotonic())
         for key, _ in self._selector.select(wait):
             if isinstance(key.data, _Client):
-                self._hear(key.data)
-            elif not self._let_in():
+                self._read_from(key.data)
+            elif not self._accept():
                 return False
         now = time.monotonic()
         for client in [client for client in self._clients.values() if client.deadline <= now]:
-            self._leave(client.socket)
+            self._disconnect(client.socket)
         return True
 
-    def _let_in(self) -> bool:
+    def _accept(self) -> bool:
         try:
-            came, _ = self._socket.accept()
+            connection, _ = self._socket.accept()
         except OSError as error:
             if self._closed:
                 return False
             if not isinstance(error, BlockingIOError):  # no file descriptor is left, so new clients wait
                 time.sleep(_PAUSE_S)
             return True
-        came.setblocking(False)
+        connection.setblocking(False)
         if len(self._clients) >= _MAX_CLIENTS:
-            self._leave(next(iter(self._clients)))
-        client = self._clients[came] = _Client(came, time.monotonic() + _SPEAK_S)
-        self._selector.register(came, selectors.EVENT_READ, client)
+            self._disconnect(next(iter(self._clients)))
+        client = self._clients[connection] = _Client(connection, time.monotonic() + _REQUEST_S)
+        self._selector.register(connection, selectors.EVENT_READ, client)
         return True
 
-    def _leave(self, client: socket.socket) -> None:
+    def _disconnect(self, client: socket.socket) -> None:
         if self._clients.pop(client, None) is not None:
             self._selector.unregister(client)
             client.close()
 
-    def _hear(self, client: _Client) -> None:
+    def _read_from(self, client: _Client) -> None:
         try:
             more = client.socket.recv(_LINE - len(client.line))
         except BlockingIOError:
@@ -144,13 +144,13 @@ class ControlSocket:
             return
         if client.line:
             with suppress(OSError):  # the client left, or its buffer is full because it does not read
-                client.socket.sendall(json.dumps(self._say(client.line)).encode() + b"\n")
-        self._leave(client.socket)
+                client.socket.sendall(json.dumps(self._reply_to(client.line)).encode() + b"\n")
+        self._disconnect(client.socket)
 
-    def _say(self, line: bytes) -> Mapping[str, Any]:
+    def _reply_to(self, line: bytes) -> Mapping[str, Any]:
         try:
-            asked = parse(line)
-            return {"name": self._name, **(self._answer(asked) if asked else {})}
+            query = parse(line)
+            return {"name": self._name, **(self._answer(query) if query else {})}
         except GrRos2Error as error:
             return {"error": str(error)}
         except (ValueError, LookupError, TypeError, ArithmeticError):
@@ -185,18 +185,18 @@ def running_programs() -> dict[int, str]:
     return found
 
 
-def request(pid: int, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+def request(pid: int, query: Mapping[str, Any]) -> Mapping[str, Any]:
     """Send a request to a program and return its answer.
 
     :raises RunError: when the program has ended, does not answer, or refuses
     """
     try:
-        said = _ask(folder() / f"{pid}.sock", asked)
+        reply = _ask(folder() / f"{pid}.sock", query)
     except (OSError, ValueError) as error:
         raise RunError(f"process {pid}: does not answer ({error}); has it ended?") from error
-    if "error" in said:
-        raise RunError(f"process {pid}: {said['error']}")
-    return said
+    if "error" in reply:
+        raise RunError(f"process {pid}: {reply['error']}")
+    return reply
 
 
 def parse(line: bytes) -> Mapping[str, Any]:
@@ -233,10 +233,10 @@ def receive(connection: socket.socket, most: int, deadline: float, end: bytes = 
     return data
 
 
-def _ask(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+def _ask(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
     deadline = time.monotonic() + _WAIT_S
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(_WAIT_S)
         client.connect(str(path))
-        client.sendall(json.dumps(asked).encode() + b"\n")
+        client.sendall(json.dumps(query).encode() + b"\n")
         return parse(receive(client, _LINE, deadline, b"\n"))

@@ -163,10 +163,10 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
     """Print what runs and what it waits for, with one status line until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import Waiting
 
-    said, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
-    said(say, _opening(running))
+    guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
+    guarded(say, _opening(running))
     if running.remark:
-        said(say, running.remark)
+        guarded(say, running.remark)
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
     waiting = Waiting(running.source)
@@ -176,12 +176,12 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
             if (waits_for := waiting.look()) is not None:
-                said(say, waits_for)
+                guarded(say, waits_for)
             if isinstance(status, Status):
-                said(status.update, status_line(running.stats()))
+                guarded(status.update, status_line(running.stats()))
             elif time.monotonic() - shown >= LOG_S:
                 shown = time.monotonic()
-                said(say, status_line(running.stats()))
+                guarded(say, status_line(running.stats()))
 
 
 def status_line(stats: Mapping[str, Any]) -> str:

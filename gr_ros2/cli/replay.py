@@ -8,7 +8,7 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.report.explain import repair_told
+from gr_ros2.report.explain import repair_lines
 from gr_ros2.report.table import ledger_table, notes, summary_table
 from gr_ros2.run.replay import replay as replay_bag
 from gr_ros2.run.scenario import Scenario, load_scenario
@@ -51,6 +51,6 @@ def replay(
     console.print(f"packets: {packets}\n")
     console.print(summary_table([result]))
     console.print(ledger_table(result))
-    for line in (*repair_told(result), *notes(result)):
+    for line in (*repair_lines(result), *notes(result)):
         console.print(line)
     console.print(f"\nWritten to {target}", soft_wrap=True)

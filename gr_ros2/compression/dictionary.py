@@ -29,7 +29,7 @@ from gr_ros2.errors import ConfigError
 
 FORMAT = 1
 SHIPPED = (1, 2)
-"""Numbers 1..14 of the shipped sets: 1 has the types of ROS 2 Humble, 2 those that are new or another
+"""Numbers 1..13 of the shipped sets: 1 has the types of ROS 2 Humble, 2 those that are new or another
 since, up to Lyrical. A sender uses the last one with a definition that fits the message."""
 GENERAL = 1
 """The set whose words and constants serve the types that no set has."""
@@ -58,7 +58,7 @@ class Dictionary:
     """The content of one dictionary.
 
     :param name: for people
-    :param number: 1..14 for a shipped set, OWN for a user's
+    :param number: 1..13 for a shipped set, OWN for a user's
     :param words: strings without terminator, most frequent first
     :param constants: bits of doubles, most frequent first
     """

@@ -16,7 +16,19 @@ from operator import itemgetter
 from struct import Struct
 from typing import Any
 
-from gr_ros2.compression.schema import HEADER, MAX_PARTS, SIZES, Composite, Node, Repeat, Scalar, Shape, Text
+from gr_ros2.compression.schema import (
+    HEADER,
+    MAX_PARTS,
+    QUATERNION_TYPE,
+    SIZES,
+    TIME_TYPES,
+    Composite,
+    Node,
+    Repeat,
+    Scalar,
+    Shape,
+    Text,
+)
 
 MAX_SLOTS = 640
 """Most values that are coded one by one; a message with more is not split, which bounds the time at both ends."""
@@ -36,8 +48,6 @@ STRING, MATRIX, SMALL = range(3)
 sent)."""
 
 _BITS = {"d": "Q", "f": "I"}
-_TIME = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-_QUATERNION = "geometry_msgs/msg/Quaternion"
 
 
 @dataclass(slots=True)  # not frozen: frozen instances would make the preparation of a new message a third slower
@@ -107,10 +117,10 @@ def _add(made: Outline, node: Node, path: str, counts: Iterator[int]) -> None:
         made.items.append(("", 1, 0))
     elif isinstance(node, Repeat):
         _add_repeat(made, node, path, counts)
-    elif node.type_name in _TIME:
+    elif node.type_name in TIME_TYPES:
         made.live.append(Slot(TIME, len(made.items), -1, 0, path))
         made.items += [("I", 4, 4)] * 2
-    elif node.type_name == _QUATERNION:
+    elif node.type_name == QUATERNION_TYPE:
         made.live.append(Slot(QUATERNION, len(made.items), made.reals, 0, path))
         made.items += [("d", 8, 8)] * 4
         made.reals += 4

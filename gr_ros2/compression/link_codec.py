@@ -1,8 +1,11 @@
 """The message codec of a link: for each topic, the codec that its registry row and options select.
 
-First byte of a coded message: high nibble, the dictionaries used (0 none, 1..14 a shipped set, 15 a user's own, whose
-two-byte id follows); low nibble, the codec (0 stored, 1 zstd, 2 fields, 3 fields with a second part). 0x00 is stored
-as it is.
+First byte of a coded message: high nibble, the dictionaries used (0 none, 1..13 a shipped set; 14 the structure of the
+type, as the sender has announced it, and 15 a user's own dictionary, whose two-byte id follows); low nibble, the codec
+(0 stored, 1 zstd, 2 fields, 3 fields with a second part). 0x00 is stored as it is.
+
+A sender announces in its table of topics how a topic is coded: the option ``codec`` and, where it has learned the
+definition of the type, a blank and the structure (``compression.structure``).
 
 Invariants: a coded message is at most one byte longer than the message; the decoded message equals the original, except
 for alignment gaps (zero) and quantised fields (within their bound); decoding arbitrary bytes raises only CodecError,
@@ -12,15 +15,19 @@ different dictionary is an UnknownDictionaryError.
 
 from __future__ import annotations
 
+from binascii import crc_hqx
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from pathlib import Path
+from typing import Any
 
 from gr_ros2.compression import bounds
 from gr_ros2.compression.dictionary import GENERAL, OWN, SHIPPED, Dictionary, load, shipped
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.quantize import Quantizer, parse_steps
-from gr_ros2.compression.schema import Types
+from gr_ros2.compression.schema import Composite, Types, tree_of
+from gr_ros2.compression.structure import read_structure, write_structure
 from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
 from gr_ros2.registry import Topic
@@ -33,6 +40,12 @@ MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in
 """Bytes; what a link can carry uncompressed."""
 
 STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
+ANNOUNCED = 14
+"""Number in the first byte for the structure that the sender has announced; two bytes of its CRC follow."""
+MAX_ANNOUNCEMENT = 255
+"""Bytes of what a table says about the coding of a topic. A type whose structure is longer is not announced."""
+MAX_LEARNED = 8
+"""Definitions of one type that are learned at most, as publishers of different age come and go."""
 
 
 class LinkCodec:
@@ -74,13 +87,35 @@ class LinkCodec:
             self._made[key] = TopicCodec(topic, self._sets, self._max_size)
         self._topics[topic.topic_id] = self._made[key]
 
-    def of(self, topics: Iterable[Topic]) -> LinkCodec:
-        """A codec of other topics, which shares dictionaries and everything made so far with this one."""
+    def of(self, topics: Iterable[Topic], announcements: Mapping[int, str] | None = None) -> LinkCodec:
+        """A codec of other topics, which shares dictionaries and everything made so far with this one.
+
+        :param announcements: what their sender says about the coding of some of them, by topic id
+        """
         made = copy(self)
         made._topics = {}
         for topic in topics:
             made.add(topic)
+        for topic_id, text in (announcements or {}).items():
+            made._topics[topic_id] = made._topics[topic_id].told(text)
         return made
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """See MessageCodec. A type that cannot be split is coded as before."""
+        tree = tree_of(definitions, type_name)
+        if tree is None:
+            return
+        for key, codec in self._made.items():
+            if key[0] == type_name:
+                codec.learn(tree)
+
+    def announcement(self, topic_id: int) -> str:
+        """See MessageCodec."""
+        return self._topics[topic_id].announcement
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:
+        """See MessageCodec."""
+        return self._topics[topic_id].lacks(coded)
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The message that the other end gets: alignment gaps are zero, quantised fields are rounded, the rest is
@@ -119,7 +154,7 @@ class TopicCodec:
         self._mode: str = topic.options.codec
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
-        self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders(topic, item) for item in sets}
+        self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders.of(topic, item) for item in sets}
         self._choices: list[_Coders] = []
         """Coders for sending, the preferred one first: one for each definition of the type."""
         for item, coders in zip(sets, self._held.values(), strict=True):
@@ -129,8 +164,48 @@ class TopicCodec:
             self._choices = [self._held[GENERAL.to_bytes(1, "big")]]
         self._plain = Zstd()
         self._max_size = max_size
-        if steps := parse_steps(topic.options.quantize):
-            self._quantize(steps, topic)
+        self._learned = 0
+        self.announcement = self._mode
+        """What the table says about the coding of this topic."""
+        self._steps = parse_steps(topic.options.quantize)
+        if self._steps:
+            self._quantize(self._steps, topic)
+
+    def learn(self, tree: Composite) -> None:
+        """See LinkCodec."""
+        text = write_structure(tree)
+        known = [coders for coders in self._choices if coders.tree is not None and write_structure(coders.tree) == text]
+        if known:
+            self._choices = known + [coders for coders in self._choices if coders not in known]
+            return
+        announcement = f"{self._mode} {text}"
+        if self._mode in ("none", "zstd") or len(announcement) > MAX_ANNOUNCEMENT or self._learned == MAX_LEARNED:
+            return
+        self._learned += 1
+        coders = _Coders.announced(tree, text)
+        if self._steps:
+            with suppress(ConfigError):  # a field that other definitions of the type have
+                coders.quantizer = Quantizer(tree, self._steps)
+        self._choices = [coders, *(other for other in self._choices if other.tree is not None and not other.learned)]
+        self._held = {**self._held, bytes([ANNOUNCED]) + _mark(text): coders}
+        self.announcement = announcement
+
+    def told(self, announcement: str) -> TopicCodec:
+        """The same, for messages of a sender that has announced this."""
+        text = announcement.partition(" ")[2]
+        if not text:
+            return self
+        try:
+            coders = _Coders.announced(read_structure(text), text)
+        except CodecError:  # of a later version; its messages are refused by name
+            return self
+        made = copy(self)
+        made._held = {**self._held, bytes([ANNOUNCED]) + _mark(text): coders}
+        return made
+
+    def lacks(self, coded: bytes) -> bool:
+        """See MessageCodec."""
+        return bool(coded) and coded[0] >> 4 == ANNOUNCED and bytes([ANNOUNCED]) + coded[1:3] not in self._held
 
     def encode(self, payload: bytes) -> bytes:
         """See LinkCodec."""
@@ -164,11 +239,12 @@ class TopicCodec:
             raise CodecError(f"unknown codec {codec} with dictionaries {number}")
         if number == 0:
             return self._plain.decompress(coded[1:], max_size)
-        start = 3 if number == OWN else 1
+        start = 3 if number in (OWN, ANNOUNCED) else 1
         coders = self._held.get(bytes([number]) + coded[1:start])
         if coders is None:
-            which = f"own dictionary {coded[1:start].hex()}" if number == OWN else f"shipped dictionaries {number}"
-            raise UnknownDictionaryError(f"message coded with {which}, which are not held here")
+            names = {OWN: f"own dictionary {coded[1:start].hex()}", ANNOUNCED: f"structure {coded[1:start].hex()}"}
+            which = names.get(number, f"shipped dictionaries {number}")
+            raise UnknownDictionaryError(f"message coded with {which}, not held here")
         body = coded[start:]
         if codec == ZSTD:
             if coders.zstd is None:
@@ -220,24 +296,44 @@ class TopicCodec:
 
 
 class _Coders:
-    """The coders of one set of dictionaries for one topic.
+    """The coders of one set of dictionaries, or of one announced structure, for one type.
 
     All of them are made in advance, so that a received message never causes this work.
 
+    :param head: what names them at the beginning of a message: their number, and bytes that follow it
+    :param dictionary: whose words and numbers are used
     :ivar tree: the type, None if it is unknown
     :ivar fields: None if the type is unknown
     :ivar zstd: None if the set has no dictionary for the type
     :ivar quantizer: None if nothing is quantised
     """
 
-    def __init__(self, topic: Topic, dictionary: Dictionary) -> None:
-        self.type_name = topic.type_name
-        self.heads = [bytes([dictionary.number << 4 | codec]) + dictionary.prefix for codec in range(4)]
-        own = {name: entry.definition for name, entry in dictionary.types.items() if entry.definition}
-        self.tree = Types(own).tree(topic.type_name)
+    def __init__(self, type_name: str, head: bytes, dictionary: Dictionary, tree: Composite | None) -> None:
+        self.type_name = type_name
+        self.heads = [bytes([head[0] << 4 | codec]) + head[1:] for codec in range(4)]
+        self.tree = tree
+        self.learned = head[0] == ANNOUNCED
         self.fields: FieldsCodec | None = None
         self.quantizer: Quantizer | None = None
-        if self.tree is not None:
-            self.fields = FieldsCodec(self.tree, dictionary.model(self.type_name), Zstd())
+        self.zstd: Zstd | None = None
+        if tree is not None:
+            self.fields = FieldsCodec(tree, dictionary.model(type_name), Zstd())
+
+    @classmethod
+    def of(cls, topic: Topic, dictionary: Dictionary) -> _Coders:
+        """The coders of one set of dictionaries."""
+        own = {name: entry.definition for name, entry in dictionary.types.items() if entry.definition}
+        head = dictionary.number.to_bytes(1, "big") + dictionary.prefix
+        made = cls(topic.type_name, head, dictionary, Types(own).tree(topic.type_name))
         entry = dictionary.types.get(topic.type_name)
-        self.zstd = Zstd(entry.zstd) if entry is not None and entry.zstd else None
+        made.zstd = Zstd(entry.zstd) if entry is not None and entry.zstd else None
+        return made
+
+    @classmethod
+    def announced(cls, tree: Composite, text: str) -> _Coders:
+        """The coders of a structure. Types have no names there, so nothing is known about this one in particular."""
+        return cls("", bytes([ANNOUNCED]) + _mark(text), shipped(GENERAL), tree)
+
+
+def _mark(text: str) -> bytes:
+    return crc_hqx(text.encode(), 0).to_bytes(2, "big")

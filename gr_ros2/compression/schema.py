@@ -31,6 +31,8 @@ _CODES = {
 }  # fmt: skip
 """struct codes; bool and int8 are plain bytes, since any byte value may occur and has to be preserved."""
 SIZES = {code: Struct("<" + code).size for code in "BHhIiQqfd"}
+TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+QUATERNION_TYPE = "geometry_msgs/msg/Quaternion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,19 @@ class Types:
         return self._trees[type_name]
 
 
-def _composite(types: Typesdict, type_name: str, above: tuple[str, ...]) -> Composite:
+def tree_of(types: Mapping[str, Any], type_name: str) -> Composite | None:
+    """The tree of a type by these definitions alone; None where :meth:`Types.tree` gives none, or where they define a
+    time or a quaternion in another way than ROS does."""
+    humble = _humble().fielddefs
+    if any(name in types and types[name][1] != humble[name][1] for name in (*TIME_TYPES, QUATERNION_TYPE)):
+        return None
+    try:
+        return _composite(types, type_name, ())
+    except KeyError:
+        return None
+
+
+def _composite(types: Mapping[str, Any], type_name: str, above: tuple[str, ...]) -> Composite:
     if type_name in above:
         raise KeyError(type_name)  # a type that contains itself has no tree
     _, members = types[type_name]
@@ -115,7 +129,7 @@ def _composite(types: Typesdict, type_name: str, above: tuple[str, ...]) -> Comp
     return Composite(type_name, nodes, any(is_open(node) for _, node in nodes))
 
 
-def _node(types: Typesdict, kind: Any, above: tuple[str, ...]) -> Node:
+def _node(types: Mapping[str, Any], kind: Any, above: tuple[str, ...]) -> Node:
     node_type, detail = kind
     if node_type is Nodetype.BASE:
         return Text() if detail[0] == "string" else Scalar(_CODES[detail[0]])

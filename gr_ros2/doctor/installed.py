@@ -46,10 +46,10 @@ def python() -> Finding:
 
 def gnu_radio() -> Finding:
     """Whether GNU Radio can be imported here, and its version is 3.10."""
-    said = output_of([sys.executable, "-c", _ASK]) or ""
-    version = next((line.split()[1] for line in said.splitlines() if line.startswith("version ")), None)
+    output = output_of([sys.executable, "-c", _ASK]) or ""
+    version = next((line.split()[1] for line in output.splitlines() if line.startswith("version ")), None)
     if version is None:
-        last = (said.strip().splitlines() or ["it ended without a word"])[-1]
+        last = (output.strip().splitlines() or ["it ended without a word"])[-1]
         there = any(Path(folder, "gnuradio").is_dir() for folder in Path("/usr/lib").glob("python3*/dist-packages"))
         remedy = f"make the environment from the system's Python: {_SYSTEM}" if there else "sudo apt install gnuradio"
         return Finding("GNU Radio", "failed", f"cannot be imported ({last})", remedy)
@@ -104,6 +104,7 @@ def _rows(table: BackendTable[Any], needed: str = "") -> Iterator[Finding]:
         what = f"{table.family} {name}"
         try:
             table.load(name)
+            table.modules(name)
             yield Finding(what, "ok", table[name].summary)
         except BackendMissingError as error:
             remedy = table[name].requires if name in table.own else ""

@@ -75,12 +75,12 @@ def programs() -> Iterator[Finding]:
 
 def _asked(name: str, command: str) -> Finding:
     words = command.split()
-    said = output_of(words)
-    if said is None:
+    output = output_of(words)
+    if output is None:
         remedy = f"sudo apt install {PACKAGES[words[0]]}" if words[0] in PACKAGES else f"install {words[0]}"
         return Finding(name, "note", f"cannot be looked for: {words[0]} is not installed", remedy)
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
-    if not lines or any(text in said.lower() for text in _NOTHING):
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    if not lines or any(text in output.lower() for text in _NOTHING):
         return Finding(name, "note", f"`{command}` finds none")
     return Finding(name, "ok", f"`{command}`: {'; '.join(line for line in lines if '=' in line or ':' in line)[:300]}")
 

@@ -55,13 +55,15 @@ class FramePrefix:
         self._plans: dict[str, list[tuple[Typestore, Plan]]] = {}
         """Plans by type name, one for each definition of the type; the most likely definition comes first."""
 
+    def learn(self, type_name: str, store: Typestore) -> None:
+        """Use a definition of a type that was not known, or in preference to those that were."""
+        self._plans[type_name] = [(store, _plan(store, type_name)), *self._plans_of(type_name)]
+
     def apply(self, type_name: str, src_id: int, payload: bytes) -> bytes:
         """The message with prefixed frame names, or the unchanged message."""
         if not self._form:
             return payload
-        plans = self._plans.get(type_name)
-        if plans is None:
-            plans = self._plans[type_name] = [(store, _plan(store, type_name)) for store in typestores(type_name)]
+        plans = self._plans_of(type_name)
         if not plans:
             self._counters["frame_unknown_type"] += 1
             return payload
@@ -74,6 +76,12 @@ class FramePrefix:
                 return _encode(store, type_name, message, payload)
         self._counters["frame_damaged"] += 1
         return payload
+
+    def _plans_of(self, type_name: str) -> list[tuple[Typestore, Plan]]:
+        plans = self._plans.get(type_name)
+        if plans is None:
+            plans = self._plans[type_name] = [(store, _plan(store, type_name)) for store in typestores(type_name)]
+        return plans
 
 
 STATIC_DEPTH = 100

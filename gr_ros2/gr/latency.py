@@ -11,6 +11,8 @@ from collections import deque
 from itertools import islice
 from typing import NamedTuple
 
+from rosbags.typesys.store import Typestore
+
 from gr_ros2.middleware.type_definitions import typestores
 
 WINDOW = 10_000
@@ -24,9 +26,12 @@ _CDR_HEAD = 4
 _LITTLE_ENDIAN = 1
 
 
-def has_header(type_name: str) -> bool:
-    """Whether messages of a type begin with a std_msgs/Header; False if the type is not known."""
-    for store in typestores(type_name)[:1]:  # no ROS type ever gained or lost its header
+def has_header(type_name: str, *learned: Typestore) -> bool:
+    """Whether messages of a type begin with a std_msgs/Header; False if the type is not known.
+
+    :param learned: stores with definitions that come before those of ROS
+    """
+    for store in (*learned, *typestores(type_name))[:1]:  # no ROS type ever gained or lost its header
         _, members = store.fielddefs[type_name]
         return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
     return False

@@ -21,7 +21,7 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.config import SourceConfig, replaced
-from gr_ros2.errors import GrRos2Error
+from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
@@ -34,15 +34,18 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.registry import MAX_TOPICS, Registry, Topic, normalize_type, options_of
-from gr_ros2.service_rows import ServiceRow, parts, rows_of
+from gr_ros2.registry import MAX_TOPICS, NewRow, Registry, Topic, normalize_type, options_of
+from gr_ros2.service_rows import ServiceRow, is_service, parts, rows_of
 from gr_ros2.setting import AUTO, Auto
 from gr_ros2.topic_choice import TopicChoice
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
-_BATCH = 16
+_BATCH = 32
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
 
 
@@ -135,6 +138,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
+        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
@@ -197,6 +201,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
+        if self.config.version and self.config.compression and isinstance(self.middleware, ServiceGraph):
+            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
     def stop(self) -> bool:
@@ -321,9 +327,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         subscription.follow(partial(self._follow, topic))
 
     def _stop_search(self) -> None:
-        if self._search is not None:
-            self._search.close()
-            self._search = None
+        for search in (self._search, self._types):
+            if search is not None:
+                search.close()
+        self._search = self._types = None
+
+    def _types_in_use(self) -> list[tuple[str, str]]:
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def _learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        with self._lock:
+            self._end.learn(described.type_name, described.types)
+            self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
         """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
@@ -365,13 +381,16 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
         """
         assert self._offer is not None
-        options = self.config.topic_options
-        rows = [(name, type_name, options_of(name, options)) for name, type_name in parts(row_name, row.kind).items()]
-        namespace = self.config.namespace
+        rows: dict[str, NewRow] = {}
+        for name, type_name in parts(row.name, row.kind).items():
+            if not self.choice.leaves_out(name):
+                part = row_name + name.removeprefix(row.name)
+                rows[name] = part, type_name, options_of(part, self.config.topic_options)
+        if not any(is_service(type_name) for _, type_name, _ in rows.values()):
+            raise ConfigError("topics leaves out all its services")
         with self._lock:
-            self.registry = self._end.add(rows)
-            added = {topic.on_graph(namespace): topic for topic in self.registry[-len(rows) :]}
-            added = {name: topic for name, topic in added.items() if not self.choice.leaves_out(name)}
+            self.registry = self._end.add(list(rows.values()))
+            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
             self.services = {**self.services, **{name: topic for name, topic in added.items() if topic.is_service}}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
             self.subscribed = {**self.subscribed, **topics}
@@ -432,8 +451,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
-            if topic_id in self._subscriptions:
-                self._end.missed(topic_id, self._subscriptions[topic_id].lost)
+            subscription = self._subscriptions.get(topic_id)
+            if subscription is not None and subscription.lost:
+                self._end.missed(topic_id, subscription.lost)
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
@@ -454,7 +474,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _pump(self) -> None:
         while self._running:
             try:
-                self._emit(self._compose())
+                if packets := self._compose():
+                    self._emit(packets)
             except Exception as error:  # noqa: BLE001 - an exception would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1

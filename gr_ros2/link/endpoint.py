@@ -8,7 +8,7 @@ immediately; the receiving half returns its events, so that the caller can act o
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
@@ -72,6 +72,12 @@ class Endpoint(Protocol):
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Code messages of a type by its definition, which was not known before, or another one.
+
+        :param definitions: of the type and of those that it is made of, as the codec takes them
         """
 
     def follow(
@@ -149,9 +155,16 @@ class Endpoint(Protocol):
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
 
-    def next_departure(self) -> float | None:
+    @property
+    def urged(self) -> bool:
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
+
+    def next_departure(self, *, credited: bool = False) -> float | None:
         """Earliest time at which ``next_packet`` may have something without a further call; None if only a call can
-        change that."""
+        change that.
+
+        :param credited: if there were a credit
+        """
 
     def next_timeout(self) -> float | None:
         """The same for ``handle_timeout``."""
@@ -167,7 +180,7 @@ class EndpointV0:
     :param observer: called with every SenderEvent, in order
     """
 
-    answers = False
+    answers = urged = False
     ladder: Sequence[Rung] = ()
 
     def __init__(
@@ -217,6 +230,9 @@ class EndpointV0:
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """See :class:`Endpoint`."""
         raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Do nothing: both ends of version 0 code by the same dictionaries."""
 
     def follow(
         self,
@@ -301,7 +317,7 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         return [] if self._receiver is None else self._receiver.handle_timeout(now)
 
-    def next_departure(self) -> float | None:
+    def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002 - nothing is due by itself
         """See :class:`Endpoint`."""
         return None if self._sender is None else self._sender.next_timeout()
 

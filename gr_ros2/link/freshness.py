@@ -61,10 +61,13 @@ class Turns:
 
     def holder(self, pending: Collection[int]) -> int:
         """The topic to which the next packet belongs, -1 for none; one of ``pending``, which is not empty."""
-        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        line = self._line
+        for topic_id in pending:
+            if topic_id not in line:
+                line.append(topic_id)
         if self._packets % TURN != TURN - 1:
             return -1
-        return next(topic_id for topic_id in self._line if topic_id in pending)
+        return next(topic_id for topic_id in line if topic_id in pending)
 
     def sent(self, holder: int) -> None:
         """A packet left that belonged to this topic, or to none."""

@@ -5,7 +5,8 @@ Invariant: every message is coded independently, so that a lost message damages 
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 from gr_ros2.registry import Topic
 
@@ -19,6 +20,18 @@ class MessageCodec(Protocol):
 
         :raises ConfigError: for a wrong option of the topic
         """
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Prefer a definition of a type for sending.
+
+        :param definitions: of the type and of those that it is made of, in the form of rosbags
+        """
+
+    def announcement(self, topic_id: int) -> str:
+        """What the table of topics says about the coding of a topic, at most 255 bytes."""
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:
+        """Whether a message can be decoded only after its sender has announced more about its topic."""
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The result of ``decode`` for the coded message: the payload itself, except for bytes without information and

@@ -53,10 +53,10 @@ class Observers(Generic[_Observer]):
         for observer, guard in self._guarded:
             guard(observer.receiver_event, event, now)
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What observers missed and why, one line each; empty if they missed nothing."""
-        lines = [line for _, guard in self._guarded for line in guard.told()]
-        return lines + [line for one, _ in self._guarded if isinstance(one, Observers) for line in one.told()]
+        lines = [line for _, guard in self._guarded for line in guard.incomplete()]
+        return lines + [line for one, _ in self._guarded if isinstance(one, Observers) for line in one.incomplete()]
 
 
 def name_of(observer: object) -> str:

@@ -77,7 +77,7 @@ class Pace:
 
     def may_leave(self, now: float) -> bool:
         """Whether a packet may leave. While packets wait for their credits, the interval of the credits is measured."""
-        if self.out_of_credit or now < self.slot:
+        if now < self.slot or self.out_of_credit:
             return False
         if self._busy_since < inf:
             if self._steady and self._rough:
@@ -97,12 +97,12 @@ class Pace:
 
         :param waiting: whether more is waiting
         """
-        self._free = self.free(now) + self.interval
+        interval = self.interval
+        self._free = max(now, self._free) + interval
         if self._credits is not None and not self._unpaced:
             self._credits -= 1
             self._busy_since = now if not self._credits and waiting else inf
             self._steady = now == self._credited
         if self._rate:
-            interval = 1 / self._rate
             # A slot missed by less than its length is used later, so that a late wake-up does not lower the rate.
             self.slot = max(self.slot, now - interval) + interval

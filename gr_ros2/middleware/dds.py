@@ -32,8 +32,15 @@ from gr_ros2.middleware.cdr_dds import (
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
-from gr_ros2.middleware.dds_services import SERVICE_QOS, DdsClient, DdsServer, ServiceParticipant
-from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback
+from gr_ros2.middleware.dds_services import DdsClient, DdsServer, ServiceParticipant
+from gr_ros2.middleware.services import (
+    DESCRIPTION_TYPE,
+    SERVICE_QOS,
+    ReplyCallback,
+    RequestCallback,
+    ServerCallback,
+    Witness,
+)
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -160,6 +167,26 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 (_, _), (replies, _) = ros_graph.dds_service(*service)
                 if (reader.participant, replies) in replying:
                     found[service[0]] = service[1]
+        return found
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:
+        name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
+        with self._lock:
+            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
+        hashes: dict[str, set[bytes]] = {}
+        services: dict[bytes, list[str]] = {}
+        for endpoint in everyone:
+            if endpoint.participant == self._guid or not endpoint.is_cyclone:
+                continue  # services of Fast DDS cannot be called from here
+            if (endpoint.topic, endpoint.type_name) == (name, kind):
+                hashes.setdefault(ros_graph.hash_told(endpoint.user_data), set()).add(endpoint.participant)
+            service = ros_graph.ros_service(endpoint.topic, endpoint.type_name)
+            if service is not None and service[1] == DESCRIPTION_TYPE:
+                services.setdefault(endpoint.participant, []).append(service[0])
+        found = []
+        for digest in sorted(hashes.keys() - {""}):
+            named = sorted({service for owner in hashes[digest] for service in services.get(owner, ())})
+            found.append(Witness(digest, tuple(named)))
         return found
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ _environment = threading.Lock()
 
 
 @contextlib.contextmanager
-def told(localhost_only: bool | Auto) -> Iterator[None]:
+def ros_localhost_only(localhost_only: bool | Auto) -> Iterator[None]:
     """Set ROS_LOCALHOST_ONLY: rcl reads it when a context is initialised, and offers no other interface for it."""
     if localhost_only == AUTO:
         yield

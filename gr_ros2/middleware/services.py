@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable
+from typing import NamedTuple
 
-from gr_ros2.middleware.base import Middleware
+from gr_ros2.middleware.base import Middleware, Qos
 
 RequestCallback = Callable[[Hashable, bytes], None]
 """Takes a request: the client, to be given back with the reply, and the message."""
@@ -17,6 +18,23 @@ ReplyCallback = Callable[[int, bytes], None]
 """Takes a reply: the number that was given with the request, and the message."""
 ServerCallback = Callable[[bool], None]
 """Takes whether a server is there."""
+
+
+SERVICE_QOS = Qos("reliable", "volatile", 1000)
+"""The QoS of services in ROS, except for the depth, which is 10 there. So a burst of calls passes."""
+DESCRIPTION, DESCRIPTION_TYPE = "get_type_description", "type_description_interfaces/srv/GetTypeDescription"
+"""The service with which a node describes types since Iron: its name below that of the node, and its type."""
+
+
+class Witness(NamedTuple):
+    """A participant that can say what a type is.
+
+    :param digest: hash of the type as it uses it, ``RIHS01_…``
+    :param services: absolute names of its services ``get_type_description``, of one node or of several
+    """
+
+    digest: str
+    services: tuple[str, ...]
 
 
 class ServiceServer(ABC):
@@ -74,6 +92,10 @@ class ServiceGraph(Middleware):
         :param on_server: called when a server has come, and when the last one has left. Servers of this participant do
             not count
         """
+
+    def witnesses(self, topic: str, type_name: str) -> list[Witness]:  # noqa: ARG002 - not every graph has them
+        """Who uses a type on a topic and can be asked about it, without this participant."""
+        return []
 
     def guarded(self, service: str, callback: Callable[[], None]) -> None:
         """Call back about a service. An exception is counted and logged, and the thread goes on, as for topics."""

@@ -60,6 +60,11 @@ def typestores(type_name: str) -> tuple[Typestore, ...]:
     return tuple(found.values())
 
 
+def ships(type_name: str, digest: str) -> bool:
+    """Whether a distribution of ROS ships ``package/msg/Type`` with this hash."""
+    return any(_hash(store, type_name) == digest for store in typestores(type_name))
+
+
 def definition(type_name: str, text: str | None = None) -> Definition:
     """What a bag says about a type.
 

@@ -274,10 +274,15 @@ class BurstModem(ABC):
     def modulate(self, packet: bytes) -> Samples:
         """One burst."""
 
-    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
-        """The bursts of these packets, each followed by ``gap`` zero samples."""
-        silence = np.zeros(gap, np.complex64)
-        return np.concatenate([part for packet in packets for part in (self.modulate(packet), silence)])
+    def modulate_into(self, packets: Sequence[bytes], gap: int, out: Samples) -> None:
+        """Write the bursts of these packets, each followed by ``gap`` zero samples, to the beginning of an array."""
+        begin = 0
+        for packet in packets:
+            burst = self.modulate(packet)
+            end = begin + len(burst)
+            out[begin:end] = burst
+            begin = end + gap
+            out[end:begin] = 0
 
     @abstractmethod
     def find(self, samples: Samples) -> Search:

@@ -10,7 +10,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections import deque
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -43,20 +43,28 @@ _GAP = 32
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class BurstOptions:
-    """Settings that every burst PHY has.
+class AirOptions:
+    """Settings that every PHY with samples has.
 
     :param gap: zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next.
         auto = 32, or as many as another receiver needs
-    :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
     :param lengths: ``any`` = a packet is as long on the air as its bytes need, and says so; ``fixed`` = as long as the
         longest, as the blocks of others send (``detection_threshold: stock``, ``lora_sdr``) whatever is set here. The
         same at both ends
     """
 
     gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
-    fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
     lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class BurstOptions(AirOptions):
+    """Settings that every burst PHY has.
+
+    :param fec: forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar
+    """
+
+    fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
 
 
 class BurstPhy(Phy):
@@ -184,11 +192,12 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self._rungs = phy.running_modem.rungs
         self._gap = phy.gap
         self._waiting: deque[tuple[BurstModem, bytes]] = deque()
-        self._bursts: deque[Samples] = deque()
-        """Bursts that are modulated, each with its gap."""
-        self._rest = np.empty(0, np.complex64)
+        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
+        self._rest = self._whole[:0]
+        """What has not left yet of a burst that did not fit."""
         self.sent = 0
         """Packets that have left as samples."""
+        self._tag = self.add_item_tag  # stored: each look-up would pass through two proxies
         log_warnings_only([self])
         self.set_min_output_buffer(_BUFFER)
 
@@ -198,36 +207,57 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self._waiting.extend((modem, packet) for packet in packets)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
-        out, done = output_items[0], 0
-        while done < len(out):
-            if not len(self._rest):
-                if not self._bursts:
-                    self._modulate(len(out) - done)
-                if not self._bursts:
-                    break
-                self._rest = self._bursts.popleft()
-                if self._tagged:
-                    self.add_item_tag(0, self.nitems_written(0) + done, _LENGTH, pmt.from_long(len(self._rest)))
-            count = min(len(out) - done, len(self._rest))
-            out[done : done + count] = self._rest[:count]
-            self._rest = self._rest[count:]
-            done += count
-            self.sent += not len(self._rest)
+        out = output_items[0]
+        done = self._go_on(out)
+        while self._waiting and done < len(out):
+            modem = self._waiting[0][0]
+            packets, sizes = self._fitting(modem, len(out) - done)
+            if packets:
+                modem.modulate_into(packets, self._gap, out[done:])
+                for size in sizes:
+                    self._begin(done, size)
+                    done += size
+                self.sent += len(packets)
+            else:
+                _, packet = self._waiting.popleft()
+                self._rest = self._whole[: self._size(modem, packet)]
+                modem.modulate_into([packet], self._gap, self._rest)
+                self._begin(done, len(self._rest))
+                done += self._go_on(out[done:])
         return done
 
-    def _modulate(self, room: int) -> None:
-        """Modulate as many waiting packets of one rung as there is room for, at least one."""
+    def _size(self, modem: BurstModem, packet: bytes) -> int:
+        """Samples of a packet's burst and gap."""
+        return modem.samples_of(len(packet)) + self._gap
+
+    def _fitting(self, modem: BurstModem, room: int) -> tuple[list[bytes], list[int]]:
+        """The next packets whose bursts fit, all of one modem, and the samples of each."""
         packets: list[bytes] = []
-        ends: list[int] = []
-        end = 0
-        modem = self._waiting[0][0] if self._waiting else None
-        while self._waiting and end < room and self._waiting[0][0] is modem:
-            _, packet = self._waiting.popleft()
-            packets.append(packet)
-            end += modem.samples_of(len(packet)) + self._gap
-            ends.append(end)
-        if modem is not None:
-            self._bursts.extend(np.split(modem.modulate_all(packets, self._gap), ends[:-1]))
+        sizes: list[int] = []
+        while self._waiting and self._waiting[0][0] is modem and (size := self._size(*self._waiting[0])) <= room:
+            packets.append(self._waiting.popleft()[1])
+            sizes.append(size)
+            room -= size
+        return packets, sizes
+
+    def _begin(self, place: int, size: int) -> None:
+        """A burst begins at a place of this call's samples."""
+        if self._tagged:
+            self._tag(0, self.nitems_written(0) + place, _LENGTH, _number(size))
+
+    def _go_on(self, out: Samples) -> int:
+        """Send as much as fits of the burst that has begun; returns its number of samples."""
+        count = min(len(out), len(self._rest))
+        if count:
+            out[:count] = self._rest[:count]
+            self._rest = self._rest[count:]
+            self.sent += not len(self._rest)
+        return count
+
+
+@lru_cache
+def _number(value: int) -> Any:
+    return pmt.from_long(value)
 
 
 class BurstSink(ReceiverBlock):

@@ -177,17 +177,17 @@ class DeviceFrontEnd(FrontEnd):
         """Losses, and what the device reports about them.
 
         ``clipped``: samples beyond full scale. ``blanked``: samples not received because this robot was sending.
-        ``overflows``: places where received samples were lost before they came here. The counters of :meth:`_told` are
-        added.
+        ``overflows``: places where received samples were lost before they came here. Those of
+        :meth:`_device_counters` are added.
         """
-        told = self._told()
-        passed = {BURSTS_OUT: told.pop(BURSTS_OUT)} if BURSTS_OUT in told else {}
+        counted = self._device_counters()
+        passed = {BURSTS_OUT: counted.pop(BURSTS_OUT)} if BURSTS_OUT in counted else {}
         if self._blanker is not None:
             passed["blanked"] = self._blanker.blanked
         overflows = {} if self._gaps.gaps is None else {"overflows": self._gaps.gaps}
-        return FrontEndCounters(passed, {"clipped": self._shaper.clipped, **overflows, **told})
+        return FrontEndCounters(passed, {"clipped": self._shaper.clipped, **overflows, **counted})
 
-    def _told(self) -> dict[str, int]:
+    def _device_counters(self) -> dict[str, int]:
         """Counters of the bursts after the shaper, by name; those sent completely are ``BURSTS_OUT``."""
         return {}
 
@@ -257,9 +257,9 @@ class DeviceFrontEnd(FrontEnd):
         except (RuntimeError, ValueError, IndexError) as error:
             if isinstance(error, RadioError):
                 raise
-            said = " ".join(str(error).split()).removeprefix("RuntimeError: ") or type(error).__name__
+            reason = " ".join(str(error).split()).removeprefix("RuntimeError: ") or type(error).__name__
             raise RadioError(
-                f"front_end {self.name}: args = {self.options.args!r}: {said}; is the device plugged in, and free? "
+                f"front_end {self.name}: args = {self.options.args!r}: {reason}; is the device plugged in, and free? "
                 f"{self.find_with} lists devices, args look like {self.example_args}"
             ) from error
 

@@ -119,7 +119,7 @@ class Radio(PacketPath, HierBlock):
 
     def incomplete(self) -> list[str]:
         """What the recording lacks and why, as one line. Empty if nothing is missing, or if there is no recording."""
-        return [] if self._recorder is None else self._recorder.told()
+        return [] if self._recorder is None else self._recorder.incomplete()
 
     @property
     def refused(self) -> int:
@@ -130,6 +130,11 @@ class Radio(PacketPath, HierBlock):
     def damaged(self) -> int:
         """Number of received packets that were damaged, as far as the PHY reports it."""
         return 0 if self._receiver is None else self._receiver.damaged
+
+    @property
+    def foreign(self) -> int:
+        """Number of whole frames received that are not packets of this link, as far as the PHY tells them."""
+        return 0 if self._receiver is None else self._receiver.foreign
 
     @property
     def _medium(self) -> str:

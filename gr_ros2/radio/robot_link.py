@@ -202,7 +202,7 @@ class RobotLink(Flowgraph):
 
     def incomplete(self) -> list[str]:
         """What observers missed and what the recording lacks: one line each, with reason and number; often none."""
-        return [*self._observers.told(), *self.radio.incomplete()]
+        return [*self._observers.incomplete(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
         """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
@@ -220,6 +220,7 @@ class RobotLink(Flowgraph):
                 "refused": self.radio.refused,
                 "in": self.sink.handled,
                 "damaged": self.radio.damaged,
+                "foreign": self.radio.foreign,
                 "dropped": dict(counts.losses),
             },
             "phy": {

@@ -163,7 +163,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         """Number of samples that could not be written, for example because the disk is full."""
         return self._refused + self._unwritten
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What is missing and why, as one line. Empty if nothing is missing."""
         if self._guard.error is None and not self.failed:
             return []

@@ -69,7 +69,7 @@ class SoapyFrontEnd(DeviceFrontEnd):
             )
         super().check(now)
 
-    def _told(self) -> dict[str, int]:
+    def _device_counters(self) -> dict[str, int]:
         if self._transmitting is not None:
             self._transmitting.ask()
         return dict(self._counted)

@@ -106,8 +106,8 @@ def _call(function: str, *arguments: Any) -> Any:
     # After an error, functions that make an object return None. The others return a code other than 0.
     failed = result is None if function in ("makeStrArgs", "setupStream") else isinstance(result, int) and result != 0
     if failed:
-        said = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
-        raise RuntimeError(said.decode("utf-8", "replace") or f"{function} failed")
+        reason = _soapy.SoapySDRDevice_lastError() or (_soapy.SoapySDR_errToStr(result) if result else b"")
+        raise RuntimeError(reason.decode("utf-8", "replace") or f"{function} failed")
     return result
 
 

@@ -52,7 +52,7 @@ class UhdFrontEnd(DeviceFrontEnd):
         super().wire(graph)
         graph.msg_connect(self._transmitting, "async_msgs", self._events, "async_msgs")
 
-    def _told(self) -> dict[str, int]:
+    def _device_counters(self) -> dict[str, int]:
         return dict(self._events.counted)
 
     def _open_transmitter(self) -> Any:

@@ -27,7 +27,7 @@ class Waiting:
 
     def __init__(self, source: RosSource) -> None:
         self._source = source
-        self._told = ALL_THERE
+        self._last = ALL_THERE
 
     def look(self) -> str | None:
         """One line for the user; None if the last line is still true. At first, every topic is assumed to have a
@@ -37,9 +37,9 @@ class Waiting:
         """
         missing = self._source.unmatched
         line = waiting_line(missing, self._types(), self._others()) if missing else self._sent()
-        if line == self._told:
+        if line == self._last:
             return None
-        self._told = line
+        self._last = line
         return line
 
     def _others(self) -> list[TopicInfo]:

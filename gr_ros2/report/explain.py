@@ -32,7 +32,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *_packets(result, packets),
         *_in_flight(trace, packets),
         *_trend(trace),
-        *repair_told(result),
+        *repair_lines(result),
         *_lateness(result),
     ]
 
@@ -102,7 +102,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
         )
 
 
-def repair_told(result: Result) -> Iterator[str]:
+def repair_lines(result: Result) -> Iterator[str]:
     """What repair did, and what the air was used for."""
     uses = air_uses(result)
     if not uses:

@@ -94,7 +94,7 @@ class DeliveryRecorder:
                 subscription.close()
             self._guard.last(self._bag.close)
 
-    def told(self) -> list[str]:
+    def incomplete(self) -> list[str]:
         """What is missing in the bag, as one line; empty if nothing is missing. To be called after :meth:`close`."""
         missed = sum(self._bag.counters.values())
         if self._guard.error is not None:  # a storage writes in chunks: earlier messages may be missing too
@@ -380,9 +380,9 @@ class _Run:
     def _incomplete(self) -> list[str]:
         """What observers and the bag of delivered messages missed. The bag is closed first."""
         if self.listener is None:
-            return self.run_observers.told()
+            return self.run_observers.incomplete()
         self.listener.close()
-        return [*self.run_observers.told(), *self.listener.told()]
+        return [*self.run_observers.incomplete(), *self.listener.incomplete()]
 
     def _counters(self) -> dict[str, Any]:
         there, *back = (way.counters() for way in self.directions)

@@ -180,7 +180,7 @@ def simulate(
         back: Medium = lambda packet, now: [Arrival(packet.data)] if heard.passes(now) else ()  # noqa: E731
         ways += report_ways(scenario, ends[:2], phy.airtime, [back])
     for timed_event in EventLoop(ways).run():
-        tell(recorder, timed_event, overhead_s)
+        pass_on(recorder, timed_event, overhead_s)
         if on_packet is not None and isinstance(timed_event[2], SentPacket):
             on_packet(timed_event[2])
     return Simulated(
@@ -193,7 +193,7 @@ def simulate(
     )
 
 
-def tell(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:
+def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:
     """Pass an event on to an observer."""
     now, way, event = timed_event
     if isinstance(event, SenderEvent):
@@ -206,12 +206,12 @@ def tell(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.
 class End:
     """One robot's end of the link.
 
-    :param told: events of its sending half that have not been reported yet
+    :param events: events of its sending half that have not been reported yet
     :param src_id: -1 for none
     """
 
     endpoint: Endpoint
-    told: list[SenderEvent]
+    events: list[SenderEvent]
     src_id: int = -1
 
 
@@ -235,10 +235,10 @@ def make_ends(
 
 
 def _end(registry: Registry, halves: Halves, codec: MessageCodec | None, start: Start, seed: int) -> End:
-    told: list[SenderEvent] = []
+    events: list[SenderEvent] = []
     rng = None if halves[0] is None else random.Random(seed)
-    endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=told.append)
-    return End(endpoint, told, robot_of(*halves))
+    endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append)
+    return End(endpoint, events, robot_of(*halves))
 
 
 class Branch:
@@ -325,7 +325,7 @@ class LinkDirection:
         yield from self._let_through(now)
         self._submit(now)
         yield from self._send(now)
-        yield from self._told(now)
+        yield from self._sender_events(now)
         self.due = self._next(now)
 
     def arrive(self, arrival: Arrival, now: float) -> Iterator[TimedEvent]:
@@ -345,13 +345,13 @@ class LinkDirection:
             for packet in self._clock.due(now):
                 self._delayed.append((now + self._delay_s, packet))
         while self._delayed and self._delayed[0][0] <= now:
-            yield from self._land(self._delayed.popleft()[1], now)
+            yield from self._arrive_everywhere(self._delayed.popleft()[1], now)
         if self._clock is not None:
             credits = self._clock.grants(now)
             if self._paced:
                 self.sender.endpoint.credit(credits)
 
-    def _land(self, packet: AirtimeEnded, now: float) -> Iterator[TimedEvent]:
+    def _arrive_everywhere(self, packet: AirtimeEnded, now: float) -> Iterator[TimedEvent]:
         if self.air is None:
             yield now, self, packet
         else:
@@ -377,13 +377,13 @@ class LinkDirection:
             elif self._delay_s:
                 self._delayed.append((now + self._delay_s, packet))
             else:
-                yield from self._told(now)
-                yield from self._land(packet, now)
+                yield from self._sender_events(now)
+                yield from self._arrive_everywhere(packet, now)
 
-    def _told(self, now: float) -> Iterator[TimedEvent]:
-        for event in self.sender.told:
+    def _sender_events(self, now: float) -> Iterator[TimedEvent]:
+        for event in self.sender.events:
             yield now, self, event
-        self.sender.told.clear()
+        self.sender.events.clear()
 
     def _next(self, now: float) -> float:
         """Time at which something may happen next; infinite when all is done, or the time to drain is over."""
@@ -439,19 +439,19 @@ class EventLoop:
             yield from self._expire()
             for way in self._ways:
                 if way.due <= self.now:
-                    yield from self._heard(way.step(self.now))
+                    yield from self._handled(way.step(self.now))
 
     def _timers(self) -> Iterator[float]:
         """When the ends that receive their packets immediately have something to do other than to send."""
-        for ear in self._ears():
-            at = ear.receiver.endpoint.next_timeout()
+        for end in self._receiving_ends():
+            at = end.receiver.endpoint.next_timeout()
             yield inf if at is None or at <= self.now else at
 
     def _expire(self) -> Iterator[TimedEvent]:
-        for ear in self._ears():
-            yield from self._heard((self.now, ear, event) for event in self._overdue(ear.receiver.endpoint))
+        for end in self._receiving_ends():
+            yield from self._handled((self.now, end, event) for event in self._overdue(end.receiver.endpoint))
 
-    def _ears(self) -> Iterator[LinkDirection | Branch]:
+    def _receiving_ends(self) -> Iterator[LinkDirection | Branch]:
         for way in self._ways:
             if way.air is not None:
                 yield way
@@ -461,7 +461,7 @@ class EventLoop:
         at = endpoint.next_timeout()
         return endpoint.handle_timeout(self.now) if at is not None and at <= self.now else []
 
-    def _heard(self, timed_events: Iterable[TimedEvent]) -> Iterator[TimedEvent]:
+    def _handled(self, timed_events: Iterable[TimedEvent]) -> Iterator[TimedEvent]:
         """Pass the events on, and let an end that has received something send."""
         for timed_event in timed_events:
             yield timed_event

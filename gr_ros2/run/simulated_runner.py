@@ -43,8 +43,8 @@ from gr_ros2.run.simulate import (
     TimedEvent,
     make_ends,
     offered,
+    pass_on,
     report_ways,
-    tell,
 )
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def run_simulated(
         for timed_event in _all_events(loop, directions):
             clock.now = timed_event[0]
             number = timed_event[1].number
-            tell(further.at(number) if number else link_observers, timed_event)
+            pass_on(further.at(number) if number else link_observers, timed_event)
             recorded.check()
             further.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
@@ -132,7 +132,7 @@ def run_simulated(
         packets=recorder.ledger.packets(),
         phy=phy_numbers(phys[0], len(ways), recorder),
         wall_s=time.monotonic() - began,
-        incomplete=tuple(run_observers.told()),
+        incomplete=tuple(run_observers.incomplete()),
         counters={**there, **({"back": back[0]} if back else {}), "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}

@@ -45,10 +45,10 @@ class TransformPublisher:
 
     def follow(self, odometry: bytes) -> None:
         """Publish the place of the robot, from its serialized odometry."""
-        said: Any = _STORE.deserialize_cdr(odometry, "nav_msgs/msg/Odometry")
-        pose, header = said.pose.pose, said.header
+        message: Any = _STORE.deserialize_cdr(odometry, "nav_msgs/msg/Odometry")
+        pose, header = message.pose.pose, message.header
         place = _TYPE["geometry_msgs/msg/Vector3"](x=pose.position.x, y=pose.position.y, z=pose.position.z)
-        moving = _transform(header.stamp, header.frame_id, said.child_frame_id, place, pose.orientation)
+        moving = _transform(header.stamp, header.frame_id, message.child_frame_id, place, pose.orientation)
         self._moving.publish(_message([moving]))
 
     def close(self) -> None:

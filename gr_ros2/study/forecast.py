@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -365,6 +365,15 @@ class _Remembering:
 
     def add(self, topic: Topic) -> None:
         self._codec.add(topic)
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        self._codec.learn(type_name, definitions)
+
+    def announcement(self, topic_id: int) -> str:
+        return self._codec.announcement(topic_id)
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:
+        return self._codec.lacks(topic_id, coded)
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         return self._codec.canonical(topic_id, payload)

@@ -124,7 +124,7 @@ def test_nobody_waits_for_those_who_do_not_speak(said: bytes, count: int) -> Non
 
 
 def test_those_who_do_not_speak_are_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gr_ros2.cli.control_socket._SPEAK_S", 0.01)
+    monkeypatch.setattr("gr_ros2.cli.control_socket._REQUEST_S", 0.01)
     with ControlSocket("demo", serve), visit() as client:
         assert client.recv(1) == b""
 

@@ -300,7 +300,7 @@ def test_a_recording_on_a_full_disk_ends_alone(tmp_path: Path, caplog: pytest.Lo
     heard.close()
     heard.close()
     assert heard.failed == 3000
-    assert heard.told() == [f"recording {tmp_path / 'rec.sigmf-data'}: 3000 samples are missing ({FULL})"]
+    assert heard.incomplete() == [f"recording {tmp_path / 'rec.sigmf-data'}: 3000 samples are missing ({FULL})"]
     assert sum(FULL in record.message for record in caplog.records) == 1
     about, samples = read_recording(tmp_path / "rec")
     assert (about.sample_rate, samples.tolist()) == (1e6, ramp.tolist())

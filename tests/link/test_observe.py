@@ -42,7 +42,7 @@ def test_one_that_fails_costs_the_others_nothing() -> None:
         tell(observers)
         assert first.heard == last.heard == whole * 2
         assert bad.heard == whole[:place]
-        assert observers.told() == [f"bad: ended (ValueError: {kind}); {6 - place} events missed"]
+        assert observers.incomplete() == [f"bad: ended (ValueError: {kind}); {6 - place} events missed"]
 
 
 def test_what_one_within_another_missed_is_told_too() -> None:
@@ -54,5 +54,5 @@ def test_what_one_within_another_missed_is_told_too() -> None:
     tell(observers)
     assert late.heard == ["sender", "packet", "message"]
     assert guard.name == name_of(late) == "hears"
-    assert observers.told() == ["deep: ended (ValueError: packet); 5 events missed"]
+    assert observers.incomplete() == ["deep: ended (ValueError: packet); 5 events missed"]
     assert name_of(observers) == "Observers"

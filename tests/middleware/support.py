@@ -31,7 +31,7 @@ def same(received: bytes, sent: bytes, padding: int) -> bool:
 class Peer:
     """A publisher or subscriber in another process: ``ready``, ``matched N``, ``data HEX`` out, hex lines in.
 
-    Ours also says ``counters JSON``.
+    Ours also says ``counters JSON``, and a server ``asked`` for each request.
     """
 
     def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
@@ -39,6 +39,7 @@ class Peer:
         self.received: list[bytes] = []
         self.counters: dict[str, int] = {}
         self.ready = False
+        self.asked = 0
         self._process = subprocess.Popen(
             list(command),
             stdin=subprocess.PIPE,
@@ -62,6 +63,8 @@ class Peer:
                 self.counters = json.loads(rest)
             elif word == "data":
                 self.received.append(bytes.fromhex(rest))
+            elif word == "asked":
+                self.asked += 1
 
     def publish(self, payloads: Iterable[bytes]) -> None:
         assert self._process.stdin is not None

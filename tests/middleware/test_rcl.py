@@ -1,4 +1,4 @@
-"""What rcl is told by its environment, and what becomes of its errors."""
+"""What rcl reads from its environment, and what becomes of its errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import pytest
 
 from gr_ros2.errors import MiddlewareError
-from gr_ros2.middleware.rcl import told, translated
+from gr_ros2.middleware.rcl import ros_localhost_only, translated
 from gr_ros2.setting import Auto
 
 NAME = "ROS_LOCALHOST_ONLY"
@@ -21,7 +21,7 @@ def test_the_environment_says_it_for_a_moment_only(
     monkeypatch.delenv(NAME, raising=False)
     if before is not None:
         monkeypatch.setenv(NAME, before)
-    with pytest.raises(ValueError, match="inside"), told(localhost_only):
+    with pytest.raises(ValueError, match="inside"), ros_localhost_only(localhost_only):
         assert os.environ.get(NAME) == {True: "1", False: "0", "auto": before}[localhost_only]
         raise ValueError("inside")
     assert os.environ.get(NAME) == before

@@ -22,6 +22,7 @@ NEAR, FAR = "/rx_robot_2/add", "/robot_2/add"
 GOAL = bytes(range(16))
 SET = "rcl_interfaces/srv/SetParameters"
 DESCRIBE = "type_description_interfaces/srv/GetTypeDescription"
+QUIET = "/robot_2/quiet/_action/status"
 STRING = "std_msgs/msg/String"
 
 
@@ -45,7 +46,8 @@ def services_of(action: str) -> list[str]:
 def test_auto_offers_services_and_actions_of_the_namespace(
     tmp_path: Path, middleware: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robots = Robots(tmp_path, "", middleware, topics=["auto", "-left_out", "-left_out_action"], packet_loss=0.1)
+    words = ["auto", "-left_out", "-left_out_action", "-quiet/_action/feedback"]
+    robots = Robots(tmp_path, "", middleware, topics=words, packet_loss=0.1)
     with robots.stack:
         near, far = robots.graphs
         for name in ("/elsewhere/add", "/robot_2/left_out", "/robot_2/_hidden"):
@@ -53,12 +55,17 @@ def test_auto_offers_services_and_actions_of_the_namespace(
         for name, kind in (("set_parameters", SET), ("get_type_description", DESCRIBE)):
             far.serve(f"/robot_2/planner/{name}", kind, lambda *_: None)
         FibonacciServer(far, "/robot_2/left_out_action")
-        FibonacciServer(far, "/robot_2/count")
+        for name in ("/robot_2/count", "/robot_2/quiet"):
+            FibonacciServer(far, name)
         client, caller = FibonacciClient(near, "/rx_robot_2/count"), Caller(near, NEAR)
         adder = Adder(far, FAR)
         wait_for(lambda: caller.there and client.there, "service and action to appear")
-        wait_for(lambda: offered(robots, 2) == sorted([FAR, *services_of("/robot_2/count")]), "what is offered")
-        wait_for(lambda: reached(robots, 1) == sorted([NEAR, *services_of("/rx_robot_2/count")]), "what is reached")
+        for prefix, found, number in (("/robot_2", offered, 2), ("/rx_robot_2", reached, 1)):
+            wanted = sorted(
+                [f"{prefix}/add", *services_of(f"{prefix}/count"), *services_of(f"{prefix}/quiet")],
+            )
+            wait_for(lambda: found(robots, number) == wanted, "all services")  # noqa: B023 - called at once
+        assert {name for name in robots.links[2].source.subscribed if "quiet" in name} == {QUIET}
         caller.call(1)
         wait_for(lambda: caller.got == {1: [1001]}, "the reply")
         client.ask("send_goal", GOAL, struct.pack("<i", 40))
@@ -69,7 +76,7 @@ def test_auto_offers_services_and_actions_of_the_namespace(
         assert client.replies["get_result"][4] == CANCELED
         said = Waiting(robots.links[2].source).look()
         assert said is not None
-        assert said.endswith("; services and actions: /robot_2/add, /robot_2/count")
+        assert said.endswith("; services and actions: /robot_2/add, /robot_2/count, /robot_2/quiet")
         assert "_action" not in said
         adder.server.close()
         wait_for(lambda: not caller.there, "the service to vanish")

@@ -37,7 +37,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController, Rung
-from gr_ros2.link.stats import ReceiverStats, SenderStats
+from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
@@ -120,17 +120,24 @@ class Endpoint:
         self.keys = keys if keys is not None else Keys()
         self.received = ReceiverStats()
         """What arrived and what did not."""
+        self.answers = bool(topics) or settings.hears
+        """Whether what it receives can change what it sends."""
+        self.urged = False
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
         self._observer = observer
         self._decoder_for = decoder_for
         self._rows = rows
         self._marks: dict[int, dict[int, int]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
-        sealed, addressed = self.keys.sealed, settings.dst_id != BROADCAST
-        self._room = body_room(settings.packet_len, sealed=sealed, addressed=addressed)
+        self._sealed, self._encrypts = self.keys.sealed, self.keys.encrypts
+        addressed = settings.dst_id != BROADCAST
+        self._room = body_room(settings.packet_len, sealed=self._sealed, addressed=addressed)
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
         """Number of bytes to which the packet with its padded body extends."""
         self._trailer = self.keys.own(settings.src_id, boot)
-        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
+        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=observer)
+        self.sent = self.outbox.stats
+        """What left and what did not."""
         self.window = RepairWindow(
             "idle" if settings.repair == AUTO else settings.repair, self._room, settings.expected_loss
         )
@@ -157,16 +164,6 @@ class Endpoint:
     # ---- sending
 
     @property
-    def answers(self) -> bool:
-        """Whether what it receives can change what it sends."""
-        return bool(self.topics) or self.settings.hears
-
-    @property
-    def sent(self) -> SenderStats:
-        """What left and what did not."""
-        return self.outbox.stats
-
-    @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
         mending = self._mode() != "off" and self.window.unconfirmed(self._now)
@@ -177,7 +174,7 @@ class Endpoint:
 
         :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline
         """
-        if self.topics is None or not 0 <= topic_id < len(self.topics):
+        if not self.outbox.sends(topic_id):
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._now = max(self._now, now)
         self._hold.submitted(topic_id, now)
@@ -199,18 +196,29 @@ class Endpoint:
             for topic in topics:
                 self._codec.add(topic)
         self.topics = together
+        self.answers = True
         self.outbox.add(topics)
         self._talk.hurry(self._now)
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
         return together
 
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one are told."""
+        if self._codec is None:
+            return
+        self._codec.learn(type_name, definitions)
+        if self.outbox.recoded() and self._started:
+            self.outbox.ask(TABLE_TOPIC, self._now)
+            self._talk.hurry(self._now)
+
     def missed(self, topic_id: int, total: int) -> None:
         """Count how many messages of a topic the ROS graph has lost so far, before they could be submitted."""
         new = total - self.sent.missed[topic_id]
         if new > 0:
             self.sent.missed[topic_id] = total
-            self._tell(Missed(topic_id, new))
+            if self._observer is not None:
+                self._observer(Missed(topic_id, new))
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """Policy and deadline (s, 0 for none) of a topic's queue."""
@@ -273,7 +281,7 @@ class Endpoint:
     def next_packet(self, now: float) -> bytes | None:
         """The next packet that may go at ``now``, or None."""
         self._now = max(self._now, now)
-        if not self._pace.may_leave(now) or not self.answers:
+        if not self.answers or not self._pace.may_leave(now):
             return None
         data = self._compose(now)
         if data is None:
@@ -349,10 +357,10 @@ class Endpoint:
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
         return min(times, default=None)
 
-    def next_departure(self) -> float | None:
-        """When ``next_packet`` may have something, if no other method is called before."""
+    def next_departure(self, *, credited: bool = False) -> float | None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         now = self._now
-        if self.out_of_credit or not self.answers:
+        if (self.out_of_credit and not credited) or not self.answers:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
@@ -363,7 +371,7 @@ class Endpoint:
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self._mode() != "off" and self.window.unconfirmed(now):
+        if min(leaving) > now and self._mode() != "off" and self.window.unconfirmed(now):
             poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
             doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
@@ -372,6 +380,7 @@ class Endpoint:
     # ---- what leaves
 
     def _compose(self, now: float) -> bytes | None:
+        self.urged = False
         if not self._started:
             self._start(now)
         outbox, talk = self.outbox, self._talk
@@ -381,7 +390,8 @@ class Endpoint:
             self._repeat_at = now + self.settings.repeat_s
             if not self.window.reported:
                 outbox.announce(now)
-        outbox.expire(now, self.interval)
+        if outbox.deadlines:
+            outbox.expire(now, self.interval)
         due: Sequence[Neighbour] = ()
         if self.settings.hears:
             due = [n for n in self.neighbours if n.inbox.unreported and n.inbox.report_due(now) <= now]
@@ -412,7 +422,7 @@ class Endpoint:
 
     def _new(self, filling: Filling, due: Sequence[Neighbour], now: float) -> bytes:
         """A source packet, with a report where there is room for one."""
-        entries: list[Entry] = list(filling.parts)
+        entries = filling.parts
         free = self._room - filling.used
         for neighbour in due:
             if free >= neighbour.inbox.report_len:
@@ -421,7 +431,7 @@ class Endpoint:
                 self._unheard = 0
             else:
                 self._unheard += 1
-        return self._source(entries, filling.lives, filling.qos, tuple(filling.sent), now)
+        return self._source(entries, filling.lives, filling.qos, filling.sent, now)
 
     def _source(
         self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentEntry, ...], now: float
@@ -434,7 +444,7 @@ class Endpoint:
         self.window.sent(number, body, data, lives, now)
         if lives:
             self._hold.left(now, self.window.loss)
-        return self._leave(data, Packet(header, tuple(entries), encrypted=self.keys.encrypts), "new", now, parts)
+        return self._leave(data, Packet(header, tuple(entries), encrypted=self._encrypts), "new", now, parts)
 
     def _standing(
         self, standing: Standing, number: int, body: bytes, entries: Sequence[Entry], *, kind: AirKind, now: float
@@ -443,7 +453,7 @@ class Endpoint:
         clear = write_header(header) + write_standing(standing)
         body = self._padded(body, clear)
         data = self._trailer.close(clear, body, number, standing.row, plain=standing.clear)
-        encrypted = self.keys.encrypts and not standing.clear
+        encrypted = self._encrypts and not standing.clear
         combined = body if standing.mask else b""
         return self._leave(data, Packet(header, tuple(entries), standing, combined, encrypted), kind, now)
 
@@ -468,7 +478,7 @@ class Endpoint:
             return self._standing(Standing(row, mask, oldest), number, combined, (), kind="repair", now=now)
         header = read_header(chosen.data, self.settings.packet_len)
         entries = tuple(read_body(chosen.body, self._room))
-        return self._leave(chosen.data, Packet(header, entries, encrypted=self.keys.encrypts), "repair", now)
+        return self._leave(chosen.data, Packet(header, entries, encrypted=self._encrypts), "repair", now)
 
     def _held(self, now: float) -> bool:
         """Whether a repair that could leave now waits for a new message."""
@@ -478,7 +488,7 @@ class Endpoint:
 
     def _hello(self, now: float) -> bytes:
         quiet = self.window.newest == self._hello_number and not self.window.reported
-        if quiet and self.keys.sealed:
+        if quiet and self._sealed:
             self._hello_number = -1
             return self._source(
                 [], (), 0, (), now
@@ -514,7 +524,8 @@ class Endpoint:
         stats.packets += 1
         if self._rate is not None:
             self._choose_rung(kind, now)
-        self._tell(SentPacket(data, packet, parts, now, kind, self.rung))
+        if self._observer is not None:
+            self._observer(SentPacket(data, packet, parts, now, kind, self.rung))
         return data
 
     def _choose_rung(self, kind: AirKind, now: float) -> None:
@@ -529,7 +540,7 @@ class Endpoint:
     def _header(self, qos: int, number: int) -> Header:
         settings = self.settings
         hop = settings.hop if settings.dst_id != BROADCAST else 0
-        return Header(qos, self.keys.sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
+        return Header(qos, self._sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
 
     def _mode(self) -> RepairMode:
         mode = self.settings.repair
@@ -565,9 +576,9 @@ class Endpoint:
         if header.dst_id not in (BROADCAST, self.settings.src_id) and self.settings.src_id != NOBODY:
             self.received.dropped["not_for_us"] += 1
             return None
-        if header.sealed and not self.keys.sealed:
+        if header.sealed and not self._sealed:
             raise NoKeyError(f"a sealed packet of robot {header.src_id}, and no key is configured here")
-        if self.keys.sealed and not header.sealed:
+        if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         opened = self.neighbours.open(data, header, now)
         if opened is None:
@@ -577,11 +588,13 @@ class Endpoint:
     def _use(self, data: bytes, opened: Opened, now: float) -> None:
         self.received.packets += 1
         neighbour, number, standing = opened.neighbour, opened.number, opened.standing
+        control = standing is not None and not standing.mask
+        self.urged = self.urged or control or self._talk.lacking
         if opened.met:
             self._meet(opened, now)
         inbox = neighbour.inbox
         self._sender = neighbour
-        room = body_room(self.settings.packet_len, sealed=self.keys.sealed, addressed=opened.header.dst_id != BROADCAST)
+        room = body_room(self.settings.packet_len, sealed=self._sealed, addressed=opened.header.dst_id != BROADCAST)
         encrypted = neighbour.encrypts and not (standing is not None and standing.clear)
         if standing is None:
             entries = read_body(opened.body, room)
@@ -667,7 +680,3 @@ class Endpoint:
             elif isinstance(event, Lost):
                 stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
                 stats.message_loss_est += 1
-
-    def _tell(self, event: SenderEvent) -> None:
-        if self._observer is not None:
-            self._observer(event)

@@ -152,6 +152,9 @@ class Hold:
     def _next(self, now: float) -> tuple[float, float]:
         """When the next message is due, and until when it is waited for."""
         if self._soonest is None or self._soonest[1] <= now:
-            times = [(due, due + period.late) for period in self._periods.values() if (due := period.due) < inf]
-            self._soonest = min((time for time in times if time[1] > now), default=(inf, inf))
+            self._soonest = (inf, inf)
+            for period in self._periods.values():
+                due = period.due
+                if due < self._soonest[0] and due + period.late > now:
+                    self._soonest = (due, due + period.late)
         return self._soonest

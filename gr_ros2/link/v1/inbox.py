@@ -54,7 +54,7 @@ _SQUARE_SMOOTHING = 0.125
 _SNR_CHANGE_DB = 1.5
 """Change of the SNR that is reported at once."""
 _WAITING = 256
-"""Number of messages of unknown topics that are kept until the table arrives."""
+"""Number of messages of unknown topics, or coded in an unknown way, that are kept until the table arrives."""
 
 
 @dataclass(slots=True)
@@ -139,7 +139,8 @@ class Inbox:
         """CRC-32 of the newest message of each latched topic, in the form in which it was transmitted."""
         self._events: Events = []
         self._now = 0.0
-        self._unreported = 0
+        self.unreported = 0
+        """Packets since the last report."""
         self._missed = False
         """Whether a packet went missing since the last report."""
         self._reported_at = 0.0
@@ -160,7 +161,7 @@ class Inbox:
         :param body: as it stood in the packet, padding included
         :param entries: the entries of the packet
         """
-        self._unreported += 1
+        self.unreported += 1
         if number in self.decoder:
             self.counts["duplicate"] += 1
             self._stats.dropped["duplicate"] += 1
@@ -185,7 +186,7 @@ class Inbox:
 
     def repair(self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float) -> Events:
         """Take a repair."""
-        self._unreported += 1
+        self.unreported += 1
         self._advance(number, now, here=False)
         window = mask.bit_length()
         if oldest and number - window + 1 > self._dead:
@@ -230,7 +231,7 @@ class Inbox:
         for waiting in [ready for line in self._ready.values() for ready in line]:
             self._events.append(Lost(self.src_id, waiting.topic_id, reason, self._key(waiting.order)))
         for waiting in self._unknown:
-            self._events.append(Lost(self.src_id, waiting.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(waiting.order)))
+            self._never_known(waiting)
         self._ready.clear()
         self._unknown.clear()
         return self._given()
@@ -245,20 +246,20 @@ class Inbox:
         half = self._settings.half_duplex
         every = self._settings.report_every * (4 if half else 1)
         most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
-        if ((self._missed or self._snr_changed) and not half) or self._unreported >= most:
+        if ((self._missed or self._snr_changed) and not half) or self.unreported >= most:
             return now
         return self._reported_at + self._pause
 
     @property
     def report_helps(self) -> bool:
         """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
-        return self._unreported > 0 and self.loss >= PROMPT and not self._settings.half_duplex
+        return self.unreported > 0 and self.loss >= PROMPT and not self._settings.half_duplex
 
     def report(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
         calm = not self._missed and self.loss < _CALM and self.counts["packets"] > MAP
         self._pause = min(self._pause * _SLOWER, _CALM_S) if calm else _REPORT_S
-        self._unreported = 0
+        self.unreported = 0
         self._missed = False
         self._reported_at = now
         decoder = self.decoder
@@ -297,11 +298,6 @@ class Inbox:
         self._square += _SQUARE_SMOOTHING * (new * new - self._square)
         share = min(max(1 - _SNR_ERROR / max(self._square, _SNR_ERROR), _LEAST_SHARE), _MOST_SHARE)
         self.snr_db += share * new
-
-    @property
-    def unreported(self) -> int:
-        """Packets since the last report."""
-        return self._unreported
 
     @property
     def held(self) -> int:
@@ -377,17 +373,26 @@ class Inbox:
             self._table(ready.payload)
             return
         row = self.rows.get(ready.topic_id)
-        if row is None:
+        if row is None or self._awaits_table(ready):
             self._unknown.append(ready)
             self._waiting += len(ready.payload)
             while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
                 lost = self._unknown.popleft()
                 self._waiting -= len(lost.payload)
-                self._events.append(Lost(self.src_id, lost.topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(lost.order)))
+                self._never_known(lost)
         elif row.reliable and ready.order[0] > self._low:
             self._ready.setdefault(ready.topic_id, []).append(ready)
         else:
             self._deliver(ready, row)
+
+    def _awaits_table(self, ready: _Ready) -> bool:
+        """Whether a message cannot be decoded before a newer table is here."""
+        return ready.coded and self._codec is not None and self._codec.lacks(ready.topic_id, ready.payload)
+
+    def _never_known(self, ready: _Ready) -> None:
+        """A message is given up for which the table did not arrive."""
+        reason = LedgerRow.UNKNOWN_DICTIONARY if ready.topic_id in self.rows else LedgerRow.UNKNOWN_TOPIC
+        self._events.append(Lost(self.src_id, ready.topic_id, reason, self._key(ready.order)))
 
     def _settle(self) -> None:
         """Find up to which packet everything is here or given up, and deliver the messages that waited for that."""

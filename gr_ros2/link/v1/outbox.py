@@ -18,8 +18,8 @@ ends in being sent or in a Refused with its row.
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 from math import inf
@@ -39,10 +39,10 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import AUTO
-from gr_ros2.wire import QOS_BULK, QOS_NAMES
+from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
-from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
 
 SHARE = 3
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -87,12 +87,39 @@ class _Kept:
     """Time in s from which on hellos name it."""
 
 
+@dataclass(slots=True, eq=False)
+class _Line:
+    """One topic, or the table of topics.
+
+    :param qos: QoS class of its messages
+    :param kept: whether its newest messages are kept for robots that join late
+    :param depth: of its publishers' history, 0 for unbounded or unknown
+    :param ordered: whether all its publishers are reliable
+    :param hidden: whether the table leaves it out: a service whose server is not there
+    :param newest: when the newest of its messages that have left was submitted, s
+    :param lives: lifetimes of its messages that have left, the packets of each, and when it left in s
+    :param packets: the packets of all of them
+    """
+
+    topic: Topic
+    queue: TopicQueue
+    qos: int
+    weight: float
+    kept: bool
+    hidden: bool = False
+    depth: int = 0
+    ordered: bool = True
+    newest: float = -inf
+    lives: deque[tuple[Life, int, float]] = field(default_factory=deque)
+    packets: int = 0
+
+
 @dataclass(slots=True)
 class Filling:
     """The content of a source packet."""
 
-    parts: list[Part]
-    sent: list[SentEntry]
+    parts: list[Entry]
+    sent: tuple[SentEntry, ...]
     lives: tuple[Life, ...]
     qos: int
     used: int
@@ -114,25 +141,17 @@ class Outbox:
         boot: int,
         room: int,
         codec: MessageCodec | None,
-        observer: Observer,
+        observer: Observer | None,
     ) -> None:
         self._settings = settings
-        self._topics: dict[int, Topic] = {}
         self._boot = boot
         self._room = room
         self._codec = codec
-        self._observe = observer
-        self._queues: dict[int, TopicQueue] = {}
-        self._depths: dict[int, int] = {}
-        self._latched: dict[int, bool] = {}
-        """Whether the publishers of a topic keep messages for late joiners."""
-        self._lives: dict[int, deque[tuple[Life, int, float]]] = {TABLE_TOPIC: deque()}
-        self._packets_of: Counter[int] = Counter()
-        """Lifetimes that packets refer to, by topic."""
+        self._observer = observer
+        self._lines: dict[int, _Line] = {}
         self._kept: dict[int, deque[_Kept]] = {}
         self._open: dict[int, Sequence[Outgoing]] = {}
         """Messages that may continue or start now, by topic."""
-        self._newest: dict[int, float] = {}
         self._turns = Turns()
         self._holder = -1
         self._serial = 0
@@ -140,10 +159,8 @@ class Outbox:
         self._starting_until = inf
         self.reported = False
         """Whether receivers report, so that it is known when a message is over."""
-        self._with_deadline: list[TopicQueue] = []
-        self._ordered: dict[int, bool] = {}
-        self._hidden: set[int] = set()
-        """Topics that the table leaves out: services whose server is not there."""
+        self.deadlines: list[TopicQueue] = []
+        """The queues whose messages may be too late."""
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
@@ -152,88 +169,95 @@ class Outbox:
     def add(self, topics: Sequence[Topic]) -> None:
         """Send and announce these topics too."""
         for topic in topics:
-            self._topics[topic.topic_id] = topic
-            self._queues[topic.topic_id] = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
-            self._lives[topic.topic_id] = deque()
-        self._hidden |= {topic.topic_id for topic in topics if not topic.is_topic}
-        if TABLE_TOPIC not in self._queues:
-            self._queues[TABLE_TOPIC] = TopicQueue("latest")
-        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+            queue = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
+            self._lines[topic.topic_id] = _line(topic, queue)
+        if TABLE_TOPIC not in self._lines:
+            self._lines[TABLE_TOPIC] = _line(Topic(TABLE_TOPIC, "", ""), TopicQueue("latest"))
+        self._find_deadlines()
         self._tabulate()
+
+    def recoded(self) -> bool:
+        """Announce how topics are coded now.
+
+        :return: whether the table of topics has changed
+        """
+        before = self.digest
+        self._tabulate()
+        return self.digest != before
 
     def offer(self, topic_id: int, *, offered: bool) -> bool:
         """Announce a service, or no longer.
 
         :return: whether the table of topics has changed
         """
-        if offered:
-            self._hidden.discard(topic_id)
-        else:
-            self._hidden.add(topic_id)
+        self._lines[topic_id].hidden = not offered
         before = self.digest
         self._tabulate()
         return self.digest != before
+
+    def sends(self, topic_id: int) -> bool:
+        """Whether this is a topic that it may send."""
+        return topic_id in self._lines and topic_id != TABLE_TOPIC
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
         """Take a message. It may be refused, or cause other messages of its topic to be dropped.
 
         :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
         """
-        topic = self._topics[topic_id]
+        line = self._lines[topic_id]
         serial = self._serial
         self._serial += 1
         self.stats.submitted[topic_id] += 1
         codec = self._codec
-        self._observe(
-            Accepted(serial, topic_id, payload, now, None if codec is None else codec.canonical(topic_id, payload))
-        )
+        if self._observer is not None:
+            expected = None if codec is None else codec.canonical(topic_id, payload)
+            self._observer(Accepted(serial, topic_id, payload, now, expected))
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
-        if self._is_latched(topic):
-            kept = self._kept.setdefault(topic_id, deque(maxlen=max(self._depths.get(topic_id, 1), 1)))
+        if line.kept:
+            kept = self._kept.setdefault(topic_id, deque(maxlen=max(line.depth, 1)))
             kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
-        qos = QOS_NAMES.index(topic.options.qos)
-        weight = topic.options.weight
         self._admit(
-            Message(serial, topic_id, payload, qos, now, weight, coded=codec is not None, lifespan_s=lifespan_s)
+            line,
+            Message(serial, topic_id, payload, line.qos, now, line.weight, lifespan_s, coded=codec is not None),
         )
 
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
         self._starting_until = min(self._starting_until, now + STARTING_S)
-        queue = self._queues.get(topic_id)
-        if queue is None or any(message.repeat for message in queue):
+        line = self._lines.get(topic_id)
+        if line is None or any(message.repeat for message in line.queue):
             return
         for kept in self._kept.get(topic_id, ()):
             if topic_id == TABLE_TOPIC:
                 # Nothing is delivered without the table. A long table does not delay urgent messages.
                 qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
-                queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
+                line.queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
             else:
-                weight = self._topics[topic_id].options.weight
                 again = Message(
-                    kept.serial, topic_id, kept.payload, QOS_BULK, now, weight, repeat=True, coded=kept.coded
+                    kept.serial, topic_id, kept.payload, QOS_BULK, now, line.weight, repeat=True, coded=kept.coded
                 )
-                self._admit(again)
+                self._admit(line, again)
             self.stats.repeats += 1
 
     def announce(self, now: float) -> None:
         """Send all kept messages, for robots that cannot ask."""
         for topic_id in self._kept:
-            if not self._queues[topic_id]:
+            if not self._lines[topic_id].queue:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the kept messages."""
+        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic.
+
+        A receiver remembers no other of a topic. If hellos named older ones too, it would ask for them for ever.
+        """
         return [
-            (topic_id, kept.mark)
+            (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC
-            for kept in messages
-            if now >= kept.named
+            if topic_id != TABLE_TOPIC and now >= messages[-1].named
         ]
 
     def follow(
@@ -243,19 +267,19 @@ class Outbox:
 
         :return: whether the table of topics has changed
         """
-        queue = self._queues[topic_id]
-        self._depths[topic_id] = depth
-        self._latched[topic_id] = latched
-        self._ordered[topic_id] = reliable
-        queue.change(*queue_for(self._topics[topic_id].options, depth, lifespan_s, period_s))
-        self._with_deadline = [queue for queue in self._queues.values() if queue.deadline_s]
+        line = self._lines[topic_id]
+        topic = line.topic
+        line.depth, line.ordered = depth, reliable
+        line.kept = topic.latched or (latched and topic.options.durability == AUTO)
+        line.queue.change(*queue_for(topic.options, depth, lifespan_s, period_s))
+        self._find_deadlines()
         before = self.digest
         self._tabulate()
         return self.digest != before
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """Policy and deadline (s, 0 for none) of a topic's queue."""
-        queue = self._queues[topic_id]
+        queue = self._lines[topic_id].queue
         return queue.policy, queue.deadline_s
 
     def reconfigure(self, settings: Settings) -> None:
@@ -264,7 +288,7 @@ class Outbox:
 
     def expire(self, now: float, interval: float) -> None:
         """Drop messages that would arrive too late."""
-        for queue in self._with_deadline:
+        for queue in self.deadlines:
             if queue:
                 self._drop(list(queue.expire(now, interval, LEAD_S, self._room - _ENTRY)))
 
@@ -275,9 +299,9 @@ class Outbox:
         :param room: bytes that its body may have
         :return: None if nothing may be sent
         """
-        if self.idle:
-            return None
         heap = self._heap(now)
+        if not heap:
+            return None
         picks: list[tuple[Message, int]] = []
         used = 0
         while heap and used < room:
@@ -285,12 +309,13 @@ class Outbox:
             queue = self._open[topic_id]
             message = queue[position]
             assert isinstance(message, Message)
-            taken, size = fit(room - used, message.remaining, number - message.begin, message.offset)
-            if taken < 0 or not (taken == message.remaining or self._may_cut(message, taken, used, room)):
+            remaining = message.remaining
+            taken, size = fit(room - used, remaining, number - message.begin, message.offset)
+            if taken < 0 or not (taken == remaining or self._may_cut(message, taken, used, room)):
                 continue
             picks.append((message, taken))
             used += size
-            if taken == message.remaining and position + 1 < len(queue):
+            if taken == remaining and position + 1 < len(queue):
                 following = queue[position + 1]
                 worth = value(following, message.submitted, _ENTRY)
                 heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
@@ -298,7 +323,7 @@ class Outbox:
             return None
         wait = self._settings.flush_timeout_s
         if wait and room - used >= self._settings.min_fragment + _ENTRY:
-            since = min(min(message.submitted, self._queues[message.topic_id].since) for message, _ in picks)
+            since = min(min(message.submitted, self._lines[message.topic_id].queue.since) for message, _ in picks)
             if now < since + wait:
                 return None
         return self._take(picks, number, used, now)
@@ -306,79 +331,88 @@ class Outbox:
     def next_timeout(self, now: float) -> float | None:
         """When ``fill`` may have something; None if nothing waits."""
         times = [
-            max(queue.opens(now) if queue.opens(now) < inf else now, self._flush(queue, now))
-            for queue in self._queues.values()
-            if queue
+            max(opens if (opens := line.queue.opens(now)) < inf else now, self._flush(line.queue, now))
+            for line in self._lines.values()
+            if line.queue
         ]
         return min(times) if times else None
 
     @property
     def urgent(self) -> bool:
         """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
-        return any(queue and queue[0].qos == 1 for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC)
+        return any(line.queue and line.queue[0].qos == QOS_LATENCY for line in self._sending())
 
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        return not any(self._queues.values())
+        return not any(line.queue for line in self._lines.values())
 
     def queued(self) -> dict[int, int]:
         """Messages that wait or are partly sent, per topic id."""
-        return {topic_id: len(queue) for topic_id, queue in self._queues.items() if topic_id != TABLE_TOPIC}
+        return {line.topic.topic_id: len(line.queue) for line in self._sending()}
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
-        return self._queues[topic_id].room(self.depth(topic_id))
+        line = self._lines[topic_id]
+        return line.queue.room(self._queue_depth(line))
 
     def _tabulate(self) -> None:
         """Make the table of topics."""
         rows = []
-        for topic in self._topics.values():
-            if topic.topic_id in self._hidden:
+        for line in self._sending():
+            if line.hidden:
                 continue
-            options = topic.options
-            reliable = options.reliability
-            ordered = self._ordered.get(topic.topic_id, True) if reliable == AUTO else reliable == "reliable"
-            ordered = ordered and self._queues[topic.topic_id].policy != "latest"
-            depth = self._depths.get(topic.topic_id, 0) if options.depth == AUTO else options.depth
-            codec = "" if self._codec is None else options.codec
-            qos = QOS_NAMES.index(options.qos)
-            name, kind, latched = topic.name, topic.type_name, self._is_latched(topic)
-            rows.append(TableRow(topic.topic_id, name, kind, qos, ordered, latched, min(depth, 255), codec))
+            topic, options = line.topic, line.topic.options
+            ordered = line.ordered if options.reliability == AUTO else options.reliability == "reliable"
+            ordered = ordered and line.queue.policy != "latest"
+            depth = min(line.depth if options.depth == AUTO else options.depth, 255)
+            codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
+            rows.append(
+                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec)
+            )
         if not rows and not self.digest:
             return
         table = write_table(rows)
         self.digest = crc32(table)
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
 
-    def _is_latched(self, topic: Topic) -> bool:
-        """Whether late joiners get the newest messages: as configured, by ROS convention, or as its publishers say."""
-        learned = topic.options.durability == AUTO and self._latched.get(topic.topic_id, False)
-        return learned or topic.latched
+    def _sending(self) -> Iterator[_Line]:
+        """All topics, without the table of topics."""
+        return (line for topic_id, line in self._lines.items() if topic_id != TABLE_TOPIC)
+
+    def _find_deadlines(self) -> None:
+        self.deadlines = [line.queue for line in self._lines.values() if line.queue.deadline_s]
 
     def _flush(self, queue: TopicQueue, now: float) -> float:
         return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
-        depth = self._topics[topic_id].options.queue_depth
+        return self._queue_depth(self._lines[topic_id])
+
+    def _queue_depth(self, line: _Line) -> int:
+        depth = line.topic.options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
-    def _admit(self, message: Message) -> None:
-        self._drop(self._queues[message.topic_id].admit(message, self.depth(message.topic_id)))
+    def _admit(self, line: _Line, message: Message) -> None:
+        if dropped := line.queue.admit(message, self._queue_depth(line)):
+            self._drop(dropped)
 
     def _heap(self, now: float) -> list[tuple[int, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
-        self._open = {topic_id: queue.open(now) for topic_id, queue in self._queues.items() if queue}
-        heap = []
-        for topic_id, queue in self._open.items():
-            if queue:
-                head = queue[0]
-                before = self._newest.get(topic_id, head.submitted - FIRST_AGE_S)
-                heap.append((RANK[head.qos], -value(head, before, _ENTRY), topic_id, 0))
-        holder = self._holder = self._turns.holder([item[2] for item in heap]) if heap else -1
-        if holder >= 0:
-            heap = [(-1, item[1], holder, 0) if item[2] == holder and item[0] else item for item in heap]
+        self._open = {}
+        for topic_id, line in self._lines.items():
+            if line.queue and (ready := line.queue.open(now)):
+                self._open[topic_id] = ready
+        heap: list[tuple[int, float, int, int]] = []
+        if not self._open:
+            return heap
+        holder = self._holder = self._turns.holder(self._open)
+        for topic_id, ready in self._open.items():
+            head, before = ready[0], self._lines[topic_id].newest
+            worth = value(head, before if before > -inf else head.submitted - FIRST_AGE_S, _ENTRY)
+            rank = RANK[head.qos]
+            heap.append((-1 if rank and topic_id == holder else rank, -worth, topic_id, 0))
         heapify(heap)
         return heap
 
@@ -391,76 +425,80 @@ class Outbox:
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
-        parts: list[Part] = []
+        parts: list[Entry] = []
         sent: list[SentEntry] = []
-        lives: dict[Life, None] = {}
-        qos = picks[0][0].qos
+        lives: list[Life] = []
+        stats, qos = self.stats, picks[0][0].qos
         for place, (message, taken) in enumerate(picks):
             topic_id, offset = message.topic_id, message.offset
-            queue = self._queues[topic_id]
+            line = self._lines[topic_id]
             if not message.index:
                 message.begin, message.place = number, place
                 message.life.expires = message.expires
-                queue.started(now)
+                line.queue.started(now)
             payload = message.take(taken)
-            last = not message.remaining
-            begin = message.begin
+            last, begin = message.offset == len(message.payload), message.begin
             parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
             key = Key(self._boot, begin, message.place)
             total = message.index if last else 0
             sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
-            lives[message.life] = None
-            qos = min(qos, message.qos, key=RANK.__getitem__)
-            self.stats.payload_bytes += taken
+            lives.append(message.life)
+            if RANK[message.qos] < RANK[qos]:
+                qos = message.qos
+            stats.payload_bytes += taken
             if last:
-                queue.popleft()
-                self._left(message, queue, now)
+                line.queue.popleft()
+                self._left(message, line, now)
         self._turns.sent(self._holder)
-        self.stats.entries += len(picks)
-        return Filling(parts, sent, tuple(lives), qos, used)
+        stats.entries += len(picks)
+        return Filling(parts, tuple(sent), tuple(lives), qos, used)
 
-    def _left(self, message: Message, queue: TopicQueue, now: float) -> None:
+    def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""
-        topic_id = message.topic_id
-        self._newest[topic_id] = max(message.submitted, self._newest.get(topic_id, 0.0))
+        topic_id, life = message.topic_id, message.life
+        line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
-        lives = self._lives[topic_id]
+        lives = line.lives
         most, least_s = self._settings.depth, 0.0
-        if queue.policy == "latest":
+        if line.queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = self._depths.get(topic_id, 0)
-            if not most:
-                most, least_s = REPORTED_DEPTH, self._settings.hold_s
+            most, least_s = (line.depth, 0.0) if line.depth else (REPORTED_DEPTH, self._settings.hold_s)
         elif lives:
             before, _, _ = lives[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((message.life, message.index, now))
-        self._packets_of[topic_id] += message.index
+        lives.append((life, message.index, now))
+        line.packets += message.index
         while len(lives) > 1 and (
-            (len(lives) > most and now - lives[0][2] >= least_s)
-            or (self._packets_of[topic_id] > GROUP and not self.reported)
+            (len(lives) > most and now - lives[0][2] >= least_s) or (line.packets > GROUP and not self.reported)
         ):
-            life, count, _ = lives.popleft()
-            life.over = True
-            self._packets_of[topic_id] -= count
-        for kept in self._kept.get(topic_id, ()):
+            replaced, count, _ = lives.popleft()
+            replaced.end()
+            line.packets -= count
+        if topic_id not in self._kept:
+            return
+        for kept in self._kept[topic_id]:
             if kept.payload is message.payload and kept.named == inf:
                 kept.named = now + SETTLING_S
-        if topic_id == TABLE_TOPIC and not self.reported:
+        if not self.reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
-            message.life.expires = self._starting_until
-        elif topic_id in self._kept and not self.reported:
-            message.life.expires = min(message.life.expires, now + 2 * (now - message.submitted) + 2.0)
+            table, waited = topic_id == TABLE_TOPIC, now - message.submitted
+            life.expires = self._starting_until if table else min(life.expires, now + 2 * waited + 2.0)
 
     def _drop(self, dropped: list[Dropped]) -> None:
         for item in dropped:
             item.message.index = max(item.message.index, 1)
             if isinstance(item.message, Message):
-                item.message.life.over = True
+                item.message.life.end()
             if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
 
     def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
-        self._observe(Refused(serial, topic_id, reason, detail))
+        if self._observer is not None:
+            self._observer(Refused(serial, topic_id, reason, detail))
+
+
+def _line(topic: Topic, queue: TopicQueue) -> _Line:
+    options = topic.options
+    return _Line(topic, queue, QOS_NAMES.index(options.qos), options.weight, topic.latched, not topic.is_topic)

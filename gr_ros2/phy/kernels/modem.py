@@ -179,20 +179,21 @@ class CompiledModem(BurstModem):
         return self._reference.peak_samples
 
     def modulate(self, packet: bytes) -> Samples:
-        return self.modulate_all([packet], 0)
+        out = np.empty(self.samples_of(len(packet)), np.complex64)
+        self.modulate_into([packet], 0, out)
+        return out
 
-    def modulate_all(self, packets: Sequence[bytes], gap: int) -> Samples:
+    def modulate_into(self, packets: Sequence[bytes], gap: int, out: Samples) -> None:
         frames = self.frames
-        data = [frames.of(len(one)).wrap(one).tobytes() for one in packets] if not frames.plain else packets
+        data = packets if frames.plain else [frames.of(len(one)).wrap(one).tobytes() for one in packets]
         lengths = [len(packet) for packet in packets]
         sizes = np.array([self._samples_of(length) + gap for length in lengths], np.int64)
         numbers = np.array((lengths, [len(one) for one in data]), np.int32)
-        out = np.empty(int(sizes.sum()), np.complex64)
+        assert len(out) >= sizes.sum()
         arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
         batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(_address, arrays))
-        if _checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
-            return out
-        return self._reference.modulate_all(packets, gap)
+        if not _checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
+            self._reference.modulate_into(packets, gap, out)
 
     def receiver(self) -> BurstReceiver:
         return CompiledReceiver(self)

@@ -53,7 +53,7 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
 
     A worker that is lost is replaced.
     """
-    with _deaf_to_ctrl_c():
+    with _interrupts_ignored():
         cluster = LocalCluster(
             n_workers=processes,
             threads_per_worker=1,
@@ -196,7 +196,7 @@ def _check_workers(client: Client, address: str) -> None:
 
 
 @contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
+def _interrupts_ignored() -> Iterator[None]:
     """Processes and threads that are started inside ignore Ctrl-C. A terminal sends it to a whole process group."""
     # multiprocessing unblocks signals when it starts its resource tracker, so the tracker must already run.
     resource_tracker.ensure_running()

@@ -28,12 +28,21 @@ def keys(mode: SealMode) -> Keys:
 
 
 class Robot:
-    """An endpoint, what it told, and what it must not forget."""
+    """An endpoint, what it told, and what it must not forget.
+
+    :param coding: its codec, and what makes a decoder from the table of another robot
+    """
 
     def __init__(
-        self, src_id: int, topics: Registry | None = None, *, mode: SealMode = "none", **settings: Any
+        self,
+        src_id: int,
+        topics: Registry | None = None,
+        *,
+        mode: SealMode = "none",
+        coding: tuple[Any, Any] = (None, None),
+        **settings: Any,
     ) -> None:
-        self.src_id, self.topics = src_id, topics
+        self.src_id, self.topics, self.coding = src_id, topics, coding
         self.keys = keys(mode)
         self.settings = Settings(src_id, **{"packet_len": 64, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
@@ -49,6 +58,8 @@ class Robot:
             self.settings,
             boot=self.boot,
             keys=self.keys,
+            codec=self.coding[0],
+            decoder_for=self.coding[1],
             heard=dict(self.stored),
             save=lambda src_id, boot, floor: self.stored.__setitem__(src_id, (boot, floor)),
             observer=self.events.append,

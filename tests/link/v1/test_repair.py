@@ -124,7 +124,7 @@ def test_one_live_packet_is_repeated_in_effect() -> None:
     old, new = Life(), Life(expires=5.0)
     sender.sent(1, b"old", b"", (old,), 0.0)
     sender.sent(2, b"new", b"", (new,), 0.0)
-    old.over = True
+    old.end()
     repair = sender.next(1.0)
     assert isinstance(repair, Repair)
     assert (repair.number, repair.mask) == (2, 1)
@@ -142,7 +142,7 @@ def test_what_is_over_is_left_out_where_its_mask_fits() -> None:
     lives = [Life() for _ in range(5)]
     for number, life in enumerate(lives, 1):
         sender.sent(number, b"short" if number < 5 else b"x" * number, b"", (life,), 0.0)
-    lives[2].over = True
+    lives[2].end()
     repair = sender.next(0.0)
     assert isinstance(repair, Repair)
     assert (repair.number, repair.mask) == (5, 0b11011)
@@ -277,7 +277,7 @@ def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None
     gone = Life()
     sender.sent(1, b"gone", b"packet 1", (gone,), 0.0)
     sender.sent(2, b"here", b"packet 2", (Life(),), 0.1)
-    gone.over = True
+    gone.end()
     sender.report(9, 2, (1 << 64) - 1 ^ 0b11, settled=False, loss=0.0, now=0.1)
     sender.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
     assert sender.next(0.2) is None  # all that is alive has arrived: there is nothing to combine
