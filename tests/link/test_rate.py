@@ -136,7 +136,7 @@ def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006
         swing = abs((number * report_s * slope_db_s) % (2 * depth_db) - depth_db)
         rate.report(7, 20.0 - swing, 0.1, now)
         rate.sent(7, now)
-    for number in range(12):
+    for number in range(6):
         now += report_s
         rate.report(7, 20.0 - slope_db_s * number * report_s, 0.1, now)
         rung = rate.sent(7, now)
