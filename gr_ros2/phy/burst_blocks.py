@@ -23,7 +23,7 @@ from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
-from gr_ros2.phy.kernels import fastest, which
+from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
@@ -86,7 +86,8 @@ class BurstPhy(Phy):
 
         :param form: further arguments of :class:`Frames`
         """
-        return Frames(self.packet_len, self.options.fec, fixed=self.options.lengths == "fixed", **form)
+        fixed = self.options.lengths == "fixed"
+        return Frames(self.packet_len, self.options.fec, fixed=fixed, decoders=decoders(self.kernels), **form)
 
     @property
     def any_length(self) -> bool:

@@ -250,13 +250,14 @@ class Outbox:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the kept messages."""
+        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic.
+
+        A receiver remembers no other of a topic. If hellos named older ones too, it would ask for them for ever.
+        """
         return [
-            (topic_id, kept.mark)
+            (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC
-            for kept in messages
-            if now >= kept.named
+            if topic_id != TABLE_TOPIC and now >= messages[-1].named
         ]
 
     def follow(

@@ -175,6 +175,27 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> No
     assert two.delivered() == [text(1, 700)]
 
 
+def test_several_messages_kept_of_one_topic_are_sent_to_a_late_robot_once() -> None:
+    """As a publisher of depth 10 has them, whose depth its graph did not tell."""
+    topics = registry(odom=TopicOptions(), map=LATCHED)
+    one, two, late = Robot(1, topics), Robot(2), Robot(3)
+    air = Air(one, two)
+    one.end.follow(1, reliable=True, latched=True, depth=10)
+    sent = [text(number) for number in range(5)]
+    for payload in sent:
+        one.end.submit(1, payload, air.now)
+        air.run(1.0)
+    air.run(20.0)
+    assert two.delivered() == sent
+    assert one.end.sent.repeats == 1  # the table
+    air.robots.append(late)
+    air.run(20.0)
+    assert late.delivered() == sent
+    repeats = one.end.sent.repeats
+    air.run(60.0)
+    assert one.end.sent.repeats == repeats and late.delivered() == sent
+
+
 def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_keep() -> None:
     one, two = Robot(1), Robot(2)
     air = Air(one, two, loss=0.2)
