@@ -237,7 +237,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     def make_pair(self, end: DdsServer | DdsClient) -> None:
         names = ros_graph.dds_service(end.name, end.type_name)
         topics = [create_topic(self._participant, *name) for name in names]
-        data = [self._data_of(name) + end.mark for _, name in names]
+        data = [ros_graph.endpoint_user_data(self._hash_told(name)) + end.mark for _, name in names]
         # The writer is first: a reader alone on a topic of requests makes clients of Fast DDS wait for ever.
         writer = RawWriter(self._participant, topics[end.writes], SERVICE_QOS, data[end.writes])
         reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
@@ -377,10 +377,10 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         """User data of an endpoint: the type hash that other endpoints on the graph announce, otherwise that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
-        return self._data_of(ros_graph.dds_type(type_name)) or ros_graph.endpoint_user_data(type_hash(type_name))
+        return ros_graph.endpoint_user_data(self._hash_told(ros_graph.dds_type(type_name)) or type_hash(type_name))
 
-    def _data_of(self, name: str) -> bytes:
-        """The type hash that other endpoints announce for a type on DDS, as user data; empty if none does."""
+    def _hash_told(self, name: str) -> str:
+        """The hash that other endpoints announce for a type on DDS; '' if none does."""
         with self._lock:
             told = [
                 ros_graph.hash_told(endpoint.user_data)
@@ -388,7 +388,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 for endpoint in found.values()
                 if endpoint.type_name == name and endpoint.participant != self._guid
             ]
-        return ros_graph.endpoint_user_data(next(filter(None, told), ""))
+        return next(filter(None, told), "")
 
     def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
         with self._lock:

@@ -186,9 +186,11 @@ def has_short_gids(topic: str, user_data: bytes) -> bool:
 def endpoint_user_data(type_hash: str) -> bytes:
     """User data with which an endpoint announces its type since Iron (REP-2016); nodes up to Humble do not read it.
 
+    It is never empty: rmw_cyclonedds warns about every endpoint without user data.
+
     :param type_hash: '' where the hash is not known
     """
-    return f"typehash={type_hash};".encode() if type_hash else b""
+    return f"typehash={type_hash};".encode() if type_hash else _OURS
 
 
 def hash_told(user_data: bytes) -> str:

@@ -137,7 +137,9 @@ def test_who_has_short_gids() -> None:
     assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, b"")  # Humble
     assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_USER_DATA)  # another gr-ros2
     assert not ros_graph.has_short_gids("rt/chatter", told)
-    assert ros_graph.endpoint_user_data("") == b"" and ros_graph.hash_told(b"xtypehash=RIHS01_;") == ""
+    unknown = ros_graph.endpoint_user_data("")
+    assert unknown and ros_graph.hash_told(unknown) == ""  # rmw_cyclonedds warns about endpoints without user data
+    assert ros_graph.hash_told(b"xtypehash=RIHS01_;") == ""
 
 
 def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None:
