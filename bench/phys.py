@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from statistics import median
 from typing import Any
 
@@ -20,6 +21,7 @@ from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait
 from bench.rows import Row
 from bench.runs import DRIVE
 from gr_ros2.config import ChannelConfig, SourceConfig
+from gr_ros2.errors import BackendMissingError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware.bag_files import read_bag
@@ -45,7 +47,7 @@ _COUNT = (4000, 200)
 def drive() -> list[Row]:
     """The recorded drive over every PHY with samples at its default settings, 64 B packets in noise."""
     packets = drive_packets()
-    return [_drive(_phy(name), packets) for name in PHY if PHY.load(name).has_samples]
+    return [_drive(_phy(name), packets) for name in _usable()]
 
 
 def drive_packets() -> list[bytes]:
@@ -77,7 +79,17 @@ def _drive(phy: Phy, packets: list[bytes]) -> Row:
 
 def beside() -> list[Row]:
     """Packets/s and latency with source and sink, beside the bare flowgraph."""
-    return [row for name in PHY if PHY.load(name).has_samples for row in _beside(name)]
+    return [row for name in _usable() for row in _beside(name)]
+
+
+def _usable() -> list[str]:
+    """The PHYs with samples whose modules are installed."""
+    found = []
+    for name in PHY:
+        with suppress(BackendMissingError):
+            PHY.modules(name)
+            found += [name] * PHY.load(name).has_samples
+    return found
 
 
 def _beside(name: str) -> list[Row]:

@@ -29,6 +29,7 @@ class Backend:
     :param summary: one line of help
     :param requires: the package a user installs to get it, '' = nothing beside this one
     :param title: what GRC calls it, '' = its name in capitals
+    :param imports: Python modules that it needs when it is used, but not for its settings to be known
     """
 
     module: str
@@ -36,6 +37,7 @@ class Backend:
     summary: str
     requires: str = ""
     title: str = ""
+    imports: tuple[str, ...] = ()
 
 
 RowT = TypeVar("RowT", bound=Backend)
@@ -89,9 +91,21 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
         if name not in self:
             raise ConfigError(f"{self.family}: no {name!r}; known are {', '.join(self)}")
         row = self[name]
+        return getattr(self._imported(name, row, row.module), row.attribute)
+
+    def modules(self, name: str) -> tuple[Any, ...]:
+        """The modules that a row needs when it is used, see ``Backend.imports``.
+
+        :param name: a name of the table
+        :raises BackendMissingError: when one is not installed
+        """
+        row = self[name]
+        return tuple(self._imported(name, row, module) for module in row.imports)
+
+    def _imported(self, name: str, row: RowT, module: str) -> Any:
         try:
             with uninterrupted():
-                return getattr(import_module(row.module), row.attribute)
+                return import_module(module)
         except ImportError as error:
             if not row.requires:
                 raise

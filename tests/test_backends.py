@@ -23,6 +23,7 @@ from gr_ros2.radio import FRONT_ENDS
 ROWS = {
     "there": Backend("collections", "OrderedDict", "always there"),
     "missing": Backend("no_such_package_at_all.bus", "Bus", "not installed", "pip install no-such-package"),
+    "partly": Backend("collections", "Counter", "its settings are known", "pip install a-part", imports=("no_part",)),
     "broken": Backend("no_such_package_at_all.bus", "Bus", "ours, so a missing module is a bug"),
 }
 TABLE = BackendTable("bus", ROWS, Backend)
@@ -30,7 +31,7 @@ TABLE = BackendTable("bus", ROWS, Backend)
 
 def test_a_table_is_a_mapping_in_order() -> None:
     assert list(TABLE) == list(ROWS)
-    assert len(TABLE) == 3
+    assert len(TABLE) == 4
     assert TABLE["missing"].requires == "pip install no-such-package"
     assert "nonsense" not in TABLE
 
@@ -40,13 +41,20 @@ def test_load_gives_the_class() -> None:
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="bus: no 'nonsense'; known are there, missing, broken"):
+    with pytest.raises(ConfigError, match="bus: no 'nonsense'; known are there, missing, partly, broken"):
         TABLE.load("nonsense")
 
 
 def test_a_missing_back_end_names_the_package() -> None:
     with pytest.raises(BackendMissingError, match="bus 'missing' needs pip install no-such-package"):
         TABLE.load("missing")
+
+
+def test_what_a_back_end_needs_only_when_it_is_used_is_named_too() -> None:
+    assert TABLE.load("partly")
+    with pytest.raises(BackendMissingError, match=r"bus 'partly' needs pip install a-part \(No module .*'no_part'"):
+        TABLE.modules("partly")
+    assert TABLE.modules("there") == ()
 
 
 def test_a_missing_back_end_is_an_import_error_too() -> None:

@@ -104,6 +104,7 @@ def _rows(table: BackendTable[Any], needed: str = "") -> Iterator[Finding]:
         what = f"{table.family} {name}"
         try:
             table.load(name)
+            table.modules(name)
             yield Finding(what, "ok", table[name].summary)
         except BackendMissingError as error:
             remedy = table[name].requires if name in table.own else ""

@@ -134,6 +134,7 @@ class LinkHealth:
             silence = look.now - self._heard_at
             status.judge("silence", silence, "s", limits.silence_warn_s, limits.silence_error_s)
         status.values["packets damaged"] = str(stats["packets"]["damaged"])
+        status.values["frames of others"] = str(stats["packets"]["foreign"])
         status.values["held (B)"] = str(stats["sink"]["held_bytes"])
         snr = stats["phy"].get("snr_db")
         if snr is not None:

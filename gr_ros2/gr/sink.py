@@ -13,6 +13,7 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from gnuradio import gr
@@ -58,6 +59,24 @@ class Services(Protocol):
         """Take over the topics and services that a robot announces now."""
 
 
+@dataclass(slots=True, eq=False)
+class _Output:
+    """A topic of one sender, as this block publishes it.
+
+    :param stamped: whether its messages begin with a header
+    :param publisher: None until the first message, and after the topic has changed
+    :param published: number of messages
+    :param delivered_at: time of the newest one, s
+    """
+
+    topic: Topic
+    stamped: bool
+    publisher: Publisher | None = None
+    published: int = 0
+    delivered_at: float | None = None
+    latency: LatencyWindow | None = None
+
+
 class RosSink(gr.basic_block):  # type: ignore[misc]
     """Reassembles packets into messages and publishes them on a ROS graph.
 
@@ -96,7 +115,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if end is None:
             start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
-        self._end, self._work = end.endpoint, end.work
+        self._live, self._end = end, end.endpoint
         self._announced: dict[tuple[int, int], Topic] = {}
         """Topics that senders have announced, by source id and topic id."""
         self._calls: Services | None = None
@@ -114,10 +133,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._transforms: MergedTransforms | None = None
         # Publishers are kept when a robot has gone. Late subscribers still get its map, and a robot that comes back
         # needs no new discovery. There are at most as many as source ids times topics of the registry.
-        self._publishers: dict[tuple[int, int], Publisher] = {}
-        self._latency: dict[tuple[int, int], LatencyWindow] = {}
-        self._published: Counter[tuple[int, int]] = Counter()
-        self._delivered_at: dict[tuple[int, int], float] = {}
+        self._outputs: dict[tuple[int, int], _Output] = {}
         self._stamped: dict[str, bool] = {}
         """Whether messages of a type begin with a header."""
         self._types: TypeSearch | None = None
@@ -159,7 +175,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every publisher has found a subscription."""
-        return all(publisher.matched() for publisher in list(self._publishers.values()))
+        return all(publisher.matched() for publisher in self._publishers())
 
     def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
         """Create the publishers of an expected sender now, so that subscribers find them before its first message.
@@ -167,8 +183,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         :raises MiddlewareError: when a topic cannot be announced
         """
         for topic_id in topic_ids:
-            if (src_id, topic_id) not in self._publishers:
-                self._advertise((src_id, topic_id))
+            key = (src_id, topic_id)
+            output = self._output(key)
+            if output.publisher is None:
+                self._advertise(key, output)
 
     def start(self) -> bool:
         with self._lock:
@@ -194,7 +212,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._clock_subscription = None
         if self._transforms is not None:
             self._transforms.close()
-        for publisher in list(self._publishers.values()):
+        for publisher in self._publishers():
             publisher.close()
         LOOP_GUARD.remove(self)
         self._finalizer()
@@ -205,7 +223,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             stats = self._end.received
             keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
             topics = {key: self._topic_stats(key) for key in keys if self._is_topic(key)}
-            windows = {key: self._latency[key].copy() for key in topics if key in self._latency}
+            outputs = {key: self._outputs[key] for key in topics if key in self._outputs}
+            windows = {key: window.copy() for key, output in outputs.items() if (window := output.latency) is not None}
             counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
@@ -248,8 +267,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _unknown_types(self) -> list[tuple[str, str]]:
         """The topics published whose types ROS does not ship."""
-        topics = [(key, self._topic(key)) for key in list(self._publishers)]
-        return [(self._name(key), topic.type_name) for key, topic in topics if not known(topic.type_name)]
+        outputs = [(key, output) for key, output in list(self._outputs.items()) if output.publisher is not None]
+        types = [(self._name(key), output.topic.type_name) for key, output in outputs]
+        return [(name, type_name) for name, type_name in types if not known(type_name)]
 
     def _define(self, described: Described) -> None:
         """Take a definition that a subscriber has given, for frame names and latencies."""
@@ -259,7 +279,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._log.info("ros2_sink: %s", error)
             return
         self._prefix.learn(described.type_name, store)
-        self._stamped[described.type_name] = has_header(described.type_name, store)
+        stamped = self._stamped[described.type_name] = has_header(described.type_name, store)
+        for output in list(self._outputs.values()):
+            if output.topic.type_name == described.type_name:
+                output.stamped = stamped
 
     def _name(self, key: tuple[int, int]) -> str:
         return self._topic(key).republished(self.config.namespace_format, key[0])
@@ -297,23 +320,22 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 self._tell_first("bad_announcement", f"a topic of robot {event.src_id} cannot be published", error)
                 continue
             topics.append(topic)
-            before = self._announced.get(key)
             self._announced[key] = topic
-            same = before is None or (before.name, before.type_name) == (topic.name, topic.type_name)
-            if key in self._publishers and not same:
-                self._publishers.pop(key).close()
+            if key in self._outputs:
+                self._change(self._outputs[key], topic)
         if self._calls is not None:
             self._calls.learn(event.src_id, topics)
 
     def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
         stats = self._end.received
-        window = self._latency.get(key)
-        delivered_at = self._delivered_at.get(key)
+        output = self._outputs.get(key)
+        window = None if output is None else output.latency
+        delivered_at = None if output is None else output.delivered_at
         latency = 0.0 if window is None else window.newest or 0.0
         return {
             "src_id": key[0],
             "topic_id": key[1],
-            "delivered": self._published[key],
+            "delivered": 0 if output is None else output.published,
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
             "latency_s": None,
             "recent_latency_s": None,
@@ -354,47 +376,46 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 events += self._end.receive(data, self._clock(), snr_db)
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
-            if self._end.answers and not self._end.out_of_credit:
-                self._work.notify()
+            if self._end.answers:
+                self._live.wake()
         self._settle(events)
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:
         """Handle each event, then call the observer."""
+        debug, calls, observer = self.config.debug, self._calls, self._observer
         for event in events:
             try:
-                if self.config.debug and isinstance(event, Received | Rejected):
+                if debug and isinstance(event, Received | Rejected):
                     self._log.debug("rx %s", describe(event, self.registry))
                 if isinstance(event, Announced):
                     self._learn(event)
                 elif isinstance(event, Rejected):
                     self._warn(event)
-                taken = self._calls is not None and self._calls.takes(event)
+                taken = calls is not None and calls.takes(event)
                 result = self._publish(event) if isinstance(event, Delivered) and not taken else event
-                if self._observer is not None:
-                    self._guard(self._observer.receiver_event, result, self._clock())
+                if observer is not None:
+                    self._guard(observer.receiver_event, result, self._clock())
             except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
                 self._failed(error)
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
         try:
-            topic = self._topic(key)
+            output = self._outputs.get(key) or self._output(key)
+            topic = output.topic
             payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
-            publisher = self._publishers.get(key) or self._advertise(key)
+            publisher = output.publisher or self._advertise(key, output)
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
             named = f"topic id {key[1]} of robot {key[0]}"
             self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
-        stamped = self._stamped.get(topic.type_name)
-        if stamped is None:
-            stamped = self._stamped[topic.type_name] = has_header(topic.type_name)
         with self._lock:
-            self._published[key] += 1
-            self._delivered_at[key] = self._clock()
-            if stamped:
-                self._measure(key, event.payload)
+            output.published += 1
+            output.delivered_at = self._clock()
+            if output.stamped:
+                self._measure(output, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
         return event
@@ -420,29 +441,58 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             trace = None if isinstance(error, GrRos2Error) else error
             self._log.warning("ros2_sink: %s: %s", what, error, exc_info=trace)
 
-    def _advertise(self, key: tuple[int, int]) -> Publisher:
-        topic = self._topic(key)
+    def _output(self, key: tuple[int, int]) -> _Output:
+        """A sender's topic, which may be published from now on.
+
+        :raises ConfigError: when the topic id is neither announced nor in the registry
+        """
+        output = self._outputs.get(key)
+        if output is None:
+            topic = self._topic(key)
+            output = self._outputs[key] = _Output(topic, self._is_stamped(topic.type_name))
+        return output
+
+    def _change(self, output: _Output, topic: Topic) -> None:
+        """A topic id means this topic now. A publisher of another name or type is closed."""
+        before, output.topic = output.topic, topic
+        if (before.name, before.type_name) != (topic.name, topic.type_name):
+            output.stamped = self._is_stamped(topic.type_name)
+            if output.publisher is not None:
+                output.publisher.close()
+                output.publisher = None
+
+    def _is_stamped(self, type_name: str) -> bool:
+        stamped = self._stamped.get(type_name)
+        if stamped is None:
+            stamped = self._stamped[type_name] = has_header(type_name)
+        return stamped
+
+    def _publishers(self) -> list[Publisher]:
+        return [publisher for output in list(self._outputs.values()) if (publisher := output.publisher) is not None]
+
+    def _advertise(self, key: tuple[int, int], output: _Output) -> Publisher:
+        topic = output.topic
         depth = self.config.publisher_depth if topic.options.depth == AUTO else topic.options.depth
         asked = topic.options.reliability
         qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
-        publisher = self._publishers[key] = self.middleware.advertise(self._name(key), topic.type_name, qos)
+        publisher = output.publisher = self.middleware.advertise(self._name(key), topic.type_name, qos)
         return publisher
 
-    def _measure(self, key: tuple[int, int], payload: bytes) -> None:
+    def _measure(self, output: _Output, payload: bytes) -> None:
         """Note the latency of a message; the caller holds the lock."""
         now = self._sim_time if self.config.use_sim_time else time.time()
         stamp = leading_time(payload)
         if now is not None and stamp is not None:
-            window = self._latency.get(key)
-            if window is None:
+            if output.latency is None:
                 self._forget_the_gone()
-                window = self._latency[key] = LatencyWindow()
-            window.add(now - stamp)
+                output.latency = LatencyWindow()
+            output.latency.add(now - stamp)
 
     def _forget_the_gone(self) -> None:
         """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""
-        known = self._end.knows
-        self._latency = {key: window for key, window in self._latency.items() if known(key[0])}
+        for (src_id, _), output in list(self._outputs.items()):
+            if not self._end.knows(src_id):
+                output.latency = None
 
     def _set_sim_time(self, payload: bytes) -> None:
         self._sim_time = leading_time(payload)

@@ -45,7 +45,7 @@ from gr_ros2.setting import AUTO, Auto
 from gr_ros2.topic_choice import TopicChoice
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
-_BATCH = 16
+_BATCH = 32
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
 
 
@@ -451,8 +451,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
-            if topic_id in self._subscriptions:
-                self._end.missed(topic_id, self._subscriptions[topic_id].lost)
+            subscription = self._subscriptions.get(topic_id)
+            if subscription is not None and subscription.lost:
+                self._end.missed(topic_id, subscription.lost)
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
@@ -473,7 +474,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _pump(self) -> None:
         while self._running:
             try:
-                self._emit(self._compose())
+                if packets := self._compose():
+                    self._emit(packets)
             except Exception as error:  # noqa: BLE001 - an exception would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1

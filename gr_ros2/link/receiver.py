@@ -53,6 +53,7 @@ class Receiver:
         self.config = config
         self.registry = registry.with_options(config.topic_options)
         self.stats = ReceiverStats()
+        self._topics = len(self.registry)
         self._latched = {topic.topic_id for topic in self.registry if topic.latched}
         self._codec = codec
         self._sources: dict[int, _Source] = {}
@@ -60,7 +61,7 @@ class Receiver:
 
     def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
         """Take the bytes of one packet; the events it causes, in order."""
-        events = self.handle_timeout(now)
+        events = self.handle_timeout(now) if self._partials.size else []
         try:
             packet = V0.decode(data, self.config.packet_len)
         except WireError as error:
@@ -147,7 +148,7 @@ class Receiver:
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
-            if entry.topic_id >= len(self.registry):
+            if entry.topic_id >= self._topics:
                 self.stats.dropped["unknown_topic"] += 1
                 continue
             reassembler = source.topics.get(entry.topic_id)
@@ -162,6 +163,8 @@ class Receiver:
             if message is not None:
                 events += self._deliver(source, packet, entry.topic_id, entry.entry_id, message)
         source.epoch += placed.arrival is Arrival.LATE
+        if not self._partials.size:
+            return
         while self._partials.size_of(src_id) > self.config.max_source_bytes:
             events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), LedgerRow.MEMORY))
         while self._partials.size > self.config.max_bytes:

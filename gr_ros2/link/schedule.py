@@ -57,7 +57,9 @@ class PaperScheduler:
         pending = [topic_id for topic_id, queue in queues.items() if queue]
         if not pending:
             return None
-        self._line += [topic_id for topic_id in pending if topic_id not in self._line]
+        for topic_id in pending:
+            if topic_id not in self._line:
+                self._line.append(topic_id)
         config, wire = self.config, self._format
         picks: list[Outgoing] = []
         chosen: list[int] = []

@@ -69,6 +69,8 @@ class Sender:
         self._largest = V0.largest_message(config.packet_len)
         self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry, V0)
         self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
+        self._classes = [(QOS_NAMES.index(topic.options.qos), topic.options.weight) for topic in self.registry]
+        """Class and weight of each topic's messages."""
         self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
         """Topics whose newest message is kept for robots that join late."""
         self._with_deadline = self._deadlines()
@@ -107,8 +109,8 @@ class Sender:
         if len(payload) > self._largest:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
             return
-        options = self.registry[topic_id].options
-        message = Outgoing(serial, topic_id, payload, QOS_NAMES.index(options.qos), now, options.weight)
+        qos, weight = self._classes[topic_id]
+        message = Outgoing(serial, topic_id, payload, qos, now, weight)
         if dropped := self._queues[topic_id].admit(message, self.depth(topic_id)):
             self._drop(dropped)
         self._changed(now)

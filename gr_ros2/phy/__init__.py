@@ -24,6 +24,14 @@ PHY = BackendTable(
         "lora": Backend(
             "gr_ros2.phy.lora", "LoraPhy", "chirp spread spectrum, own format or LoRa's", _GNURADIO, title="LoRa-like"
         ),
+        "wifi": Backend(
+            "gr_ros2.phy.wifi",
+            "WifiPhy",
+            "IEEE 802.11 a/g/p frames, by gr-ieee802-11",
+            f"{_GNURADIO} and gr-ieee802-11 (https://github.com/bastibl/gr-ieee802-11, branch maint-3.10)",
+            title="Wi-Fi (802.11)",
+            imports=("ieee802_11",),
+        ),
         "modem": Backend(
             "gr_ros2.phy.modem", "ModemPhy", "a radio that modulates packets itself; no samples", title="Modem"
         ),

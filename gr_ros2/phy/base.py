@@ -60,6 +60,10 @@ class PacketReceiver(Protocol):
         """Packets received with errors, as far as the PHY reports them."""
 
     @property
+    def foreign(self) -> int:
+        """Whole frames of other networks or of other uses, dropped; 0 where the PHY cannot tell them."""
+
+    @property
     def snr_db(self) -> float | None:
         """SNR of the newest packets, dB over the sampled band; None before the first, or if the PHY does not measure
         it."""

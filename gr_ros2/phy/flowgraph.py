@@ -137,6 +137,11 @@ class ReceiverBlock(HierBlock):
         return 0
 
     @property
+    def foreign(self) -> int:
+        """Whole frames of other networks or of other uses, dropped."""
+        return 0
+
+    @property
     def snr_db(self) -> float | None:
         """SNR over the sampled band of the newest packets, dB; None before the first."""
         return None

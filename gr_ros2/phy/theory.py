@@ -7,6 +7,7 @@ cost of synchronisation, pilots and framing. Source: Proakis and Salehi, Digital
 
 from __future__ import annotations
 
+from fractions import Fraction
 from functools import lru_cache
 from math import erfc, exp, lgamma, log, log1p, log2, log10, pi, sin, sqrt
 
@@ -42,6 +43,51 @@ def qam_symbol_error(order: int, snr: float) -> float:
     """
     side = 2 * (1 - 1 / sqrt(order)) * q(sqrt(3 * snr / (order - 1)))
     return 1 - (1 - side) ** 2
+
+
+def qam_bit_error(bits: int, snr: float) -> float:
+    """BPSK and Gray-coded square QAM, coherent, each bit decided by itself: mean over the bits, exact.
+
+    :param bits: of a point: 1, 2, 4 or 6
+    :param snr: Es/N0
+    """
+    x = sqrt(snr * {1: 2, 2: 1, 4: 1 / 5, 6: 1 / 21}[bits])
+    if bits <= 2:
+        return q(x)
+    if bits == 4:
+        return (3 * q(x) + 2 * q(3 * x) - q(5 * x)) / 4
+    return (7 * q(x) + 6 * q(3 * x) - q(5 * x) + q(9 * x) - q(13 * x)) / 12
+
+
+_EVENTS = {
+    (1, 2): (10, (11, 0, 38, 0, 193, 0, 1331, 0, 7275)),
+    (2, 3): (6, (1, 16, 48, 158, 642, 2435, 9174)),
+    (3, 4): (5, (8, 31, 160, 892, 4512, 23307)),
+}
+"""By code rate: free distance of the code 133/171 (octal) punctured as in IEEE 802.11, and its numbers of error events
+at this and the next distances (Haccoun and Begin, IEEE Trans. Commun. 37-11, 1989)."""
+
+
+def convolutional_success(rate: tuple[int, int], error: float, data_bits: int) -> float:
+    """Probability that a Viterbi decoder with hard decisions finds all bits of IEEE 802.11's convolutional code.
+
+    The union bound of error events (Pursley and Taipale, IEEE Trans. Commun. 35-11, 1987), so it is pessimistic.
+
+    :param rate: 1/2, 2/3 or 3/4, as a fraction that need not be reduced
+    :param error: probability that a coded bit is wrong, below 1/2
+    """
+    share = Fraction(*rate)
+    free, events = _EVENTS[share.numerator, share.denominator]
+    begins = sum(count * _confused(free + more, error) for more, count in enumerate(events) if count)
+    return packet_success(begins, data_bits)
+
+
+def _confused(distance: int, error: float) -> float:
+    """Probability that a path with ``distance`` other bits fits better, half of it where both fit as well."""
+    if distance % 2:
+        return at_least((distance + 1) // 2, distance, error)
+    tie = distance // 2
+    return (at_least(tie, distance, error) + at_least(tie + 1, distance, error)) / 2
 
 
 def orthogonal_symbol_error(count: int, snr: float) -> float:
@@ -143,10 +189,12 @@ __all__ = [
     "at_least",
     "coded_orthogonal_success",
     "coded_success",
+    "convolutional_success",
     "half_point",
     "orthogonal_symbol_error",
     "packet_success",
     "psk_symbol_error",
     "q",
+    "qam_bit_error",
     "qam_symbol_error",
 ]

@@ -132,6 +132,11 @@ class Radio(PacketPath, HierBlock):
         return 0 if self._receiver is None else self._receiver.damaged
 
     @property
+    def foreign(self) -> int:
+        """Number of whole frames received that are not packets of this link, as far as the PHY tells them."""
+        return 0 if self._receiver is None else self._receiver.foreign
+
+    @property
     def _medium(self) -> str:
         return f"front_end {self.front_end.name}"
 

@@ -220,6 +220,7 @@ class RobotLink(Flowgraph):
                 "refused": self.radio.refused,
                 "in": self.sink.handled,
                 "damaged": self.radio.damaged,
+                "foreign": self.radio.foreign,
                 "dropped": dict(counts.losses),
             },
             "phy": {

@@ -51,7 +51,7 @@ def stats(**changes: Any) -> dict[str, Any]:
                 }
             },
         },
-        "packets": {"out": values["out"], "backlog": 0, "damaged": 0},
+        "packets": {"out": values["out"], "backlog": 0, "damaged": 0, "foreign": 0},
         "phy": {"airtime_s": 0.01, "snr_db": values["snr_db"]},
         "front_end": {"name": "sim", "passed": {}, "lost": {}},
     }

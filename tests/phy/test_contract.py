@@ -14,7 +14,7 @@ import pmt
 from gnuradio import blocks, gr
 
 from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.phy.loopback import LoopbackLink
@@ -43,13 +43,17 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("lora", {"coding_rate": 1, "gap": 16}),
     ("lora", {"spreading_factor": 9, "coding_rate": 3}),
     ("lora", {"coding_rate": 1, "fec": "cc"}),
+    ("wifi", {"encoding": "bpsk-3/4", "equalizer": "lms"}),
+    ("wifi", {"encoding": "qpsk-3/4", "gap": 1000, "equalizer": "sta"}),
+    ("wifi", {"encoding": "16qam-1/2", "channel_hz": 5.89e9}),
+    ("wifi", {"encoding": "64qam-3/4"}),
     ("lora", {"implementation": "lora_sdr"}),
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3, "oversampling": 4}),
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 8, "coding_rate": 1, "ldro": True, "gap": 48}),
 ]
 LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
-LONGEST = {"lora_sdr": 251}
-"""By implementation."""
+LONGEST = {"lora_sdr": 251, "wifi": 1492}
+"""By implementation or name."""
 IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
 IN_NOISE = [
     *((name, {}) for name in WITH_SAMPLES),
@@ -57,6 +61,7 @@ IN_NOISE = [
     ("psk", {"modulation": "bpsk"}),
     ("psk", {"modulation": "8psk"}),
     ("lora", {"implementation": "lora_sdr"}),
+    *(("wifi", {"encoding": name}) for name in ("bpsk-3/4", "qpsk-1/2", "16qam-3/4", "64qam-2/3")),
 ]
 _LONG = 10_000
 """Samples of a packet from which on fewer packets have to do."""
@@ -64,13 +69,17 @@ CASES = [
     pytest.param(name, options, packet_len, id=f"{packet_len}-{about}")
     for (name, options), about in zip(SETTINGS, IDS, strict=True)
     for packet_len in LENGTHS
-    if packet_len <= LONGEST.get(options.get("implementation", ""), max(LENGTHS))
+    if packet_len <= LONGEST.get(options.get("implementation", name), max(LENGTHS))
 ]
 
 
 def make(name: str, options: dict[str, Any], packet_len: int = 64) -> Phy:
     if options.get("implementation") == "lora_sdr":
         pytest.importorskip("gnuradio.lora_sdr", reason="gr-lora_sdr is not installed")
+    try:
+        PHY.modules(name)
+    except BackendMissingError as error:
+        pytest.skip(str(error))
     phy: Phy = PHY.load(name)(packet_len, 1e6, **options)
     return phy
 

@@ -42,7 +42,7 @@ from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
-from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
 
 SHARE = 3
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -118,8 +118,8 @@ class _Line:
 class Filling:
     """The content of a source packet."""
 
-    parts: list[Part]
-    sent: list[SentEntry]
+    parts: list[Entry]
+    sent: tuple[SentEntry, ...]
     lives: tuple[Life, ...]
     qos: int
     used: int
@@ -141,13 +141,13 @@ class Outbox:
         boot: int,
         room: int,
         codec: MessageCodec | None,
-        observer: Observer,
+        observer: Observer | None,
     ) -> None:
         self._settings = settings
         self._boot = boot
         self._room = room
         self._codec = codec
-        self._observe = observer
+        self._observer = observer
         self._lines: dict[int, _Line] = {}
         self._kept: dict[int, deque[_Kept]] = {}
         self._open: dict[int, Sequence[Outgoing]] = {}
@@ -209,10 +209,10 @@ class Outbox:
         self._serial += 1
         self.stats.submitted[topic_id] += 1
         codec = self._codec
-        if codec is None:
-            self._observe(Accepted(serial, topic_id, payload, now))
-        else:
-            self._observe(Accepted(serial, topic_id, payload, now, codec.canonical(topic_id, payload)))
+        if self._observer is not None:
+            expected = None if codec is None else codec.canonical(topic_id, payload)
+            self._observer(Accepted(serial, topic_id, payload, now, expected))
+        if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
@@ -250,13 +250,14 @@ class Outbox:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the kept messages."""
+        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic.
+
+        A receiver remembers no other of a topic. If hellos named older ones too, it would ask for them for ever.
+        """
         return [
-            (topic_id, kept.mark)
+            (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC
-            for kept in messages
-            if now >= kept.named
+            if topic_id != TABLE_TOPIC and now >= messages[-1].named
         ]
 
     def follow(
@@ -424,7 +425,7 @@ class Outbox:
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
-        parts: list[Part] = []
+        parts: list[Entry] = []
         sent: list[SentEntry] = []
         lives: list[Life] = []
         stats, qos = self.stats, picks[0][0].qos
@@ -450,7 +451,7 @@ class Outbox:
                 self._left(message, line, now)
         self._turns.sent(self._holder)
         stats.entries += len(picks)
-        return Filling(parts, sent, tuple(lives), qos, used)
+        return Filling(parts, tuple(sent), tuple(lives), qos, used)
 
     def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""
@@ -492,7 +493,8 @@ class Outbox:
 
     def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
-        self._observe(Refused(serial, topic_id, reason, detail))
+        if self._observer is not None:
+            self._observer(Refused(serial, topic_id, reason, detail))
 
 
 def _line(topic: Topic, queue: TopicQueue) -> _Line:
