@@ -532,7 +532,7 @@ class Endpoint:
         """Choose the rung of the packet that leaves. Hellos are also for robots that are not known yet."""
         assert self._rate is not None
         rung = self._rate.sent(None if self.settings.dst_id == BROADCAST else self.settings.dst_id, now)
-        self.rung = 0 if kind == "hello" else rung
+        self.rung = 0 if kind in {"hello", "report"} else rung
 
     def _padded(self, body: bytes, clear: bytes) -> bytes:
         return body.ljust(self._end_of_body - len(clear), b"\0")

@@ -59,7 +59,7 @@ WORTH = 0.85
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
 REPORTED_DEPTH = 160
 """Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
-known."""
+known; but it is repaired for as long as a receiver waits for it (``hold_s``)."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -97,7 +97,7 @@ class _Line:
     :param ordered: whether all its publishers are reliable
     :param hidden: whether the table leaves it out: a service whose server is not there
     :param newest: when the newest of its messages that have left was submitted, s
-    :param lives: lifetimes of its messages that have left, and the packets of each
+    :param lives: lifetimes of its messages that have left, the packets of each, and when it left in s
     :param packets: the packets of all of them
     """
 
@@ -110,7 +110,7 @@ class _Line:
     depth: int = 0
     ordered: bool = True
     newest: float = -inf
-    lives: deque[tuple[Life, int]] = field(default_factory=deque)
+    lives: deque[tuple[Life, int, float]] = field(default_factory=deque)
     packets: int = 0
 
 
@@ -459,18 +459,20 @@ class Outbox:
         line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
         lives = line.lives
-        most = self._settings.depth
+        most, least_s = self._settings.depth, 0.0
         if line.queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = line.depth or REPORTED_DEPTH
+            most, least_s = (line.depth, 0.0) if line.depth else (REPORTED_DEPTH, self._settings.hold_s)
         elif lives:
-            before, _ = lives[-1]
+            before, _, _ = lives[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((life, message.index))
+        lives.append((life, message.index, now))
         line.packets += message.index
-        while len(lives) > 1 and (len(lives) > most or (line.packets > GROUP and not self.reported)):
-            replaced, count = lives.popleft()
+        while len(lives) > 1 and (
+            (len(lives) > most and now - lives[0][2] >= least_s) or (line.packets > GROUP and not self.reported)
+        ):
+            replaced, count, _ = lives.popleft()
             replaced.end()
             line.packets -= count
         if topic_id not in self._kept:
