@@ -22,6 +22,7 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("psk", {"modulation": "bpsk", "sps": 2}),
     ("gfsk", {}),
     ("lora", {"coding_rate": 3}),
+    *(("psk", {"fec": name}) for name in ("cc", "ldpc", "polar")),
 ]
 PACKET_LEN = 20
 BURSTS = 3

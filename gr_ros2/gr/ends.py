@@ -239,12 +239,16 @@ class LiveEnd:
         """
         if self.sleeps_until > -inf:
             at = self.endpoint.next_departure()
-            if at is not None and at < self.sleeps_until:
+            if at is not None and (at < self.sleeps_until or self.endpoint.urged):
                 self.work.notify()
 
     def sleep(self, now: float) -> None:
         """Wait, as the sending thread, until a packet may leave; the caller holds the lock."""
         at = self.endpoint.next_departure()
+        if at is None:
+            # What is due later anyway is waited for now, so that a credit that comes before need not wake the thread.
+            later = self.endpoint.next_departure(credited=True)
+            at = later if later is not None and later > now else None
         self.sleeps_until = inf if at is None else at
         self.work.wait(None if at is None else max(SHORTEST_WAIT_S, at - now))
         self.sleeps_until = -inf

@@ -115,7 +115,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if end is None:
             start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
-        self._end, self._work = end.endpoint, end.work
+        self._live, self._end = end, end.endpoint
         self._announced: dict[tuple[int, int], Topic] = {}
         """Topics that senders have announced, by source id and topic id."""
         self._calls: Services | None = None
@@ -376,8 +376,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 events += self._end.receive(data, self._clock(), snr_db)
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
-            if self._end.answers and not self._end.out_of_credit:
-                self._work.notify()
+            if self._end.answers:
+                self._live.wake()
         self._settle(events)
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:

@@ -474,7 +474,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _pump(self) -> None:
         while self._running:
             try:
-                self._emit(self._compose())
+                if packets := self._compose():
+                    self._emit(packets)
             except Exception as error:  # noqa: BLE001 - an exception would end all transmission
                 with self._lock:
                     self._counters["pump_failed"] += 1

@@ -155,9 +155,16 @@ class Endpoint(Protocol):
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
 
-    def next_departure(self) -> float | None:
+    @property
+    def urged(self) -> bool:
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
+
+    def next_departure(self, *, credited: bool = False) -> float | None:
         """Earliest time at which ``next_packet`` may have something without a further call; None if only a call can
-        change that."""
+        change that.
+
+        :param credited: if there were a credit
+        """
 
     def next_timeout(self) -> float | None:
         """The same for ``handle_timeout``."""
@@ -173,7 +180,7 @@ class EndpointV0:
     :param observer: called with every SenderEvent, in order
     """
 
-    answers = False
+    answers = urged = False
     ladder: Sequence[Rung] = ()
 
     def __init__(
@@ -310,7 +317,7 @@ class EndpointV0:
         """See :class:`Endpoint`."""
         return [] if self._receiver is None else self._receiver.handle_timeout(now)
 
-    def next_departure(self) -> float | None:
+    def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002 - nothing is due by itself
         """See :class:`Endpoint`."""
         return None if self._sender is None else self._sender.next_timeout()
 

@@ -35,16 +35,28 @@ _GAPS = 4.0
 """Usual times between two reports after which a robot that is sent packets counts as silent."""
 _UNANSWERED = 12
 """Packets to a robot since its last report, from which on its silence means something."""
+_FADING_SILENT_S, _FADING_UNANSWERED = 0.02, 4
+"""The same two where the channel changes all the time, and receivers therefore report often."""
 _LONGEST_GAP_S = 0.2
 _SMOOTHING = 0.25
-"""Share of a new report in the averages of SNR and time between reports."""
-_STEP_DB = 1.5
-"""Change of the SNR from one report to the next that is believed at once, dB."""
-_CORRECTION_DB = 0.1
-"""dB of correction per report, for a loss of 1 where 0 was expected."""
+"""Share of a new report in the average of the time between reports."""
+_LOOK_BACK_S = 0.02
+"""s over which the change of the SNR is measured: long against the errors of single reports."""
+_REPORT_S = 0.01
+"""s for which the SNR of a report is old when it comes: measured on several packets, waited, and was on the air."""
+_ERROR_DB = 1.0
+"""Change of the SNR within this time that may be an error of measurement, dB."""
+_CHANGE_DB = 1.5
+"""Change of the SNR that is no error of measurement, dB."""
+_DRIFT_SMOOTHING = 0.125
+_MOST_DRIFT_DB_S = 150.0
+_CALM_DB_S = 5.0
+"""Mean rate of change up to which the channel counts as constant, dB/s."""
+_CORRECTION_DB_S = 3.0
+"""dB of correction per s, for a loss of 1 where 0 was expected."""
 _MOST_CORRECTION_DB = 6.0
-_FADE = 0.97
-"""Share of the correction that is kept with each report: the SNR is trusted again in the end."""
+_FADE_S = 1.2
+"""s in which the correction falls to 1/e: the SNR is trusted again in the end."""
 _STEEPEST = 50.0
 
 
@@ -78,8 +90,8 @@ class _Robot:
     """What is known of a receiver."""
 
     rung: int = 0
-    mean_db: float = -inf
-    """SNR, averaged over the newest reports."""
+    reported_db: float = -inf
+    """The newest SNR reported."""
     correction_db: float = 0.0
     heard: float = -inf
     gap_s: float = _LONGEST_GAP_S
@@ -88,13 +100,43 @@ class _Robot:
     """Reports since the last change of the rung."""
     patience: int = SETTLED
     """Reports after a change before a faster rung is tried."""
+    changed_db: float = -inf
+    """The SNR to count on at the last change of the rung."""
     climbed: bool = False
     """Whether the last change was to a faster rung."""
+    before: tuple[float, float] = (-inf, 0.0)
+    """When the SNR was looked at for its change, s, and its value then, dB."""
+    trend_db_s: float = 0.0
+    """Recent change of the SNR, dB/s."""
+    drift_db_s: float = 0.0
+    """Mean magnitude of this change, dB/s: 0 for a constant channel."""
+
+    def heard_at(self, snr_db: float, now: float) -> float:
+        """A report came. Returns the s since the one before."""
+        gap = min(max(now - self.heard, 0.0), _LONGEST_GAP_S)
+        self.gap_s += _SMOOTHING * (gap - self.gap_s)
+        self.reported_db, self.heard, self.unanswered = snr_db, now, 0
+        self.reports += 1
+        at, snr_before_db = self.before
+        if now - at >= _LOOK_BACK_S:
+            change = snr_db - snr_before_db if now - at < _LONGEST_GAP_S else 0.0
+            beyond = max(abs(change) - _ERROR_DB, 0.0)
+            limit = min(beyond / (now - at), _MOST_DRIFT_DB_S)
+            self.trend_db_s = limit if change > 0 else -limit
+            self.drift_db_s += _DRIFT_SMOOTHING * (limit - self.drift_db_s)
+            self.before = now, snr_db
+        return gap
+
+    def snr_db(self, now: float) -> float:
+        """The SNR to count on: as it was when it was reported, less what it may have fallen since."""
+        falling = max(-self.trend_db_s, self.drift_db_s)
+        reported_db = self.reported_db + _REPORT_S * self.trend_db_s
+        return reported_db - self.correction_db - falling * max(now - self.heard, 0.0)
 
     @property
-    def snr_db(self) -> float:
-        """The SNR to count on."""
-        return self.mean_db - self.correction_db
+    def fades(self) -> bool:
+        """Whether the channel changes all the time."""
+        return self.drift_db_s > _CALM_DB_S
 
 
 class RateController:
@@ -117,18 +159,11 @@ class RateController:
         :param loss: share of the packets that it has lost lately, 0..1
         """
         known = self._robots.setdefault(robot, _Robot())
-        gap = min(max(now - known.heard, 0.0), _LONGEST_GAP_S)
-        known.gap_s += _SMOOTHING * (gap - known.gap_s)
-        known.heard, known.unanswered = now, 0
-        # A small difference is an error of measurement, a large one a change of the channel.
-        if abs(snr_db - known.mean_db) > _STEP_DB:
-            known.mean_db = snr_db
-        known.mean_db += _SMOOTHING * (snr_db - known.mean_db)
-        known.reports += 1
-        surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db))
-        correction = _FADE * known.correction_db + _CORRECTION_DB * surplus
+        gap = known.heard_at(snr_db, now)
+        surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db(now)))
+        correction = known.correction_db + gap * (_CORRECTION_DB_S * surplus - known.correction_db / _FADE_S)
         known.correction_db = min(max(correction, -_MOST_CORRECTION_DB), _MOST_CORRECTION_DB)
-        self._choose(known)
+        self._choose(known, now)
 
     def meet(self, robot: int) -> None:
         """A robot that can report is known. It counts for packets to everybody from now on."""
@@ -146,25 +181,31 @@ class RateController:
     def _next(self, known: _Robot, now: float) -> int:
         known.unanswered += 1
         if self._silent(known, now):
-            known.rung, known.reports, known.climbed = 0, 0, False
+            known.rung, known.reports, known.climbed, known.changed_db = 0, 0, False, -inf
+        elif known.fades:
+            self._choose(known, now, faster=False)
         return known.rung
 
     def _silent(self, known: _Robot, now: float) -> bool:
         waited = now - known.heard
-        usual = max(_GAPS * known.gap_s, _LEAST_SILENT_S)
-        return waited > MOST_SILENT_S or (known.unanswered >= _UNANSWERED and waited > usual)
+        least_s, packets = (_FADING_SILENT_S, _FADING_UNANSWERED) if known.fades else (_LEAST_SILENT_S, _UNANSWERED)
+        usual = max(_GAPS * known.gap_s, least_s)
+        return waited > MOST_SILENT_S or (known.unanswered >= packets and waited > usual)
 
-    def _choose(self, known: _Robot) -> None:
-        worth = [rung.goodput(known.snr_db) for rung in self.ladder]
+    def _choose(self, known: _Robot, now: float, *, faster: bool = True) -> None:
+        snr_db = known.snr_db(now)
+        worth = [rung.goodput(snr_db) for rung in (self.ladder if faster else self.ladder[: known.rung + 1])]
         best = max(range(len(worth)), key=worth.__getitem__)
         gain = GAIN_UP if best > known.rung else GAIN_DOWN
         if best == known.rung or worth[best] < gain * worth[known.rung]:
             return
+        # A change of the SNR explains that a rung is left. Without one, its choice was an error of measurement.
+        changed = abs(snr_db - known.changed_db) > _CHANGE_DB
         if best > known.rung:
-            if known.reports < known.patience:
+            if not changed and known.reports < known.patience:
                 return
-        elif known.climbed:
+        elif known.climbed and not changed:
             hasty = known.reports <= _HASTY * known.patience
             known.patience = min(2 * known.patience, _MOST_PATIENCE) if hasty else max(known.patience // 2, SETTLED)
         known.climbed = best > known.rung
-        known.rung, known.reports = best, 0
+        known.rung, known.reports, known.changed_db = best, 0, snr_db

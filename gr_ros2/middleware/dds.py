@@ -32,8 +32,15 @@ from gr_ros2.middleware.cdr_dds import (
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
-from gr_ros2.middleware.dds_services import SERVICE_QOS, DdsClient, DdsServer, ServiceParticipant
-from gr_ros2.middleware.services import DESCRIPTION_TYPE, ReplyCallback, RequestCallback, ServerCallback, Witness
+from gr_ros2.middleware.dds_services import DdsClient, DdsServer, ServiceParticipant
+from gr_ros2.middleware.services import (
+    DESCRIPTION_TYPE,
+    SERVICE_QOS,
+    ReplyCallback,
+    RequestCallback,
+    ServerCallback,
+    Witness,
+)
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 

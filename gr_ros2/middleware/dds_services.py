@@ -18,7 +18,6 @@ from abc import abstractmethod
 from collections.abc import Hashable
 
 from gr_ros2.errors import MiddlewareError
-from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.cdr_dds import DdsError, DiscoveredEndpoint, RawReader, RawWriter
 from gr_ros2.middleware.services import (
     ReplyCallback,
@@ -29,8 +28,6 @@ from gr_ros2.middleware.services import (
     ServiceServer,
 )
 
-SERVICE_QOS = Qos("reliable", "volatile", 1000)
-"""The QoS of services in ROS, except for the depth, which is 10 there. So a burst of calls passes."""
 ENCAPSULATION, HEADER = 4, 16
 _NAME = 8
 """Bytes that name a client."""

@@ -28,6 +28,7 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -45,7 +46,14 @@ from gr_ros2.middleware.base import (
 from gr_ros2.middleware.rcl import ros_localhost_only, translated
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
-from gr_ros2.middleware.services import DESCRIPTION, ReplyCallback, RequestCallback, ServerCallback, Witness
+from gr_ros2.middleware.services import (
+    DESCRIPTION,
+    SERVICE_QOS,
+    ReplyCallback,
+    RequestCallback,
+    ServerCallback,
+    Witness,
+)
 from gr_ros2.registry import normalize_type
 from gr_ros2.setting import AUTO, Auto
 
@@ -176,6 +184,9 @@ class RclpyMiddleware(RclpyParticipant):
         self._work: deque[tuple[Callable[[], None], threading.Event]] = deque()
         self._subscriptions: list[_RclpySubscription] = []
         self._clients: list[RclpyClient] = []
+        self._shown: dict[str, tuple[Any, list[Any]]] = {}
+        """Nodes of other robots that are shown here, and the services of each."""
+        self._showing = threading.Lock()
         self._closing = threading.Event()
         self._failed = False
         # Reentrant; otherwise an error of rclpy while it takes a message would block the whole group permanently.
@@ -209,19 +220,13 @@ class RclpyMiddleware(RclpyParticipant):
         self.check_open()
         return _RclpyPublisher(self, topic, type_name, qos)
 
-    def serve(
-        self,
-        service: str,
-        type_name: str,
-        on_request: RequestCallback,
-        node: str = "",  # noqa: ARG002 - a node of rclpy has its own endpoints only
-    ) -> RclpyServer:
-        """See services. The server belongs to this participant's node.
+    def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> RclpyServer:
+        """See services.
 
         :raises ConfigError: a type that cannot be imported, a name ROS does not allow
         """
         self.check_open()
-        return RclpyServer(self, check_topic(service), type_name, on_request)
+        return RclpyServer(self, check_topic(service), type_name, on_request, node)
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> RclpyClient:
         """See services.
@@ -253,7 +258,8 @@ class RclpyMiddleware(RclpyParticipant):
     def discover_services(self) -> dict[str, str]:
         """See services. ROS does not tell servers from clients here. Of several types, the first is taken."""
         self.check_open()
-        own = {service.srv_name for service in self._node.services}
+        nodes = [self._node, *(node for node, _ in tuple(self._shown.values()))]
+        own = {service.srv_name for node in nodes for service in node.services}
         with translated("the graph cannot be read"):
             found = self._node.get_service_names_and_types()
         return {name: type_names[0] for name, type_names in found if type_names and name not in own}
@@ -320,12 +326,23 @@ class RclpyMiddleware(RclpyParticipant):
             except (RuntimeError, NameValidationException) as error:
                 raise MiddlewareError(f"{kind} of {arguments['topic']} failed: {error}") from error
 
-    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any]) -> Any:
-        """Make a service or a client of the node."""
-        try:
-            return getattr(self._node, f"create_{kind}")(service_type, name, *callback, callback_group=self._group)
-        except (RuntimeError, NameValidationException) as error:
-            raise MiddlewareError(f"{kind} of {name} failed: {error}") from error
+    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any], node: str = "") -> Any:
+        """Make a service or a client.
+
+        :param node: absolute name of the node that has it; '' for the participant's own
+        """
+        with self._showing:
+            try:
+                owner = self._shown_node(node) if node else self._node
+                make = getattr(owner, f"create_{kind}")
+                endpoint = make(
+                    service_type, name, *callback, qos_profile=_to_profile(SERVICE_QOS), callback_group=self._group
+                )
+            except (RuntimeError, NameValidationException) as error:
+                raise MiddlewareError(f"{kind} of {name} failed: {error}") from error
+            if node:
+                self._shown[node][1].append(endpoint)
+        return endpoint
 
     def to_bytes(self, message: Any) -> bytes:
         return bytes(serialize_message(message))
@@ -336,7 +353,16 @@ class RclpyMiddleware(RclpyParticipant):
     def destroy(self, kind: str, endpoint: Any) -> None:
         """Destroy an endpoint, in the executor's thread."""
         self._clients = [client for client in self._clients if not client.is_of(endpoint)]
-        with contextlib.suppress(InvalidHandle):  # destroyed with its node already
+        with self._showing, contextlib.suppress(InvalidHandle):  # destroyed with its node already
+            for name, (node, endpoints) in tuple(self._shown.items()):
+                if endpoint in endpoints:
+                    node.destroy_service(endpoint)
+                    endpoints.remove(endpoint)
+                    if not endpoints:
+                        del self._shown[name]
+                        self._executor.remove_node(node)
+                        node.destroy_node()
+                    return
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
     def in_executor(self, work: Callable[[], None]) -> None:
@@ -357,6 +383,24 @@ class RclpyMiddleware(RclpyParticipant):
 
     # Internals
 
+    def _shown_node(self, name: str) -> Any:
+        """The node of that absolute name: ros2 param and ros2 lifecycle look for a node before they call its
+        services."""
+        if name not in self._shown:
+            namespace, _, base = name.rpartition("/")
+            node = Node(
+                base,
+                context=self._context,
+                namespace=namespace or "/",
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+                parameter_overrides=[Parameter("start_type_description_service", value=False)],
+            )
+            self._executor.add_node(node)
+            self._shown[name] = (node, [])
+        return self._shown[name][0]
+
     def _trigger(self) -> bool:
         """Wake the executor; False when it has ended."""
         with self._lock:
@@ -368,7 +412,7 @@ class RclpyMiddleware(RclpyParticipant):
         """The endpoints of other nodes. Another node may have the same name; so from the endpoints with this node's
         name, as many are removed as this node has."""
         name = self._node.get_name(), self._node.get_namespace()
-        others = list(infos)
+        others = [i for i in infos if f"{i.node_namespace.rstrip('/')}/{i.node_name}" not in self._shown]
         for endpoint in own_endpoints:
             if endpoint.topic != topic:
                 continue
@@ -415,6 +459,8 @@ class RclpyMiddleware(RclpyParticipant):
         with self._lock:
             self._open = False
         self._executor.shutdown()
+        for node, _ in self._shown.values():
+            node.destroy_node()
         self._node.destroy_node()
         self._context.try_shutdown()
         while self._work:

@@ -65,8 +65,8 @@ class RclpyParticipant(ServiceGraph):
         """Run work in the executor's thread."""
 
     @abstractmethod
-    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any]) -> Any:
-        """A service or a client of the node."""
+    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any], node: str = "") -> Any:
+        """A service or a client of the node; of another node, which is shown for it, where ``node`` names one."""
 
     @abstractmethod
     def destroy(self, kind: str, endpoint: Any) -> None:
@@ -85,13 +85,13 @@ class RclpyServer(ServiceServer):
     """See :class:`gr_ros2.middleware.services.ServiceServer`."""
 
     def __init__(
-        self, participant: RclpyParticipant, service: str, type_name: str, on_request: RequestCallback
+        self, participant: RclpyParticipant, service: str, type_name: str, on_request: RequestCallback, node: str = ""
     ) -> None:
         self._participant, self._name, self._on_request = participant, service, on_request
         self._type = service_class(type_name)
         self._closed = False
         self._ready = threading.Event()
-        self._endpoint = participant.make("service", self._type, service, self._handed_on)
+        self._endpoint = participant.make("service", self._type, service, self._handed_on, node=node)
         self._send = self._endpoint.send_response
         self._endpoint.send_response = self._taken
         self._ready.set()

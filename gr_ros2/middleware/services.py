@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
-from gr_ros2.middleware.base import Middleware
+from gr_ros2.middleware.base import Middleware, Qos
 
 RequestCallback = Callable[[Hashable, bytes], None]
 """Takes a request: the client, to be given back with the reply, and the message."""
@@ -20,6 +20,8 @@ ServerCallback = Callable[[bool], None]
 """Takes whether a server is there."""
 
 
+SERVICE_QOS = Qos("reliable", "volatile", 1000)
+"""The QoS of services in ROS, except for the depth, which is 10 there. So a burst of calls passes."""
 DESCRIPTION, DESCRIPTION_TYPE = "get_type_description", "type_description_interfaces/srv/GetTypeDescription"
 """The service with which a node describes types since Iron: its name below that of the node, and its type."""
 

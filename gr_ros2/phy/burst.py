@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.fec import Bits, Code, CodeName, Codes, Soft
+from gr_ros2.phy.fec import GNU_RADIO, Bits, Code, CodeName, Codes, Decoders, Soft
 from gr_ros2.phy.soft import BitOrder
 
 Samples = NDArray[np.complex64]
@@ -92,6 +92,7 @@ class Frames:
     :param mask: whitening sequence of the longest frame; shorter frames use its beginning; None = PN9
     :param rung: with an adaptive rate the number of its rung. The CRC-32 then covers rung and packet length too, so
         that no frame is taken for one of another rung or length
+    :param decoders: what decodes the code
     """
 
     def __init__(
@@ -104,16 +105,18 @@ class Frames:
         multiple: int = 1,
         mask: Octets | None = None,
         rung: int | None = None,
+        decoders: Decoders = GNU_RADIO,
     ) -> None:
         form: dict[str, Any] = {"fixed": fixed, "order": order, "multiple": multiple, "mask": mask, "rung": rung}
-        self._again = partial(Frames, packet_len, fec, **form)
+        self._again = partial(Frames, packet_len, fec, **form, decoders=decoders)
         self._rung = rung
         self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
         self.plain = not self.coded and rung is None
         """Whether a frame is packet, filling and their CRC-32, whitened, and nothing else."""
         self.order, self.multiple = order, multiple
         self.mask = whitening(self.length(packet_len)) if mask is None else mask
-        self._codes = Codes(fec)
+        self.decoders = decoders
+        self._codes = Codes(fec, decoders)
         self.of = lru_cache(maxsize=_KEPT)(self._make)
         """The frame by the bytes of its packet."""
 

@@ -23,7 +23,7 @@ from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
-from gr_ros2.phy.kernels import fastest, which
+from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
@@ -36,8 +36,9 @@ _log = logging.getLogger(__name__)
 
 
 _LENGTH = pmt.intern(LENGTH_TAG)
-_BUFFER = 1 << 15
-"""Samples that may wait behind the modulator: several packets, so that the receiver gets several at a time."""
+_BUFFER = 1 << 17
+"""Samples that may wait behind the modulator. GNU Radio hands over at most half of them at once: so many that modulator
+and receiver have a dozen long packets in a call. With a quarter of it, links carry half of the packets of 1,500 B."""
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -86,7 +87,8 @@ class BurstPhy(Phy):
 
         :param form: further arguments of :class:`Frames`
         """
-        return Frames(self.packet_len, self.options.fec, fixed=self.options.lengths == "fixed", **form)
+        fixed = self.options.lengths == "fixed"
+        return Frames(self.packet_len, self.options.fec, fixed=fixed, decoders=decoders(self.kernels), **form)
 
     @property
     def any_length(self) -> bool:

@@ -1,5 +1,8 @@
 """Forward error correction of a frame's bits with GNU Radio's FEC objects, called without its scheduler.
 
+Decoding takes long, and GNU Radio's decoders hold Python's lock meanwhile. So there may be other decoders, see
+:class:`gr_ros2.phy.kernels.codes.CompiledDecoders`.
+
 Invariants: a code of equal name and length is the same at both ends; soft bits are log-likelihood ratios, above 0 for a
 1; coded bits are interleaved over the whole frame, so that a fade affects all parts a little; a decoder always gives a
 result, and only the CRC says whether the frame is right.
@@ -9,10 +12,11 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from math import gcd
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from gnuradio import fec, gr
@@ -24,14 +28,17 @@ Bits = NDArray[np.uint8]
 Soft = NDArray[np.float32]
 CodeName = Literal["none", "cc", "ldpc", "polar"]
 
-_CONSTRAINT, _POLYNOMIALS = 7, [0o117, 0o155]
+Decoder = Callable[[NDArray[Any]], Bits]
+"""Decodes the soft values of one block."""
+
+_CONSTRAINT, POLYNOMIALS = 7, (0o117, 0o155)
 _CC_TAIL = 2 * (_CONSTRAINT - 1)
 _CC_MIDDLE, _CC_STEP = 127.5, 12.0
 """Scaling of soft bits to the bytes that the Viterbi decoder takes: a soft bit of 10 is almost certain, and close to
 the end of the range."""
 _LDPC = ((152, 300, "n_0300_k_0152_gap_03"), (902, 1800, "n_1800_k_0902_gap_28"))
 """GNU Radio's codes of rate one half: data bits, coded bits, file."""
-_LDPC_ROUNDS = 25
+LDPC_ROUNDS = 25
 _LIMIT = 20.0
 """Largest magnitude of a soft bit; the LDPC decoder computes its exponential."""
 _LEAST = 1e-3
@@ -41,6 +48,46 @@ _POLAR_RATE = 0.625
 _POLAR_ROOM = int(_POLAR_MOST * _POLAR_RATE)
 _POLAR_DESIGN_DB = 1.0
 _GOLDEN = 0.618
+
+
+class Decoders(Protocol):
+    """Decoders of the codes."""
+
+    def convolutional(self, bits: int) -> Decoder:
+        """A decoder of ``2 * bits + 12`` levels, 0..255, into ``bits`` bits."""
+
+    def ldpc(self, path: Path, room: int) -> Decoder:
+        """A decoder of log-likelihood ratios into the ``room`` data bits of a block.
+
+        :param path: the matrix, in the alist format
+        """
+
+    def polar(self, size: int, frozen: list[int]) -> Decoder:
+        """A decoder of ``size`` log-likelihood ratios into the bits that are not frozen.
+
+        :param frozen: numbers of the bits that are always 0, in increasing order
+        """
+
+
+class GnuRadioDecoders:
+    """GNU Radio's decoders. They hold Python's lock while they work."""
+
+    def convolutional(self, bits: int) -> Decoder:
+        """See :class:`Decoders`."""
+        arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
+        return partial(_work, fec.cc_decoder.make(*arguments, -1, fec.CC_TERMINATED, False), size=bits)
+
+    def ldpc(self, path: Path, room: int) -> Decoder:
+        """See :class:`Decoders`."""
+        return partial(_work, _ldpc_decoder(str(path)), size=room)
+
+    def polar(self, size: int, frozen: list[int]) -> Decoder:
+        """See :class:`Decoders`."""
+        room = size - len(frozen)
+        return partial(_work, fec.polar_decoder_sc.make(size, room, frozen, [0] * len(frozen)), size=room)
+
+
+GNU_RADIO = GnuRadioDecoders()
 
 
 class Code(ABC):
@@ -100,12 +147,12 @@ class Spread(Code):
 class Convolutional(Code):
     """Rate 1/2, constraint length 7, ended with zeros; soft decisions, Viterbi."""
 
-    def __init__(self, bits: int) -> None:
+    def __init__(self, bits: int, decoders: Decoders) -> None:
         super().__init__(bits)
         self.coded_bits = self.coded(bits)
-        arguments = (bits, _CONSTRAINT, 2, _POLYNOMIALS, 0)
+        arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
         self._encoder = fec.cc_encoder.make(*arguments, fec.CC_TERMINATED, False)
-        self._decoder = fec.cc_decoder.make(*arguments, -1, fec.CC_TERMINATED, False)
+        self._decode = decoders.convolutional(bits)
 
     @staticmethod
     def coded(bits: int) -> int:
@@ -117,7 +164,7 @@ class Convolutional(Code):
 
     def decode(self, soft: Soft) -> Bits:
         levels = np.clip(_CC_MIDDLE + _CC_STEP * soft, 0, 255).astype(np.uint8)
-        return _work(self._decoder, levels, self.bits)
+        return self._decode(levels)
 
 
 class Blocks(Code):
@@ -153,13 +200,13 @@ class Matrix:
     :raises BackendMissingError: if GNU Radio's matrices are not installed
     """
 
-    def __init__(self, room: int, size: int, name: str) -> None:
+    def __init__(self, decoders: Decoders, room: int, size: int, name: str) -> None:
         path = Path(gr.prefix()) / "share" / "gnuradio" / "fec" / "ldpc" / f"{name}.alist"
         if not path.is_file():
             raise BackendMissingError(f"fec 'ldpc' needs {path}, which comes with GNU Radio (apt install gnuradio)")
         self.room, self.size, self.checks = room, size, size - room
         self.encoder = fec.ldpc_encoder.make(str(path))
-        self.decoder = _ldpc_decoder(str(path))
+        self.decode = decoders.ldpc(path, room)
 
 
 class Ldpc(Blocks):
@@ -203,7 +250,7 @@ class Ldpc(Blocks):
         known = np.where(np.abs(soft) < _LEAST, np.float32(_LEAST), np.clip(soft, -_LIMIT, _LIMIT))
         for block in known.reshape(self.count, -1):
             levels[: block.size] = block
-            out.append(_work(matrix.decoder, levels, matrix.room)[: self.each])
+            out.append(matrix.decode(levels)[: self.each])
         data: Bits = np.concatenate(out)[: self.bits]
         return data
 
@@ -212,22 +259,21 @@ def _ldpc_decoder(path: str) -> Any:
     """A decoder that takes log-likelihood ratios. GNU Radio's decoder does so from 3.10.8 on; earlier ones take the
     ratios for a sigma of √½."""
     try:
-        return fec.ldpc_decoder.make(path, 0.5**0.5, _LDPC_ROUNDS)
+        return fec.ldpc_decoder.make(path, 0.5**0.5, LDPC_ROUNDS)
     except TypeError:
-        return fec.ldpc_decoder.make(path, _LDPC_ROUNDS)
+        return fec.ldpc_decoder.make(path, LDPC_ROUNDS)
 
 
 class Polar(Blocks):
     """Rate 0.31 to 0.625, blocks of up to 2048 bits, frozen bits after Arikan; successive cancellation decoder."""
 
-    def __init__(self, bits: int) -> None:
+    def __init__(self, bits: int, decoders: Decoders) -> None:
         super().__init__(bits, _POLAR_ROOM)
         self.coded_bits = self.coded(bits)
         self._size = size = self.coded_bits // self.count
         frozen = np.sort(np.argsort(capacities(size, _POLAR_DESIGN_DB), kind="stable")[: size - self.each]).tolist()
-        zeros = [0] * len(frozen)
-        self._encoder = fec.polar_encoder.make(size, self.each, frozen, zeros, False)
-        self._decoder = fec.polar_decoder_sc.make(size, self.each, frozen, zeros)
+        self._encoder = fec.polar_encoder.make(size, self.each, frozen, [0] * len(frozen), False)
+        self._decode = decoders.polar(size, frozen)
 
     @classmethod
     def coded(cls, bits: int) -> int:
@@ -240,7 +286,7 @@ class Polar(Blocks):
 
     def decode(self, soft: Soft) -> Bits:
         blocks = soft.reshape(self.count, self._size)
-        data: Bits = np.concatenate([_work(self._decoder, block, self.each) for block in blocks])[: self.bits]
+        data: Bits = np.concatenate([self._decode(block) for block in blocks])[: self.bits]
         return data
 
 
@@ -260,11 +306,14 @@ class Codes:
     """The codes of one name, one for each number of bits. They share the parts that are expensive to make.
 
     One thread may encode while another decodes.
+
+    :param decoders: what decodes
     """
 
-    def __init__(self, name: CodeName) -> None:
+    def __init__(self, name: CodeName, decoders: Decoders = GNU_RADIO) -> None:
         self.name = name
-        self._matrix = lru_cache(maxsize=len(_LDPC))(Matrix)
+        self._decoders = decoders
+        self._matrix = lru_cache(maxsize=len(_LDPC))(partial(Matrix, decoders))
 
     def coded_bits(self, bits: int) -> int:
         """Coded bits for this number of bits."""
@@ -279,7 +328,7 @@ class Codes:
             return Uncoded(bits)
         if self.name == "ldpc":
             return Spread(Ldpc(bits, self._matrix(*Ldpc.shape(bits))))
-        return Spread(Convolutional(bits) if self.name == "cc" else Polar(bits))
+        return Spread((Convolutional if self.name == "cc" else Polar)(bits, self._decoders))
 
 
 _CODES: dict[str, type[Convolutional | Ldpc | Polar]] = {"cc": Convolutional, "ldpc": Ldpc, "polar": Polar}

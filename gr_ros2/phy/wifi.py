@@ -299,7 +299,8 @@ class WifiReceiver(ReceiverBlock):
         ratio = blocks.divide_ff()
         short = wifi.sync_short(options.sensitivity, 2, False, False)
         long = wifi.sync_long(length, False, False)
-        carrier = _UNKNOWN_CARRIER if options.channel_hz is None else options.channel_hz
+        # The module corrects the clock offset in the wrong direction; the sign turns it round.
+        carrier = _UNKNOWN_CARRIER if options.channel_hz is None else -options.channel_hz
         estimate = getattr(wifi, options.equalizer.upper())
         self._equalizer = wifi.frame_equalizer(estimate, carrier, phy.sample_rate, False, False)
         self._decoder = _Decoder(phy)

@@ -276,15 +276,12 @@ def write_body(entries: Sequence[Entry], room: int) -> bytes:
     :param room: bytes of the longest body; if the last entry ends there, it leaves out its length where possible
     :raises EncodeError: a field out of range, or more bytes than ``room``
     """
-    parts: list[bytes] = []
-    free = room
+    body = b""
     for entry in entries:
-        data = _write_part(entry, free) if isinstance(entry, Part) else write_control(entry)
-        free -= len(data)
-        parts.append(data)
-    if free < 0:
-        raise EncodeError(f"{room - free} bytes of entries do not fit a body of {room}")
-    return b"".join(parts)
+        body += _write_part(entry, room - len(body)) if isinstance(entry, Part) else write_control(entry)
+    if len(body) > room:
+        raise EncodeError(f"{len(body)} bytes of entries do not fit a body of {room}")
+    return body
 
 
 def read_body(body: bytes, room: int) -> list[Entry]:

@@ -55,6 +55,7 @@ ONLY_PARSED = {
     ("docs/how-to/dashboard.md", "gr-ros2 run demo --dashboard=0.0.0.0:5006"): "opens a port to the network",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --scheduler tcp://HOST:8786"): "needs a Dask cluster",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep pdr-vs-snr"): "takes minutes; tests/study runs the built-in sweeps' cells",
+    ("docs/how-to/sweeps.md", "gr-ros2 sweep rate-vs-snr"): "the same",
     ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
     ("docs/tutorial.md", "gr-ros2 registry from-graph --namespace /robot_1 --out topics.csv"): "needs a robot",
     ("docs/tutorial.md", "gr-ros2 registry check topics.csv"): "the same",

@@ -85,6 +85,15 @@ def test_back_ends_that_are_missing_say_what_they_need(monkeypatch: pytest.Monke
     assert found["middleware zenoh"].remedy.startswith("pip install eclipse-zenoh")
 
 
+def test_a_module_that_a_phy_needs_when_it_is_used_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    monkeypatch.setitem(sys.modules, "ieee802_11", None)
+    found = {finding.what: finding for finding in installed.phys()}["phy wifi"]
+    assert found.state == "note"
+    assert "ieee802_11" in found.text
+    assert "https://github.com/bastibl/gr-ieee802-11" in found.remedy
+
+
 def test_flowgraphs_that_do_not_find_the_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     found = installed.companion()

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import load_scenario
 from gr_ros2.sim.fleet import Fleet
+from gr_ros2.study.forecast import Planner
 from tests.e2e.support import check_complete, check_identical, delivered_bag, scenario
 
 
@@ -23,3 +25,11 @@ def test_each_gets_the_grid_and_the_odometry_of_the_other(tmp_path: Path) -> Non
     for topic in result.topics:
         sent = [message.payload for message in Fleet(cars.sim).messages(1.5, topics={topic.topic})]
         check_identical(delivered_bag(tmp_path, topic.topic.replace("/robot", "/rx_robot")), sent)
+
+
+def test_the_forecast_knows_its_airtime() -> None:
+    pytest.importorskip("ieee802_11", reason="gr-ieee802-11 is not installed")
+    forecast = Planner(load_scenario("wifi-cars", ["ros_source.topics=[odom]"], duration_s=1.0)).forecast()
+    # 36 bytes around a packet, 48 bits a symbol of 8 us, 40 us of preamble and header, a gap of 40 us.
+    assert forecast.airtime_s == pytest.approx((40 + 8 * -(-(22 + 8 * (760 + 36)) // 48) + 40.1) * 1e-6)
+    assert all(topic.result.pdr == 1.0 for topic in forecast.topics)

@@ -49,6 +49,7 @@ PURE_NUMBERS = {
     "bt",
     "carriers",
     "detection_threshold",
+    "sensitivity",
     "domain_id",
     "dst_id",
     "max_sources",

@@ -124,3 +124,44 @@ def test_any_course_of_events_gives_a_rung_of_the_ladder(events: list[tuple[str,
         elif kind == "f":
             rate.forget(robot)
         assert rate.sent(None, now) <= rate.sent(robot, now) < len(LADDER) or not rate.sent(robot, now)
+
+
+def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006) -> tuple[RateController, float, int]:
+    """A controller whose robot reports an SNR that swings, and then falls from 20 dB: the time of the last report, and
+    the rung after it."""
+    rate, now = RateController(LADDER), 0.0
+    rate.meet(7)
+    for number in range(400):  # the channel is one that changes all the time
+        now += report_s
+        swing = abs((number * report_s * slope_db_s) % (2 * depth_db) - depth_db)
+        rate.report(7, 20.0 - swing, 0.1, now)
+        rate.sent(7, now)
+    for number in range(6):
+        now += report_s
+        rate.report(7, 20.0 - slope_db_s * number * report_s, 0.1, now)
+        rung = rate.sent(7, now)
+    return rate, now, rung
+
+
+def test_in_a_fade_the_rung_goes_down_though_no_report_comes() -> None:
+    rate, now, rung = faded(12.0)
+    assert rung >= 2
+    after = [rate.sent(7, now + wait / 1000) for wait in range(1, 40, 3)]
+    assert after == sorted(after, reverse=True)
+    assert after[0] >= after[3] > after[-1] == 0
+
+
+def test_in_a_constant_channel_the_rung_stays_for_the_same_time() -> None:
+    rate = RateController(LADDER)
+    rate.meet(7)
+    for number in range(400):
+        rate.report(7, 20.0, 0.0, number * 0.006)
+    assert {rate.sent(7, 399 * 0.006 + wait / 1000) for wait in range(1, 40, 3)} == {3}
+
+
+def test_after_a_fade_the_rung_rises_with_the_next_report() -> None:
+    rate, now, _ = faded(12.0)
+    for wait in range(10):
+        assert rate.sent(7, now + 0.1 + wait / 1000) <= 1
+    rate.report(7, 20.0, 0.2, now + 0.12)
+    assert rate.sent(7, now + 0.12) == 3

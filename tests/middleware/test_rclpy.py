@@ -18,6 +18,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: source a ROS 2 setup (Hum
 
 import rclpy
 import rclpy.context
+import rclpy.executors
 import rclpy.node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header, String
@@ -25,6 +26,9 @@ from std_msgs.msg import Header, String
 from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.rclpy import RclpyMiddleware, message_class
+from gr_ros2.middleware.type_definitions import type_hash
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.setting import Auto
 from tests.domains import domain
 from tests.waiting import wait_for
@@ -455,3 +459,52 @@ def test_a_service_is_called_from_another_node_and_replies_later(start: Start) -
     wait_for(lambda: there == [True, False], "the server to be missed")
     assert not one.counters
     assert not two.counters
+
+
+def test_a_service_of_a_far_node_is_shown_under_the_name_of_that_node(start: Start) -> None:
+    """As ``ros2 param`` and ``ros2 lifecycle`` need it, which look for the node first."""
+    kind, one, two = "rcl_interfaces/srv/ListParameters", start(node_name="one"), start(node_name="two")
+    far = "/rx_robot_2/planner"
+
+    def nodes() -> list[str]:
+        return [f"{space.rstrip('/')}/{name}" for name, space in two._node.get_node_names_and_namespaces()]
+
+    servers = [one.serve(f"{far}/{name}", kind, lambda *_: None, far) for name in ("list_parameters", "other")]
+    wait_for(lambda: nodes().count(far) == 1, "the node to be shown")
+    wait_for(lambda: len(two._node.get_service_names_and_types_by_node("planner", "/rx_robot_2")) >= 2, "its services")
+    assert far not in {info.topic for info in one.discover()}
+    servers[0].close()
+    assert nodes().count(far) == 1
+    servers[1].close()
+    wait_for(lambda: far not in nodes(), "the node to leave with its last service")
+    again = one.serve(f"{far}/list_parameters", kind, lambda *_: None, far)
+    wait_for(lambda: far in nodes(), "the node to come back")
+    (events,) = [info for info in one.discover() if info.topic == "/parameter_events"]
+    assert len(events.publishers) == 1  # that of node two
+    again.close()
+    assert not one.counters
+
+
+def test_nodes_that_use_a_type_can_be_asked_about_it(start: Start, host: rclpy.node.Node) -> None:
+    """By the service that nodes have since Jazzy."""
+    learned: list[Described] = []
+    one = start(node_name="one")
+    host.create_publisher(Header, "/custom", 1)
+    wait_for(one.discover, "the publisher")
+    witnesses = one.witnesses("/custom", "std_msgs/msg/Header")
+    if not witnesses:
+        pytest.skip("this ROS 2 gives no type hashes")
+    assert witnesses[0].digest == type_hash("std_msgs/msg/Header")
+    assert witnesses[0].services == ("/host/get_type_description",)
+    executor = rclpy.executors.SingleThreadedExecutor(context=host.context)
+    executor.add_node(host)
+    spinning = threading.Thread(target=executor.spin, daemon=True)
+    spinning.start()
+    monkey = pytest.MonkeyPatch()
+    with monkey.context() as patch:
+        patch.setattr("gr_ros2.middleware.type_search.ships", lambda *_: False)
+        search = TypeSearch(one, lambda: [("/custom", "std_msgs/msg/Header")], learned.append)
+        wait_for(lambda: learned, "the description")
+        search.close()
+    executor.shutdown()
+    assert learned[0].types.keys() == {"std_msgs/msg/Header", "builtin_interfaces/msg/Time"}

@@ -97,7 +97,7 @@ class Node(RclpyParticipant):
     def in_executor(self, work: Callable[[], None]) -> None:
         work()
 
-    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any]) -> Any:
+    def make(self, kind: str, service_type: Any, name: str, *callback: Callable[..., Any], node: str = "") -> Any:  # noqa: ARG002
         assert (service_type, name) == (Add, "/add")
         self.made.append(Service(*callback) if kind == "service" else Client())
         return self.made[-1]

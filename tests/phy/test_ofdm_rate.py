@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstReceiver, Heard, Samples
+from gr_ros2.phy.burst import Heard, Samples
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.length_word import LENGTHS, RUNGS, WORD_BITS, LengthWord, header_bits, header_crc, rung_mark
 from gr_ros2.phy.ofdm_rate import RUNGS as LADDER
@@ -37,7 +37,7 @@ def adaptive(kernels: str = "auto") -> Any:
 
 def heard(phy: Any, *bursts: Samples) -> list[Heard]:
     silence = np.zeros(400, np.complex64)
-    return BurstReceiver(phy.running_modem).feed(np.concatenate([silence, *bursts, silence, silence]))
+    return phy.running_modem.receiver().feed(np.concatenate([silence, *bursts, silence, silence]))
 
 
 def with_header(phy: Any, burst: Samples, change: Any) -> Samples:

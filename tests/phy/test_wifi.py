@@ -270,6 +270,18 @@ def test_no_packet_is_lost_wherever_it_falls(snr_db: float | None, late: float) 
 
 
 @with_the_module
+@pytest.mark.parametrize("ppm", [-40, 40])
+def test_with_the_channel_known_clocks_may_differ(ppm: int) -> None:
+    """One oscillator makes carrier and samples."""
+    told = make(760, encoding="qpsk-1/2", channel_hz=5.89e9)
+    recording = record(told, 10)
+    offset = ppm * 1e-6 * 5.89e9 / RATE
+    channel = ChannelConfig(snr_db=20, epsilon=1 + ppm * 1e-6, frequency_offset=offset, seed=1)
+    assert deliver(told, recording, channel) == recording.packets
+    assert len(deliver(make(760, encoding="qpsk-1/2"), recording, channel)) < 5
+
+
+@with_the_module
 @pytest.mark.parametrize("equalizer", ["ls", "lms", "sta"])
 @pytest.mark.parametrize("snr_db", [8.0, 20.0])
 def test_the_snr_told_is_that_of_the_channel(equalizer: str, snr_db: float) -> None:

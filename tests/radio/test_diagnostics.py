@@ -103,6 +103,7 @@ STATS = {
     "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "publish_failed": 0, "topics": {}},
     "packets": {"out": 0, "backlog": 0, "damaged": 0, "foreign": 0},
     "phy": {"airtime_s": 0.0},
+    "front_end": {"name": "sim", "passed": {}, "lost": {}},
 }
 QUICK = DiagnosticsConfig(period_s=0.01)
 

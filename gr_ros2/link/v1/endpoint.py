@@ -122,6 +122,8 @@ class Endpoint:
         """What arrived and what did not."""
         self.answers = bool(topics) or settings.hears
         """Whether what it receives can change what it sends."""
+        self.urged = False
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
         self._observer = observer
         self._decoder_for = decoder_for
         self._rows = rows
@@ -133,7 +135,7 @@ class Endpoint:
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
         """Number of bytes to which the packet with its padded body extends."""
         self._trailer = self.keys.own(settings.src_id, boot)
-        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=self._tell)
+        self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=observer)
         self.sent = self.outbox.stats
         """What left and what did not."""
         self.window = RepairWindow(
@@ -215,7 +217,8 @@ class Endpoint:
         new = total - self.sent.missed[topic_id]
         if new > 0:
             self.sent.missed[topic_id] = total
-            self._tell(Missed(topic_id, new))
+            if self._observer is not None:
+                self._observer(Missed(topic_id, new))
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """Policy and deadline (s, 0 for none) of a topic's queue."""
@@ -354,10 +357,10 @@ class Endpoint:
         times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
         return min(times, default=None)
 
-    def next_departure(self) -> float | None:
-        """When ``next_packet`` may have something, if no other method is called before."""
+    def next_departure(self, *, credited: bool = False) -> float | None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         now = self._now
-        if self.out_of_credit or not self.answers:
+        if (self.out_of_credit and not credited) or not self.answers:
             return None
         leaving = [self._talk.due]
         waiting = self.outbox.next_timeout(now)
@@ -368,7 +371,7 @@ class Endpoint:
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
-        if self._mode() != "off" and self.window.unconfirmed(now):
+        if min(leaving) > now and self._mode() != "off" and self.window.unconfirmed(now):
             poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
             doubt = min(now + poll_s, self.window.next_doubt(now))
             leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
@@ -377,6 +380,7 @@ class Endpoint:
     # ---- what leaves
 
     def _compose(self, now: float) -> bytes | None:
+        self.urged = False
         if not self._started:
             self._start(now)
         outbox, talk = self.outbox, self._talk
@@ -418,7 +422,7 @@ class Endpoint:
 
     def _new(self, filling: Filling, due: Sequence[Neighbour], now: float) -> bytes:
         """A source packet, with a report where there is room for one."""
-        entries: list[Entry] = list(filling.parts)
+        entries = filling.parts
         free = self._room - filling.used
         for neighbour in due:
             if free >= neighbour.inbox.report_len:
@@ -427,7 +431,7 @@ class Endpoint:
                 self._unheard = 0
             else:
                 self._unheard += 1
-        return self._source(entries, filling.lives, filling.qos, tuple(filling.sent), now)
+        return self._source(entries, filling.lives, filling.qos, filling.sent, now)
 
     def _source(
         self, entries: list[Entry], lives: tuple[Life, ...], qos: int, parts: tuple[SentEntry, ...], now: float
@@ -520,14 +524,15 @@ class Endpoint:
         stats.packets += 1
         if self._rate is not None:
             self._choose_rung(kind, now)
-        self._tell(SentPacket(data, packet, parts, now, kind, self.rung))
+        if self._observer is not None:
+            self._observer(SentPacket(data, packet, parts, now, kind, self.rung))
         return data
 
     def _choose_rung(self, kind: AirKind, now: float) -> None:
         """Choose the rung of the packet that leaves. Hellos are also for robots that are not known yet."""
         assert self._rate is not None
         rung = self._rate.sent(None if self.settings.dst_id == BROADCAST else self.settings.dst_id, now)
-        self.rung = 0 if kind == "hello" else rung
+        self.rung = 0 if kind in {"hello", "report"} else rung
 
     def _padded(self, body: bytes, clear: bytes) -> bytes:
         return body.ljust(self._end_of_body - len(clear), b"\0")
@@ -583,6 +588,8 @@ class Endpoint:
     def _use(self, data: bytes, opened: Opened, now: float) -> None:
         self.received.packets += 1
         neighbour, number, standing = opened.neighbour, opened.number, opened.standing
+        control = standing is not None and not standing.mask
+        self.urged = self.urged or control or self._talk.lacking
         if opened.met:
             self._meet(opened, now)
         inbox = neighbour.inbox
@@ -673,7 +680,3 @@ class Endpoint:
             elif isinstance(event, Lost):
                 stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
                 stats.message_loss_est += 1
-
-    def _tell(self, event: SenderEvent) -> None:
-        if self._observer is not None:
-            self._observer(event)

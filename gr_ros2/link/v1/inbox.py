@@ -45,8 +45,12 @@ _CALM = 1 / 128
 _SLOWER = 1.1
 """By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
 must not grow faster."""
-_SNR_SMOOTHING = 0.25
-"""Share of a new packet in the reported SNR: one preamble gives the SNR only to 1 dB."""
+_SNR_ERROR = 1.3
+"""Mean square of the error of an SNR that one preamble gives, dB^2, with a margin."""
+_LEAST_SHARE, _MOST_SHARE = 0.2, 0.8
+"""Limits of the share of a new packet in the reported SNR. The more the SNRs of packets differ from the reported one,
+the greater is the share (a Kalman filter whose channel noise is estimated)."""
+_SQUARE_SMOOTHING = 0.125
 _SNR_CHANGE_DB = 1.5
 """Change of the SNR that is reported at once."""
 _WAITING = 256
@@ -100,6 +104,8 @@ class Inbox:
         """Recent share of lost packets."""
         self.snr_db: float | None = None
         """SNR of the newest packets, dB; None where it is not measured."""
+        self._square = _SNR_ERROR
+        """Mean square of the differences of new SNRs from the reported one, dB^2."""
         self._reported_db: float | None = None
         self._settings = settings
         self._room = room
@@ -286,7 +292,12 @@ class Inbox:
 
     def measured(self, snr_db: float) -> None:
         """Note the SNR of a packet, dB."""
-        self.snr_db = snr_db if self.snr_db is None else self.snr_db + _SNR_SMOOTHING * (snr_db - self.snr_db)
+        if self.snr_db is None:
+            self.snr_db = snr_db
+        new = snr_db - self.snr_db
+        self._square += _SQUARE_SMOOTHING * (new * new - self._square)
+        share = min(max(1 - _SNR_ERROR / max(self._square, _SNR_ERROR), _LEAST_SHARE), _MOST_SHARE)
+        self.snr_db += share * new
 
     @property
     def held(self) -> int:

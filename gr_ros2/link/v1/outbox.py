@@ -42,7 +42,7 @@ from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
-from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Part, fit
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
 
 SHARE = 3
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -59,7 +59,7 @@ WORTH = 0.85
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
 REPORTED_DEPTH = 160
 """Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
-known."""
+known; but it is repaired for as long as a receiver waits for it (``hold_s``)."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -97,7 +97,7 @@ class _Line:
     :param ordered: whether all its publishers are reliable
     :param hidden: whether the table leaves it out: a service whose server is not there
     :param newest: when the newest of its messages that have left was submitted, s
-    :param lives: lifetimes of its messages that have left, and the packets of each
+    :param lives: lifetimes of its messages that have left, the packets of each, and when it left in s
     :param packets: the packets of all of them
     """
 
@@ -110,7 +110,7 @@ class _Line:
     depth: int = 0
     ordered: bool = True
     newest: float = -inf
-    lives: deque[tuple[Life, int]] = field(default_factory=deque)
+    lives: deque[tuple[Life, int, float]] = field(default_factory=deque)
     packets: int = 0
 
 
@@ -118,8 +118,8 @@ class _Line:
 class Filling:
     """The content of a source packet."""
 
-    parts: list[Part]
-    sent: list[SentEntry]
+    parts: list[Entry]
+    sent: tuple[SentEntry, ...]
     lives: tuple[Life, ...]
     qos: int
     used: int
@@ -141,13 +141,13 @@ class Outbox:
         boot: int,
         room: int,
         codec: MessageCodec | None,
-        observer: Observer,
+        observer: Observer | None,
     ) -> None:
         self._settings = settings
         self._boot = boot
         self._room = room
         self._codec = codec
-        self._observe = observer
+        self._observer = observer
         self._lines: dict[int, _Line] = {}
         self._kept: dict[int, deque[_Kept]] = {}
         self._open: dict[int, Sequence[Outgoing]] = {}
@@ -209,10 +209,10 @@ class Outbox:
         self._serial += 1
         self.stats.submitted[topic_id] += 1
         codec = self._codec
-        if codec is None:
-            self._observe(Accepted(serial, topic_id, payload, now))
-        else:
-            self._observe(Accepted(serial, topic_id, payload, now, codec.canonical(topic_id, payload)))
+        if self._observer is not None:
+            expected = None if codec is None else codec.canonical(topic_id, payload)
+            self._observer(Accepted(serial, topic_id, payload, now, expected))
+        if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
@@ -250,13 +250,14 @@ class Outbox:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the kept messages."""
+        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic.
+
+        A receiver remembers no other of a topic. If hellos named older ones too, it would ask for them for ever.
+        """
         return [
-            (topic_id, kept.mark)
+            (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC
-            for kept in messages
-            if now >= kept.named
+            if topic_id != TABLE_TOPIC and now >= messages[-1].named
         ]
 
     def follow(
@@ -424,7 +425,7 @@ class Outbox:
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
-        parts: list[Part] = []
+        parts: list[Entry] = []
         sent: list[SentEntry] = []
         lives: list[Life] = []
         stats, qos = self.stats, picks[0][0].qos
@@ -450,7 +451,7 @@ class Outbox:
                 self._left(message, line, now)
         self._turns.sent(self._holder)
         stats.entries += len(picks)
-        return Filling(parts, sent, tuple(lives), qos, used)
+        return Filling(parts, tuple(sent), tuple(lives), qos, used)
 
     def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""
@@ -458,18 +459,20 @@ class Outbox:
         line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
         lives = line.lives
-        most = self._settings.depth
+        most, least_s = self._settings.depth, 0.0
         if line.queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = line.depth or REPORTED_DEPTH
+            most, least_s = (line.depth, 0.0) if line.depth else (REPORTED_DEPTH, self._settings.hold_s)
         elif lives:
-            before, _ = lives[-1]
+            before, _, _ = lives[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((life, message.index))
+        lives.append((life, message.index, now))
         line.packets += message.index
-        while len(lives) > 1 and (len(lives) > most or (line.packets > GROUP and not self.reported)):
-            replaced, count = lives.popleft()
+        while len(lives) > 1 and (
+            (len(lives) > most and now - lives[0][2] >= least_s) or (line.packets > GROUP and not self.reported)
+        ):
+            replaced, count, _ = lives.popleft()
             replaced.end()
             line.packets -= count
         if topic_id not in self._kept:
@@ -492,7 +495,8 @@ class Outbox:
 
     def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
-        self._observe(Refused(serial, topic_id, reason, detail))
+        if self._observer is not None:
+            self._observer(Refused(serial, topic_id, reason, detail))
 
 
 def _line(topic: Topic, queue: TopicQueue) -> _Line:

@@ -375,14 +375,15 @@ class RepairWindow:
     def next_doubt(self, now: float) -> float:
         """When a report about one of the newest packets, or about a repair, is overdue next (thrifty), s; inf if none
         is expected."""
-        times = [at for at, _, _ in self._flight if at > now][:1]
+        soonest = next((at for at, _, _ in self._flight if at > now), inf)
         waits = [(peer.bit, peer.patience) for peer in self._receivers.values()]
-        for number in range(self.newest, max(self._oldest, self.newest - GROUP + 1) - 1, -1):
-            record = self._records.get(number)
-            if record is not None:
-                overdue = (record.at + patience for bit, patience in waits if not record.confirmed & bit)
-                times += [at for at in overdue if at > now]
-        return min(times, default=inf)
+        for record in reversed(self._records.values()):
+            if record.number <= self.newest - GROUP:
+                break
+            for bit, patience in waits:
+                if not record.confirmed & bit and now < record.at + patience < soonest:
+                    soonest = record.at + patience
+        return soonest
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
         """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and

@@ -46,6 +46,8 @@ class Talk:
         self._answers: dict[int, int] = {}
         self._mark = 0
         self._look_at = -inf
+        self.lacking = False
+        """Whether other robots keep messages that this one lacked when it last looked."""
         self.due = -inf
         """When the next hello is due, s."""
 
@@ -109,11 +111,13 @@ class Talk:
         if now < self._look_at or not self._settings.hears:
             return found
         self._look_at = now + LOOK_S
+        self.lacking = False
         for neighbour in neighbours:
             hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
             lacking = [mark[0] for mark in hello.marks if inbox.lacks(mark, now)]
             if hello.digest and hello.digest != inbox.digest and inbox.lacks((TABLE_TOPIC, hello.digest), now):
                 lacking.append(TABLE_TOPIC)
+            self.lacking = self.lacking or bool(lacking)
             wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
             if wanted:
                 found.append(Ask(neighbour.src_id, wanted))

@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <exception>
 
+#include "codes.h"
 #include "stream.h"
 
 #define GR_ROS2_API extern "C" __attribute__((visibility("default")))
@@ -30,7 +31,7 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 // Version of this interface and of the parameters in `modem.h`. Increase it with each change, here and in
 // `kernels/library.py`.
-GR_ROS2_API int kernels_version() { return 4; }
+GR_ROS2_API int kernels_version() { return 5; }
 
 // What it was compiled for.
 GR_ROS2_API const char* kernels_target() {
@@ -105,6 +106,34 @@ GR_ROS2_API int modem_take(const void* modem, void* stream) {
 GR_ROS2_API int modem_modulate(const void* modem, const void* batch) {
     try {
         return modulate(*static_cast<const Modem*>(modem), *static_cast<const Batch*>(batch));
+    } catch (const std::exception&) {
+        return -1;
+    }
+}
+
+// The decoders of codes.h: 1, or -1 without memory.
+GR_ROS2_API int decode_convolutional(const uint8_t* levels, int64_t bits, const int32_t* polynomials, uint8_t* out) {
+    try {
+        Viterbi::decode(levels, bits, polynomials, out);
+        return 1;
+    } catch (const std::exception&) {
+        return -1;
+    }
+}
+
+GR_ROS2_API int decode_ldpc(const void* checks, const float* soft, uint8_t* out) {
+    try {
+        decode_ldpc(*static_cast<const Checks*>(checks), soft, out);
+        return 1;
+    } catch (const std::exception&) {
+        return -1;
+    }
+}
+
+GR_ROS2_API int decode_polar(int32_t size, const float* soft, const uint8_t* frozen, uint8_t* out) {
+    try {
+        Polar::decode(size, soft, frozen, out);
+        return 1;
     } catch (const std::exception&) {
         return -1;
     }

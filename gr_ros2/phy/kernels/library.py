@@ -13,10 +13,12 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 _FOLDER = Path(__file__).parent
 _EVERYWHERE, _AVX2 = "_baseline", "_avx2"
 """Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
-VERSION = 4
+VERSION = 5
 """Version of ``abi.cpp``. A library that was built before a change of it is not used."""
 _POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
@@ -29,6 +31,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "modem_read": (_INT, [_POINTER, _POINTER, _LONG, _LONG, _POINTER, _POINTER, _POINTER]),
     "modem_take": (_INT, [_POINTER, _POINTER]),
     "modem_modulate": (_INT, [_POINTER, _POINTER]),
+    "decode_convolutional": (_INT, [_POINTER, _LONG, _POINTER, _POINTER]),
+    "decode_ldpc": (_INT, [_POINTER, _POINTER, _POINTER]),
+    "decode_polar": (_INT, [_INT, _POINTER, _POINTER, _POINTER]),
 }
 """Result and arguments of each function of ``abi.cpp``."""
 
@@ -78,3 +83,19 @@ def _open(path: Path) -> Any:
     if functions.kernels_version() != VERSION:
         raise OSError(f"{path.name} is of version {functions.kernels_version()}, not {VERSION}")
     return functions
+
+
+def address(array: NDArray[Any]) -> int:
+    """Where an array's values are."""
+    place: int = array.__array_interface__["data"][0]  # three times as fast as array.ctypes
+    return place
+
+
+def checked(result: int) -> int:
+    """The result of a function.
+
+    :raises MemoryError: when memory was short
+    """
+    if result < 0:
+        raise MemoryError("no memory for a compiled kernel to work in")
+    return result

@@ -14,10 +14,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, ModemConstants, Reading, Samples, Search
-from gr_ros2.phy.kernels.library import loaded
+from gr_ros2.phy.kernels.library import address, checked, loaded
 
 _NONE = -(2**63)
 _NO_MEMORY = 2**63 - 1
@@ -93,7 +92,7 @@ class _FrameForm(ctypes.Structure):
 
     def __init__(self, frames: Frames) -> None:
         self._mask = np.ascontiguousarray(frames.mask, np.uint8)
-        super().__init__(frames.multiple, frames.order == "big", _address(self._mask) if frames.plain else None)
+        super().__init__(frames.multiple, frames.order == "big", address(self._mask) if frames.plain else None)
 
 
 class _Batch(ctypes.Structure):
@@ -191,8 +190,8 @@ class CompiledModem(BurstModem):
         numbers = np.array((lengths, [len(one) for one in data]), np.int32)
         assert len(out) >= sizes.sum()
         arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
-        batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(_address, arrays))
-        if not _checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
+        batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(address, arrays))
+        if not checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
             self._reference.modulate_into(packets, gap, out)
 
     def receiver(self) -> BurstReceiver:
@@ -204,15 +203,12 @@ class CompiledModem(BurstModem):
         :raises MemoryError: when memory is short
         """
         stream.frames = ctypes.addressof(self._form)
-        reason: int = self._functions.modem_take(self._kernel, ctypes.addressof(stream))
-        if reason < 0:
-            raise MemoryError("no memory for a compiled kernel to work in")
-        return reason
+        return checked(self._functions.modem_take(self._kernel, ctypes.addressof(stream)))
 
     def find(self, samples: Samples) -> Search:
         samples = np.ascontiguousarray(samples, np.complex64)
         start = ctypes.c_int64()
-        found = self._functions.modem_find(self._kernel, _address(samples), len(samples), ctypes.addressof(start))
+        found = self._functions.modem_find(self._kernel, address(samples), len(samples), ctypes.addressof(start))
         return Search(_counted(found), None if start.value == _NONE else start.value)
 
     def read(self, samples: Samples, start: int) -> Reading | None:
@@ -220,8 +216,8 @@ class CompiledModem(BurstModem):
         soft_bits, most_points = self.reading_size
         soft, points = np.empty(soft_bits, np.float32), np.empty(most_points, np.complex64)
         report = _Report()
-        given = (_address(samples), len(samples), start, _address(soft), _address(points), ctypes.addressof(report))
-        result = _checked(self._functions.modem_read(self._kernel, *given))
+        given = (address(samples), len(samples), start, address(soft), address(points), ctypes.addressof(report))
+        result = checked(self._functions.modem_read(self._kernel, *given))
         if result == _NO_BURST:
             return None
         if result == _CUT:
@@ -247,13 +243,13 @@ class CompiledReceiver(BurstReceiver):
         soft, points = modem.reading_size
         self._soft, self._points = np.empty(soft, np.float32), np.empty((2, points), np.complex64)
         self._stream = stream = _Stream()
-        stream.samples = _address(self._buffer)
+        stream.samples = address(self._buffer)
         stream.margin, stream.span = modem.margin, modem.span
         stream.peak, stream.burst, stream.stretch = modem.peak_samples, modem.burst_samples, self._stretch
         stream.room, stream.row_size = _ROOM, points
-        stream.packets, stream.lengths = _address(self._packets), _address(self._lengths)
-        stream.snrs = _address(self._newest_snrs)
-        stream.soft, stream.points = _address(self._soft), _address(self._points)
+        stream.packets, stream.lengths = address(self._packets), address(self._lengths)
+        stream.snrs = address(self._newest_snrs)
+        stream.soft, stream.points = address(self._soft), address(self._points)
 
     def _take(self) -> list[Heard]:
         stream = self._stream
@@ -314,7 +310,7 @@ def _new(functions: Any, constants: ModemConstants) -> int:
             values.append(value)
         else:
             arrays.append(np.ascontiguousarray(value, kind.removesuffix("s")))
-            values.append(_address(arrays[-1]))
+            values.append(address(arrays[-1]))
     types = [(name, _NUMBERS.get(kind, ctypes.c_void_p)) for name, kind in fields.items()]
     struct = type("Parameters", (ctypes.Structure,), {"_fields_": types})(*values)
     kernel: int | None = functions.modem_new(number, ctypes.addressof(struct), ctypes.sizeof(struct))
@@ -323,18 +319,7 @@ def _new(functions: Any, constants: ModemConstants) -> int:
     return kernel
 
 
-def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]  # three times as fast as array.ctypes
-    return address
-
-
 def _counted(result: int) -> int:
     if result == _NO_MEMORY:
-        raise MemoryError("no memory for a compiled kernel to work in")
-    return result
-
-
-def _checked(result: int) -> int:
-    if result < 0:
         raise MemoryError("no memory for a compiled kernel to work in")
     return result

@@ -58,6 +58,34 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     assert one.end.sent.air["repair"] == 0
 
 
+def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+    air.run(1.5)
+    one.end.submit(ODOM, text(1), air.now)
+    air.run(3 * SLOT_S)
+    now = air.now
+    one.end.submit(ODOM, text(2), now)
+    message = one.slot(now)
+    assert message is not None
+    two.end.receive(message, now)
+    due = two.end.next_departure(credited=True)
+    assert not two.end.urged, "a message alone lets nothing leave"
+    assert due is not None
+    assert due > now, "its report may wait"
+    assert one.end.next_departure() is None, "its credit is used"
+    later = one.end.next_departure(credited=True)
+    assert later is not None
+    assert later > now, "a credit alone lets nothing leave"
+    one.end.add([("late", "std_msgs/msg/String", TopicOptions())])
+    hello = one.slot(now)
+    assert hello is not None
+    two.end.receive(hello, now)
+    assert two.end.urged, "it asks for the table of topics"
+    two.slot(now)
+    assert not two.end.urged
+
+
 def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_loss() -> None:
     one, two = Robot(1, registry()), Robot(2)
     air = Air(one, two)
@@ -145,6 +173,27 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> No
     assert late.delivered() == [text(1, 700)]
     assert waited <= (packets + 2 * 4 + 4) * SLOT_S  # the map, two round trips of two slots each way, and the table
     assert two.delivered() == [text(1, 700)]
+
+
+def test_several_messages_kept_of_one_topic_are_sent_to_a_late_robot_once() -> None:
+    """As a publisher of depth 10 has them, whose depth its graph did not tell."""
+    topics = registry(odom=TopicOptions(), map=LATCHED)
+    one, two, late = Robot(1, topics), Robot(2), Robot(3)
+    air = Air(one, two)
+    one.end.follow(1, reliable=True, latched=True, depth=10)
+    sent = [text(number) for number in range(5)]
+    for payload in sent:
+        one.end.submit(1, payload, air.now)
+        air.run(1.0)
+    air.run(20.0)
+    assert two.delivered() == sent
+    assert one.end.sent.repeats == 1  # the table
+    air.robots.append(late)
+    air.run(20.0)
+    assert late.delivered() == sent
+    repeats = one.end.sent.repeats
+    air.run(60.0)
+    assert one.end.sent.repeats == repeats and late.delivered() == sent
 
 
 def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_keep() -> None:

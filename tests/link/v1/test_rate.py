@@ -105,3 +105,35 @@ def test_without_a_ladder_nothing_is_chosen_and_without_an_snr_none_is_reported(
         assert sender.rung == 0
     (neighbour,) = receiver.neighbours
     assert neighbour.inbox.report(0.0).snr_db is None
+
+
+def test_reports_leave_at_the_most_robust_rung() -> None:
+    fleet = Fleet({2: 30.0})
+    fleet.run(100)
+    settings = Settings(3, packet_len=64, fixed=False, packet_rate=0)
+    told: list[SenderEvent] = []
+    other = Endpoint(TOPICS, settings, boot=6, observer=told.append, ladder=LADDER)
+    for number in range(100):
+        now = fleet.now + number * STEP_S
+        fleet.sender.submit(0, bytes(30), now)
+        data = fleet.sender.next_packet(now)
+        if data is not None:
+            other.receive(data, now, 30.0)
+        if (answer := other.next_packet(now)) is not None:
+            fleet.sender.receive(answer, now, 30.0)
+    reports = [event for event in told if isinstance(event, SentPacket) and event.kind == "report"]
+    assert reports
+    assert {event.rung for event in reports} == {0}
+
+
+def test_the_reported_snr_follows_a_channel_that_changes_and_averages_one_that_does_not() -> None:
+    fleet = Fleet({2: 20.0})
+    fleet.run(100)
+    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours)
+    for error_db in (1.0, -1.0) * 20:
+        inbox.measured(20.0 + error_db)
+    assert inbox.snr_db is not None
+    assert abs(inbox.snr_db - 20.0) < 0.5
+    for step in range(12):
+        inbox.measured(20.0 - 2.0 * step)
+    assert inbox.snr_db < 20.0 - 2.0 * 11 + 3.0
