@@ -25,6 +25,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import fuzz.framing
 import fuzz.kernels
+import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
 HARNESSES = {
@@ -39,6 +40,7 @@ HARNESSES = {
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
     "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
+    "wifi": (fuzz.wifi.wifi, fuzz.wifi.corpus),
 }
 COUNTS = {
     "wire": 20_000,
@@ -53,6 +55,7 @@ COUNTS = {
     "dashboard": 300,
     "framing": 1_000,
     "kernels": 400,
+    "wifi": 200,
 }
 if find_spec("bokeh") is not None:
     import fuzz.dashboard

@@ -84,9 +84,10 @@ class PaperScheduler:
         lengths: list[int] = []
         length = message.plan(cut)
         index, remaining = message.index, message.remaining
+        room, packet_len = self._format.room, self.config.packet_len
         most = self._format.max_entries if self.config.greedy else 1
         while len(lengths) < most and index < message.total:
-            if length > self._format.room(self.config.packet_len, entries + len(lengths), payload):
+            if length > room(packet_len, entries + len(lengths), payload):
                 break
             lengths.append(length)
             payload += length

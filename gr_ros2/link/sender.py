@@ -71,6 +71,7 @@ class Sender:
         self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
         self._classes = [(QOS_NAMES.index(topic.options.qos), topic.options.weight) for topic in self.registry]
         """Class and weight of each topic's messages."""
+        self._depths = [topic.options.queue_depth for topic in self.registry]
         self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
         """Topics whose newest message is kept for robots that join late."""
         self._with_deadline = self._deadlines()
@@ -179,7 +180,7 @@ class Sender:
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
-        depth = self.registry[topic_id].options.queue_depth
+        depth = self._depths[topic_id]
         return self.config.queue_depth if depth == AUTO else depth
 
     def use_credit(self) -> None:

@@ -10,15 +10,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
-from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
 from tests.gr.probe import Probe
+from tests.phy.test_loopback import make
 from tests.waiting import wait_for
-
-
-def make(name: str) -> Phy:
-    phy: Phy = PHY.load(name)(64, 5e6)
-    return phy
 
 
 @pytest.mark.parametrize("throttled", [True, False])

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.errors import BackendMissingError, ConfigError, PhyError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from tests.gr.probe import Probe
@@ -22,7 +22,10 @@ RATE = 5e6
 
 
 def make(name: str, packet_len: int = 64) -> Phy:
-    phy: Phy = PHY.load(name)(packet_len, RATE)
+    try:
+        phy: Phy = PHY.load(name)(packet_len, RATE)
+    except BackendMissingError as error:
+        pytest.skip(str(error))
     return phy
 
 
@@ -157,10 +160,10 @@ def test_a_loss_out_of_range_is_refused() -> None:
 def test_it_stops_cleanly_at_any_moment_and_leaves_no_thread(name: str) -> None:
     for rounds in range(4):
         source, sink = Probe(), Probe()
-        link = LoopbackLink(make(name, 1500), source, sink)
+        link = LoopbackLink(make(name, 1492), source, sink)
         link.stop()
         link.start()
-        for packet in packets(rounds * 20, 1500):
+        for packet in packets(rounds * 20, 1492):
             source.post(packet)
         started = time.monotonic()
         link.stop()
