@@ -18,6 +18,7 @@ BENCHMARKS = {
     "repair": "bench.repair",
     "repair_runs": "bench.repair_runs",
     "saturated": "bench.saturated",
+    "bound": "bench.bound",
     "endpoint": "bench.endpoint",
     "hostile": "bench.hostile",
     "port": "bench.port",

@@ -114,6 +114,8 @@ class RunMonitor:
         return self.snapshot
 
     def _tick(self, run: LiveRun, state: DashboardState) -> None:
+        for src_id, source in run.sources.items():
+            state.subscribed(src_id, source.subscribed)
         queued = {
             (src_id, topic["topic_id"]): topic["queued"]
             for src_id, source in run.sources.items()

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from gr_ros2.dashboard.topic_names import TopicNames
 from gr_ros2.dashboard.views import PacketView, SpanView
 from gr_ros2.link.events import Received, Rejected
-from gr_ros2.registry import Registry
 from gr_ros2.wire import QOS_NAMES, Packet, Span, format_of
 
 NO_COLOUR = -1
@@ -19,7 +19,7 @@ NO_COLOUR = -1
 def packet_views(
     events: Iterable[tuple[float, Received | Rejected]],
     packet_len: int,
-    registry: Registry,
+    names: TopicNames,
     colours: Mapping[tuple[int, int], int],
     start: float,
 ) -> tuple[PacketView, ...]:
@@ -51,7 +51,7 @@ def packet_views(
                 hop=packet.hop,
                 entries=len(packet.entries),
                 spans=tuple(
-                    _span(span, packet.src_id, registry, colours)
+                    _span(span, packet.src_id, names, colours)
                     for span in wire.layout(packet, packet_len, len(event.data))
                     if span.size
                 ),
@@ -74,10 +74,9 @@ def _missing(packet: Packet, newest: dict[int, int]) -> int:
     return max(ahead - packet.numbered, 0)
 
 
-def _span(span: Span, src_id: int, registry: Registry, colours: Mapping[tuple[int, int], int]) -> SpanView:
+def _span(span: Span, src_id: int, names: TopicNames, colours: Mapping[tuple[int, int], int]) -> SpanView:
     entry = span.entry
     if entry is None:
         return SpanView(span.kind, span.size)
-    name = registry[entry.topic_id].name if entry.topic_id < len(registry) else f"topic {entry.topic_id}"
-    text = f"{name} {entry.label} {len(entry.payload)} B"
+    text = f"{names.of((src_id, entry.topic_id))} {entry.label} {len(entry.payload)} B"
     return SpanView(span.kind, span.size, text, colours.get((src_id, entry.topic_id), NO_COLOUR))

@@ -16,11 +16,13 @@ from typing import get_args
 import numpy as np
 
 from gr_ros2.dashboard.packets import packet_views
+from gr_ros2.dashboard.topic_names import Key, TopicNames
 from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
     AirKind,
+    Announced,
     Delivered,
     Lost,
     Missed,
@@ -36,10 +38,7 @@ from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import Result, TopicResult
-from gr_ros2.registry import Registry
-
-Key = tuple[int, int]
-"""Source id and topic id."""
+from gr_ros2.registry import Registry, Topic
 
 HISTORY_S = 180.0
 """Length of the shown curves and paths, s."""
@@ -112,8 +111,7 @@ class DashboardState:
         tick_s: float = 0.5,
     ) -> None:
         self._lock = Lock()
-        self._registry = registry
-        self._names = dict(topics)
+        self._names = TopicNames(registry, topics)
         self._packet_len = packet_len
         self._name = name
         self._duration_s = duration_s
@@ -156,6 +154,9 @@ class DashboardState:
         with self._lock:
             if isinstance(event, Delivered):
                 self._delivered(event, now)
+            elif isinstance(event, Announced):
+                for row in event.rows:
+                    self._learn((event.src_id, row.topic_id), row.name, row.type_name)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):
@@ -168,6 +169,12 @@ class DashboardState:
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
+
+    def subscribed(self, src_id: int, topics: Mapping[str, Topic]) -> None:
+        """Take over what a source in this process subscribes, by absolute name. Topics may be added while it runs."""
+        with self._lock:
+            for full_name, topic in topics.items():
+                self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
         """End the run. There is no result if the run failed, or if only one end of the link was observed."""
@@ -222,7 +229,7 @@ class DashboardState:
                     self._packets_sent.totals(now)[0] / RATE_S,
                     self._packets_received.totals(now)[0] / RATE_S,
                 ),
-                last_packets=packet_views(heard, self._packet_len, self._registry, colours, start)[-PACKETS_SHOWN:],
+                last_packets=packet_views(heard, self._packet_len, self._names, colours, start)[-PACKETS_SHOWN:],
             )
 
     def _remember(self, topic: _Topic, now: float, elapsed: float, queued: int | None) -> None:
@@ -258,8 +265,8 @@ class DashboardState:
         latencies = np.sort(np.array(topic.latencies, dtype=float))
         age_now, age_mean, age_peak = topic.age.read(now) or (None, None, None)
         return TopicView(
-            name=self._topic_name(key),
-            type_name=self._registry[key[1]].type_name if key[1] < len(self._registry) else "",
+            name=self._names.full(key),
+            type_name=self._names.type_name(key),
             src_id=key[0],
             topic_id=key[1],
             colour=place,
@@ -281,13 +288,13 @@ class DashboardState:
     def _series(self, place: int, key: Key) -> SeriesView:
         points = np.array(self._topics[key].history, dtype=float).reshape(-1, 5)
         t, pdr, goodput, age, queued = points.T
-        return SeriesView(self._topic_name(key), place, t, pdr, goodput, age, queued)
+        return SeriesView(self._names.full(key), place, t, pdr, goodput, age, queued)
 
     def _path(self, place: int, key: Key, start: float) -> PathView:
         belief = self._topics[key].belief
         t, errors = belief.errors()
         return PathView(
-            self._topic_name(key),
+            self._names.full(key),
             place,
             *belief.sent.xy(),
             *belief.received.xy(),
@@ -301,12 +308,8 @@ class DashboardState:
     def _final(self, key: Key) -> TopicResult | None:
         if self._result is None:
             return None
-        name = self._topic_name(key)
+        name = self._names.full(key)
         return next((t for t in self._result.topics if (t.src_id, t.topic) == (key[0], name)), None)
-
-    def _topic_name(self, key: Key) -> str:
-        known = self._registry[key[1]].name if key[1] < len(self._registry) else f"topic_{key[1]}"
-        return self._names.get(key) or f"/source_{key[0]}/{known.lstrip('/')}"
 
     # -- events -------------------------------------------------------------------------------------------------
 
@@ -316,11 +319,14 @@ class DashboardState:
             if self._phase == "waiting":
                 self._phase = "running"
 
+    def _learn(self, key: Key, name: str, type_name: str, full_name: str = "") -> None:
+        if self._names.learn(key, name, type_name, full_name=full_name) and key in self._topics:
+            self._topics[key].read_position = position_reader(type_name)
+
     def _topic(self, key: Key) -> _Topic:
         topic = self._topics.get(key)
         if topic is None:
-            read = position_reader(self._registry[key[1]].type_name) if key[1] < len(self._registry) else None
-            topic = self._topics[key] = _Topic(read, self._history)
+            topic = self._topics[key] = _Topic(position_reader(self._names.type_name(key)), self._history)
         return topic
 
     def _accepted(self, source: _SourceWindow, src_id: int, event: Accepted) -> None:

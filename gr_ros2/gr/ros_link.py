@@ -96,10 +96,11 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self.sink.close()
 
 
-def make_link(*, half_duplex: bool = False, **values: Any) -> RosLink:
+def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: Any) -> RosLink:
     """Make a link from the settings of both halves in one list, as GRC does.
 
     :param half_duplex: whether sending and receiving share the airtime
+    :param any_length: see :class:`RosSource`
     :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
@@ -115,4 +116,4 @@ def make_link(*, half_duplex: bool = False, **values: Any) -> RosLink:
     source, sink = halves
     if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
         sink = replace(sink, robot_id=source.src_id())
-    return RosLink(source.registry, source, sink, half_duplex=half_duplex)
+    return RosLink(source.registry, source, sink, half_duplex=half_duplex, any_length=any_length)

@@ -105,7 +105,7 @@ class LoraModem(BurstModem):
         self.spreading_factor, self.code_bits = options.spreading_factor, 4 + options.coding_rate
         self.chips = 1 << options.spreading_factor
         self._telling = np.empty((0, 0), np.int64) if frames.fixed else telling(frames.lengths, self.chips)
-        self._before = self._telling.shape[1]
+        self._before: int = self._telling.shape[1]
         """Number of chirps between preamble and payload."""
         n = np.arange(self.chips)
         self._up = np.exp(1j * np.pi * (n * n / self.chips - n)).astype(np.complex64)

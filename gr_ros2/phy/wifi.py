@@ -30,6 +30,7 @@ from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
 from gr_ros2.phy.burst_blocks import STOCK, AirOptions, TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
+from gr_ros2.phy.kernels import decoders
 from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.theory import convolutional_success, qam_bit_error
@@ -350,7 +351,7 @@ class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
     def __init__(self, phy: WifiPhy) -> None:
         super().__init__("gr_ros2_wifi_decoder", [(np.uint8, CARRIERS)], None)
         self._frames, self._lengths = DataFrames(phy.options.network, phy.options.address), phy.lengths
-        self._frame_decoder = FrameDecoder()
+        self._frame_decoder = FrameDecoder(decoders(phy.kernels))
         self._measures = phy.options.equalizer != "comb"
         self._encoding, self._length, self._snr_db = phy.encoding, 0, 0.0
         self._symbols: list[NDArray[np.uint8]] = []

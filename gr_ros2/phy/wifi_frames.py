@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.phy.fec import Bits, Convolutional
+from gr_ros2.phy.fec import GNU_RADIO, Bits, Convolutional, Decoders
 
 MAX_PSDU = 1528
 """Bytes of the longest frame that gr-ieee802-11 sends with any encoding, header and FCS included."""
@@ -148,10 +148,17 @@ def interleaving(carrier_bits: int) -> NDArray[np.int64]:
 
 
 class FrameDecoder:
-    """Decides what frames say; each receiver has its own."""
+    """Decides what frames say; each receiver has its own.
 
-    def __init__(self) -> None:
-        self._code = lru_cache(maxsize=_CODES)(Convolutional)
+    :param decoders: what decodes the convolutional code
+    """
+
+    def __init__(self, decoders: Decoders = GNU_RADIO) -> None:
+        self._decoders = decoders
+        self._code = lru_cache(maxsize=_CODES)(self._make)
+
+    def _make(self, bits: int) -> Convolutional:
+        return Convolutional(bits, self._decoders)
 
     def decode(self, encoding: Encoding, length: int, symbols: NDArray[np.uint8]) -> bytes | None:
         """The frame of these symbols without its FCS; None if the FCS is wrong.

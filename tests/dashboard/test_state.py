@@ -13,9 +13,11 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
-from gr_ros2.link.events import SentPacket
+from gr_ros2.link.events import Accepted, Announced, Delivered, SentPacket
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
+from gr_ros2.registry import Topic
+from gr_ros2.wire.table import Row
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
 from tests.link.v1.air import Robot, registry
 
@@ -182,6 +184,25 @@ def test_packets_field_by_field() -> None:
     assert all(sum(span.size for span in packet.spans) == 64 for packet in packets)
     assert refused.refused.startswith("length:")
     assert refused.t == pytest.approx(1.0)
+
+
+def test_topics_get_the_names_that_their_robot_announces() -> None:
+    state = make()
+    state.receiver_event(Delivered(9, 3, at(1, 2), 0, "key"), 1.0)
+    assert [topic.name for topic in state.tick(1.0).topics if topic.src_id == 9] == ["/source_9/topic_3"]
+    state.receiver_event(Announced(9, (Row(3, "ground_truth", "nav_msgs/msg/Odometry"),)), 2.0)
+    state.receiver_event(Delivered(9, 3, at(2, 3), 0, "later"), 3.0)
+    (topic,) = [topic for topic in state.tick(3.0).topics if topic.src_id == 9]
+    assert (topic.name, topic.type_name) == ("/source_9/ground_truth", "nav_msgs/msg/Odometry")
+    assert any(path.name == topic.name for path in state.tick(3.0).paths), "its positions are shown from now on"
+
+
+def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
+    state = make()
+    found = Topic(5, "found", "nav_msgs/msg/Odometry", TopicOptions())
+    state.subscribed(SRC, {"/robot_4/found": found})
+    state.sender_event(SRC, Accepted(0, 5, at(1, 2), 1.0))
+    assert [topic.name for topic in state.tick(1.0).topics if topic.topic_id == 5] == ["/robot_4/found"]
 
 
 def test_queues_and_colours_go_with_their_topic() -> None:

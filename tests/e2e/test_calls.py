@@ -166,7 +166,8 @@ def test_a_service_that_was_found_is_there_only_while_its_server_is(tmp_path: Pa
                 )
                 return number in robots.answered
 
-            wait_for(answered, "an answer")
+            while not answered():
+                pass
         robots.servers[-1].close()
         wait_for(lambda: not near.discover_services(), "the service to vanish")
         assert len(robots.taken) == len(set(robots.taken))

@@ -110,7 +110,7 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
     offered = [parameter["id"] for parameter in loaded["parameters"]]
     wanted = {item.name for _, config in halves.values() for item in fields(config)}
     assert len(offered) == len(set(offered))
-    assert set(offered) == wanted | {"half_duplex"}
+    assert set(offered) == wanted | {"half_duplex", "any_length"}
     values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
     assert (values["version"], values["compression"], values["repair"]) == ("1", "True", '"auto"')
     for name in offered:
@@ -123,12 +123,13 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
 
 def test_ros_link_is_made_of_its_settings_and_refuses_others() -> None:
     settings = {"middleware": "memory", "namespace": "/robot_3", "version": 1, "hold_s": 0.5, "repair": "idle"}
-    link = make_link(registry=str(example("topics.csv")), half_duplex=True, **settings)
+    link = make_link(registry=str(example("topics.csv")), half_duplex=True, any_length=True, **settings)
     try:
         assert (link.source.src_id, link.source.config.repair, link.sink.config.hold_s) == (3, "idle", 0.5)
         assert link.sink.config.robot_id == 3
         assert link.source.config.version == link.sink.config.version == 1
         assert link.end.endpoint.settings.half_duplex
+        assert not link.end.endpoint.settings.fixed
     finally:
         link.close()
     with pytest.raises(ConfigError, match="unknown key hold; known are backpressure, "):

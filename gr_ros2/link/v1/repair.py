@@ -15,7 +15,8 @@ times as many in separate groups of 64.
 *Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
 then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
 reports are rare or take long, it cannot know that so soon: it sends about as many repairs as losses are to be expected,
-before a report names them.
+before a report names them. Where reports come at once, the sender may also repair before it knows of a loss, but only
+``AHEAD`` times as often as packets are lost: a message that waits for a repair delays all later ones of its topic.
 
 *Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
 reduced to ``FEW`` packets, and to those of the newest message.
@@ -50,6 +51,8 @@ MAP = 64
 PROMPT = 1 / 64
 """Share of packets lost from which on a receiver reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
+AHEAD = 2.2
+"""Most repairs per packet lost, as long as repairs are sent before a report calls for them."""
 TURN = 3
 """While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
@@ -60,8 +63,11 @@ _ENOUGH = 0.05
 _TIMES = 512
 _PATIENCE_S = 0.2
 """s that are added to the time for a report, unless the receiver reports every packet at once."""
-_MARGIN = 1.2
-"""Factor on the longest recent delay of a report."""
+_MARGIN = 1.02
+"""Factor on the longest recent delay of a report, to which a part of the delays' spread is added."""
+_SPREAD = 1 / 4
+_MOST_AHEAD = 2.0
+_MOST_LOSS = 0.5
 _UNDER_WAY_S = 1e-3
 """s for which a repair is under way at least. Without it, a sender with no pace would repair without end where a report
 comes at once."""
@@ -143,7 +149,13 @@ class Receiver:
     @property
     def answer(self) -> float:
         """Time in s after which a report about a packet is to be expected."""
-        return max(self.answers) * _MARGIN if self.prompt else self.delay + self.interval
+        return self.longest if self.prompt else self.delay + self.interval
+
+    @property
+    def longest(self) -> float:
+        """Time in s within which the report about a packet comes, as far as recent ones tell."""
+        longest = max(self.answers)
+        return longest * _MARGIN + (longest - min(self.answers)) * _SPREAD
 
     @property
     def patience(self) -> float:
@@ -201,6 +213,10 @@ class RepairWindow:
         """Mean time between two of them, s."""
         self._once: set[int] = set()
         """Those of them that were neither sent again nor combined: what a report says arrived when it was sent."""
+        self._ahead = 0.0
+        """Number of repairs that may be sent before a report calls for them."""
+        self._share = 0.0
+        """How much each new packet adds to that number."""
         self._slots = [0.0, 0.0]
         """Recent numbers of new packets and of idle slots."""
 
@@ -221,6 +237,8 @@ class RepairWindow:
         slots = self._slots
         slots[0] = slots[0] * _DECAY + 1
         slots[1] *= _DECAY
+        if lives:
+            self._ahead = min(self._ahead + self._share, _MOST_AHEAD)
         if self._records or lives:
             if not self._records:
                 self._oldest = number
@@ -235,7 +253,7 @@ class RepairWindow:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
             peer = self._receivers[receiver] = Receiver(1 << free, now)
             self._everybody |= peer.bit
-            self.loss = self._worst()
+            self._note_losses()
         return peer
 
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
@@ -252,14 +270,14 @@ class RepairWindow:
         gap = now - peer.heard
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
-        self.loss = self._worst()
+        self._note_losses()
         sent_at = self._times.get(number)
         if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
             if loss >= PROMPT and number > peer.newest and number in self._once:
                 peer.answers.append(now - sent_at)
         peer.newest = max(peer.newest, number)
-        soon = bool(peer.answers) and max(peer.answers) * _MARGIN <= _SOON * self._period
+        soon = bool(peer.answers) and peer.longest <= _SOON * self._period
         peer.prompt = loss >= PROMPT and soon
         records, bit, delay = self._records, peer.bit, peer.delay
         peer.waits = False
@@ -289,7 +307,7 @@ class RepairWindow:
         peer = self._receivers.pop(receiver, None)
         if peer is not None:
             self._everybody &= ~peer.bit
-            self.loss = self._worst()
+            self._note_losses()
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
@@ -318,8 +336,10 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def _worst(self) -> float:
-        return max((peer.loss for peer in self._receivers.values()), default=self._expected)
+    def _note_losses(self) -> None:
+        self.loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+        loss = min(self.loss, _MOST_LOSS)
+        self._share = AHEAD * loss / (1 - loss)
 
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
         """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
@@ -388,6 +408,7 @@ class RepairWindow:
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     record.at = now
                     self.counts["resent"] += 1
+                    self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
                     self._once.discard(number)
                     return record
         return None
@@ -483,7 +504,7 @@ class RepairWindow:
         for peer in self._receivers.values():
             if peer.waits and not under_way:
                 return True
-            expected = 0.0 if peer.prompt else peer.loss
+            expected = 0.0 if peer.prompt and self._ahead < 1 else peer.loss
             patience, doubt = peer.patience, peer.doubt
             need = 0.0
             for record in window:
@@ -515,6 +536,7 @@ class RepairWindow:
         self._fly(now, first, newest)
         self._once.difference_update(range(first, newest + 1))
         self.counts["combined"] += 1
+        self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
         oldest = first == self._oldest
         return Repair(newest, mask, row, oldest, combined)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
 from gr_ros2.link.v1.gf256 import combine
-from gr_ros2.link.v1.repair import GROUP, Life, Repair, RepairMode, RepairWindow, Sent
+from gr_ros2.link.v1.repair import AHEAD, GROUP, Life, Repair, RepairMode, RepairWindow, Sent
 from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
 
 ROOM = 24
@@ -242,6 +242,7 @@ def prompt(count: int, delay: float = 0.01) -> RepairWindow:
 def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
     sender = prompt(4)
     sender.sent(5, body(5), b"packet 5", (Life(),), 0.5)
+    assert isinstance(sender.next(0.5), Repair), "ahead of any report"
     assert sender.next(0.5) is None
     overdue = sender.next_doubt(0.5)
     assert 0.51 < overdue < 0.52
@@ -255,6 +256,19 @@ def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
     assert sender.next(again + 1e-6) is not None
     sender.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.53)
     assert sender.next(0.53) is None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.2])
+def test_repairs_that_no_report_calls_for_are_few(loss: float) -> None:
+    sender, ahead, count = window("thrifty"), 0, 400
+    for number in range(1, count + 1):
+        at = number / 10
+        sender.sent(number, body(number), b"packet %d" % number, (Life(),), at)
+        while sender.next(at) is not None:
+            ahead += 1
+        sender.report(9, number, (1 << 64) - 1, settled=True, loss=loss, now=at + 0.01)
+    most = AHEAD * loss / (1 - loss) * count
+    assert 0.9 * most <= ahead <= most + 2
 
 
 def test_reports_that_take_long_are_not_waited_for() -> None:

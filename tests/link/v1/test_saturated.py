@@ -25,6 +25,15 @@ def test_a_repair_that_cannot_be_interrupted_delays_no_message(loss: float) -> N
     assert ratio <= TOLERANCE[loss]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("best_effort", "most"), [((), 1.25), (("odom",), TOLERANCE[0.2])])
+def test_waiting_for_reports_makes_odometry_older_only_where_it_comes_in_order(
+    best_effort: tuple[str, ...], most: float
+) -> None:
+    (ratio,) = paced_ratios("paper-ofdm-paced", 0.2, back=True, seeds=(1, 2), best_effort=best_effort).values()
+    assert ratio <= most
+
+
 @pytest.mark.parametrize("name", SCENARIOS[1:])
 def test_a_full_link_repairs_nothing(name: str) -> None:
     _, air = run(name, 1, 0.2, seconds=10.0)
