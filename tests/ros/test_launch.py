@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: source a ROS 2 setup (Humble or later) to run these tests")
 pytest.importorskip("ros2run", reason="this ROS 2 has no ros2run")
 pytest.importorskip("ros2launch", reason="this ROS 2 has no ros2launch")
+pytest.importorskip("launch_ros.actions", reason="this ROS 2 cannot launch nodes: launch_ros is missing or incomplete")
 pytest.importorskip("diagnostic_msgs", reason="this ROS 2 has no diagnostic_msgs")
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
