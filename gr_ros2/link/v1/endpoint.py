@@ -44,7 +44,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import NewRow, Registry, Topic
 from gr_ros2.setting import AUTO
@@ -134,7 +134,8 @@ class Endpoint:
         self._room = body_room(settings.packet_len, sealed=self._sealed, addressed=addressed)
         self._end_of_body = settings.packet_len - self.keys.trailer_len if settings.fixed else 0
         """Number of bytes to which the packet with its padded body extends."""
-        self._trailer = self.keys.own(settings.src_id, boot)
+        # An end without an id only listens and closes no packet. Its id makes no key.
+        self._trailer = Checksum(boot) if settings.src_id == NOBODY else self.keys.own(settings.src_id, boot)
         self.outbox = Outbox(topics, settings, boot=boot, room=self._room, codec=codec, observer=observer)
         self.sent = self.outbox.stats
         """What left and what did not."""

@@ -46,7 +46,7 @@ class Robot:
         self.keys = keys(mode)
         self.settings = Settings(src_id, **{"packet_len": 64, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
-        self.boot = 1000 * src_id
+        self.boot = 1000 * abs(src_id)
         self.events: list[SenderEvent | ReceiverEvent] = []
         self.start()
 

@@ -7,7 +7,7 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
-from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, MAX_TOPICS, Part, body_room, read_header
@@ -136,6 +136,17 @@ def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None
     lose[0] = False
     air.run(0.5)
     assert two.delivered() == [text(2)]
+
+
+@pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
+def test_an_end_without_an_id_listens(mode: SealMode) -> None:
+    one, listener = Robot(1, registry(), mode=mode, hears=False), Robot(NOBODY, mode=mode, hears=False)
+    air = Air(one, listener)
+    air.run(0.5)
+    one.end.submit(SCAN, text(1), air.now)
+    air.run(0.5)
+    assert listener.delivered() == [text(1)]
+    assert not listener.end.sent.air
 
 
 def test_a_message_waits_for_an_earlier_one_and_not_for_ever() -> None:
