@@ -121,4 +121,4 @@ def test_the_command_line_takes_them_by_name_and_lives_with_broken_ones(folder: 
     assert "package echo-package has it as broken:Bus" in broken.stderr
     assert "Traceback" not in broken.stderr
     unknown = run(folder, "-m", "gr_ros2.cli", "run", str(scenario), "--set", "phy.name=nothing")
-    assert "known are direct, ofdm, gfsk, psk, lora, modem, echo" in unknown.stderr
+    assert "known are direct, ofdm, gfsk, psk, lora, wifi, modem, echo" in unknown.stderr
