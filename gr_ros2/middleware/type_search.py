@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 from gr_ros2.errors import DescriptionError, GrRos2Error, MiddlewareError
+from gr_ros2.middleware.graph_search import GraphSearch
 from gr_ros2.middleware.services import DESCRIPTION_TYPE, ServiceGraph
 from gr_ros2.middleware.type_definitions import ships
 from gr_ros2.middleware.type_descriptions import Described, read_reply, request
@@ -21,7 +22,7 @@ from gr_ros2.middleware.type_descriptions import Described, read_reply, request
 LOOK_S = 0.5
 """s between two looks, at least."""
 _SHARE = 0.02
-"""Largest share of time that may be spent looking. rclpy asks for every topic separately."""
+"""Largest share of time that may be spent looking."""
 REPLY_S = 5.0
 """s that a node has for its reply, discovery of its service included."""
 TRIES = 3
@@ -32,7 +33,7 @@ _ASKED = 1
 _log = logging.getLogger(__name__)
 
 
-class TypeSearch:
+class TypeSearch(GraphSearch):
     """Learns types until it is closed.
 
     :param wanted: returns the topics in use, by absolute name and type; must not raise
@@ -50,29 +51,16 @@ class TypeSearch:
         """Hashes of the types that are known."""
         self._asked: Counter[tuple[str, str]] = Counter()
         """How often a node was asked, by hash and service."""
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="gr-ros2-type-search", daemon=True)
-        self._thread.start()
+        super().__init__("gr-ros2-type-search", LOOK_S, _SHARE)
 
-    def close(self) -> None:
-        """Stop asking. No callback begins after this has returned."""
-        self._closed.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join()
+    def _look(self) -> float:
+        return sum(self._look_for(topic, type_name) for topic, type_name in self._wanted())
 
-    def _run(self) -> None:
-        try:
-            while True:
-                begin = time.monotonic()
-                waited = sum(self._look(topic, type_name) for topic, type_name in self._wanted())
-                spent = time.monotonic() - begin - waited
-                if self._closed.wait(max(LOOK_S, spent / _SHARE)):
-                    return
-        except MiddlewareError as error:
-            if not self._closed.is_set():
-                _log.debug("no further types are asked for: %s", error)
+    def _failed(self, error: MiddlewareError) -> None:
+        if not self._closed.is_set():
+            _log.debug("no further types are asked for: %s", error)
 
-    def _look(self, topic: str, type_name: str) -> float:
+    def _look_for(self, topic: str, type_name: str) -> float:
         """Ask about the type of one topic. Returns the s that it waited for nodes."""
         begin = time.monotonic()
         for witness in self._graph.witnesses(topic, type_name):
