@@ -28,6 +28,9 @@ _ASK_AGAIN = "<SPDPInterval>2s</SPDPInterval>"
 _NEVER_FORGET = 'PruneDelay="inf"'
 """By itself Cyclone DDS 11 asks a peer in the first moment and drops its address after 30 s, before it would ask again.
 A peer that starts a second later would never be found. Asking is a packet of 0.3 kB to each of 100 ports."""
+_NODES_ON_LOCALHOST = f'<Peer Address="127.0.0.1" {_NEVER_FORGET}/>'
+"""A node of this machine on LOCALHOST does not receive multicast on another interface, and Cyclone DDS 11 ignores its
+packets to 127.0.0.1 there. So it is asked."""
 
 
 def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
@@ -49,6 +52,7 @@ def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os
     else:
         general = "<AllowMulticast>spdp</AllowMulticast>"
         discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # sets the ports at which peers look for us
+        interval, peers = _ASK_AGAIN, f"{_NODES_ON_LOCALHOST}{peers}"
     discovery += f"{interval}<Peers>{peers}</Peers>"
     domain = f'<Domain Id="any"><General>{general}</General><Discovery>{discovery}</Discovery></Domain>'
     return f"<CycloneDDS>{domain}</CycloneDDS>,{environment.get('CYCLONEDDS_URI', '')}"

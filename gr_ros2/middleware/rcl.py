@@ -1,4 +1,4 @@
-"""Helpers around rclpy: a setting that rcl reads from the environment, and the translation of its errors.
+"""Helpers around rclpy: a setting that rcl reads from the environment, names on its graph, and its errors.
 
 Invariant: nothing here imports rclpy.
 """
@@ -9,6 +9,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.setting import AUTO, Auto
@@ -32,6 +33,16 @@ def ros_localhost_only(localhost_only: bool | Auto) -> Iterator[None]:
                 del os.environ["ROS_LOCALHOST_ONLY"]
             else:
                 os.environ["ROS_LOCALHOST_ONLY"] = before
+
+
+def node_of(endpoint: Any) -> str:
+    """The absolute name of the node of an endpoint (an rclpy TopicEndpointInfo), '' where it is not known yet.
+
+    The RMW finds an endpoint before it is told the node. Until then it fills in names without a slash
+    (``_NODE_NAMESPACE_UNKNOWN_``).
+    """
+    namespace, name = endpoint.node_namespace, endpoint.node_name
+    return f"{namespace.rstrip('/')}/{name}" if namespace.startswith("/") else ""
 
 
 class translated(contextlib.AbstractContextManager[None]):

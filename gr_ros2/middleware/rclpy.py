@@ -43,7 +43,7 @@ from gr_ros2.middleware.base import (
     TopicInfo,
     finite,
 )
-from gr_ros2.middleware.rcl import ros_localhost_only, translated
+from gr_ros2.middleware.rcl import node_of, ros_localhost_only, translated
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.middleware.services import (
@@ -275,10 +275,9 @@ class RclpyMiddleware(RclpyParticipant):
             ]
         found: dict[str, set[str]] = {}
         for info in infos:
-            digest = getattr(info, "topic_type_hash", None)
+            digest, owner = getattr(info, "topic_type_hash", None), node_of(info)
             if info.topic_type == type_name and digest is not None and digest.version > 0:
-                service = f"{info.node_namespace.rstrip('/')}/{info.node_name}/{DESCRIPTION}"
-                found.setdefault(str(digest), set()).add(service)
+                found.setdefault(str(digest), set()).update({f"{owner}/{DESCRIPTION}"} if owner else ())
         return [Witness(digest, tuple(sorted(services))) for digest, services in sorted(found.items())]
 
     def close(self) -> None:
@@ -412,7 +411,7 @@ class RclpyMiddleware(RclpyParticipant):
         """The endpoints of other nodes. Another node may have the same name; so from the endpoints with this node's
         name, as many are removed as this node has."""
         name = self._node.get_name(), self._node.get_namespace()
-        others = [i for i in infos if f"{i.node_namespace.rstrip('/')}/{i.node_name}" not in self._shown]
+        others = [i for i in infos if node_of(i) not in self._shown]
         for endpoint in own_endpoints:
             if endpoint.topic != topic:
                 continue

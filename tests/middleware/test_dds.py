@@ -473,6 +473,24 @@ def test_static_peers_are_found_on_another_machine(first: tuple[str, str], secon
         wait_for(lambda: peers[1].received == [message(1)], "the message across the cable")
 
 
+@needs_namespaces
+@pytest.mark.parametrize("ranges", [("SUBNET", "LOCALHOST"), ("LOCALHOST", "SUBNET")])
+def test_nodes_of_one_machine_find_each_other_whatever_their_range(ranges: tuple[str, str]) -> None:
+    """In a network namespace with a further interface, which the node on SUBNET uses."""
+    with ExitStack() as stack:
+        machine = stack.enter_context(Namespace()).path
+        inside(machine, lambda: subprocess.run(INTERFACES, shell=True, check=True))
+        peers = []
+        for chosen, role in zip(ranges, ("pub", "sub"), strict=True):
+            environment = {"ROS_LOCALHOST_ONLY": "0", RANGE: chosen, PEERS: ""}
+            command = [*PEER, "7", "/a", STRING, role, "reliable", "transient_local", "1"]
+            peers.append(inside(machine, lambda c=command, e=environment: Peer(c, e)))  # type: ignore[misc]
+            stack.callback(peers[-1].close)
+            wait_for(lambda: peers[-1].ready, "a node that has started")
+        peers[0].publish([message(1)])
+        wait_for(lambda: peers[1].received == [message(1)], "the message from one interface to the other")
+
+
 def test_a_participant_on_loopback_announces_itself_often(join: Callable[..., DdsMiddleware]) -> None:
     """Nodes on another interface find it only then; by itself Cyclone DDS would do so every 8 s."""
     node = join()
