@@ -28,6 +28,7 @@ def top() -> Iterator[gr.top_block]:
 
 def wire(top: gr.top_block, gate: AirtimeGate) -> Probe:
     probe = Probe()
+    top.kept = probe, gate  # GNU Radio calls Python blocks without a reference, also to stop them after the test
     top.msg_connect((probe, "pdus"), (gate, "pdus"))
     top.msg_connect((gate, "pdus"), (probe, "pdus"))
     top.msg_connect((gate, "credit"), (probe, "credit"))
