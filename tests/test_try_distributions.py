@@ -47,7 +47,7 @@ def test_the_clone_is_copied_without_what_git_ignores(tool: ModuleType, tmp_path
     kept, built = (tmp_path / tool.CLONE / ".venv" / name for name in ("kept", "stamp-run"))
     old = tmp_path / tool.CLONE / "old" / "file"
     for path in (kept, built, old):
-        path.parent.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     tool.copy_in(tmp_path)
     assert (tmp_path / tool.CLONE / "setup.py").read_bytes() == (ROOT / "setup.py").read_bytes()
