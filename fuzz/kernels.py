@@ -41,7 +41,8 @@ def stream(setting: int) -> tuple[Any, frozenset[bytes], Samples]:
     packets = [draw.randbytes(PACKET_LEN) for _ in range(BURSTS)]
     parts = [np.zeros(150, np.complex64)]
     for number, packet in enumerate(packets):
-        rung = phy.modem.rungs[2 * number % len(phy.modem.rungs)]
+        rungs = phy.running_modem.rungs
+        rung = rungs[2 * number % len(rungs)]
         parts += [rung.modulate(packet), np.zeros(phy.gap, np.complex64)]
     whole = np.concatenate([*parts, np.zeros(300, np.complex64)])
     if phy.receiver_taps is not None:

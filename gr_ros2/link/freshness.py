@@ -59,15 +59,16 @@ class Turns:
         self._line: list[int] = []
         self._packets = 0
 
+    def join(self, topic_id: int) -> None:
+        """A topic has a message. The order of the first turns is that of the first messages."""
+        if topic_id not in self._line:
+            self._line.append(topic_id)
+
     def holder(self, pending: Collection[int]) -> int:
-        """The topic to which the next packet belongs, -1 for none; one of ``pending``, which is not empty."""
-        line = self._line
-        for topic_id in pending:
-            if topic_id not in line:
-                line.append(topic_id)
+        """The topic to which the next packet belongs, one of ``pending``; -1 for none."""
         if self._packets % TURN != TURN - 1:
             return -1
-        return next(topic_id for topic_id in line if topic_id in pending)
+        return next((topic_id for topic_id in self._line if topic_id in pending), -1)
 
     def sent(self, holder: int) -> None:
         """A packet left that belonged to this topic, or to none."""
@@ -124,6 +125,8 @@ class FreshnessScheduler:
         pending = [topic_id for topic_id, queue in queues.items() if queue]
         if not pending:
             return None
+        for topic_id in pending:
+            self._turns.join(topic_id)
         holder = self._holder = self._turns.holder(pending)
         for topic_id in self._latency.intersection(pending):
             self._urgent = max(self._urgent, min(len(queues[topic_id][0].payload), self._half))

@@ -179,7 +179,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             if endpoint.participant == self._guid or not endpoint.is_cyclone:
                 continue  # services of Fast DDS cannot be called from here
             if (endpoint.topic, endpoint.type_name) == (name, kind):
-                hashes.setdefault(ros_graph.hash_told(endpoint.user_data), set()).add(endpoint.participant)
+                hashes.setdefault(ros_graph.announced_hash(endpoint.user_data), set()).add(endpoint.participant)
             service = ros_graph.ros_service(endpoint.topic, endpoint.type_name)
             if service is not None and service[1] == DESCRIPTION_TYPE:
                 services.setdefault(endpoint.participant, []).append(service[0])
@@ -237,7 +237,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     def make_pair(self, end: DdsServer | DdsClient) -> None:
         names = ros_graph.dds_service(end.name, end.type_name)
         topics = [create_topic(self._participant, *name) for name in names]
-        data = [ros_graph.endpoint_user_data(self._hash_told(name)) + end.mark for _, name in names]
+        data = [ros_graph.endpoint_user_data(self._announced_hash(name)) + end.mark for _, name in names]
         # The writer is first: a reader alone on a topic of requests makes clients of Fast DDS wait for ever.
         writer = RawWriter(self._participant, topics[end.writes], SERVICE_QOS, data[end.writes])
         reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
@@ -377,13 +377,13 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         """User data of an endpoint: the type hash that other endpoints on the graph announce, otherwise that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
-        return ros_graph.endpoint_user_data(self._hash_told(ros_graph.dds_type(type_name)) or type_hash(type_name))
+        return ros_graph.endpoint_user_data(self._announced_hash(ros_graph.dds_type(type_name)) or type_hash(type_name))
 
-    def _hash_told(self, name: str) -> str:
+    def _announced_hash(self, name: str) -> str:
         """The hash that other endpoints announce for a type on DDS; '' if none does."""
         with self._lock:
             told = [
-                ros_graph.hash_told(endpoint.user_data)
+                ros_graph.announced_hash(endpoint.user_data)
                 for found in self._found.values()
                 for endpoint in found.values()
                 if endpoint.type_name == name and endpoint.participant != self._guid

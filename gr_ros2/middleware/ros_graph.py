@@ -31,6 +31,7 @@ __all__ = [
     "DiscoveryOptions",
     "DiscoveryRange",
     "NodeEntities",
+    "announced_hash",
     "check_node",
     "check_topic",
     "dds_service",
@@ -40,7 +41,6 @@ __all__ = [
     "endpoint_user_data",
     "gid_size",
     "has_short_gids",
-    "hash_told",
     "participant_entities_info",
     "resolve_domain_id",
     "ros_service",
@@ -180,7 +180,7 @@ def has_short_gids(topic: str, user_data: bytes) -> bool:
 
     :param topic: its name on DDS
     """
-    return topic == DISCOVERY_TOPIC and bool(hash_told(user_data)) and _OURS not in user_data
+    return topic == DISCOVERY_TOPIC and bool(announced_hash(user_data)) and _OURS not in user_data
 
 
 def endpoint_user_data(type_hash: str) -> bytes:
@@ -193,7 +193,7 @@ def endpoint_user_data(type_hash: str) -> bytes:
     return f"typehash={type_hash};".encode() if type_hash else _OURS
 
 
-def hash_told(user_data: bytes) -> str:
+def announced_hash(user_data: bytes) -> str:
     """The inverse of :func:`endpoint_user_data`, for an endpoint of any program."""
     match = _TYPE_HASH.search(user_data)
     return match[1].decode() if match else ""

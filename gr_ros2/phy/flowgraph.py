@@ -1,7 +1,7 @@
 """Flowgraphs and hier blocks that start and stop cleanly.
 
-Invariants: after a flowgraph's ``stop`` none of its threads runs, whatever its state was; after a hier block's
-``release`` only its creator still refers to it, its blocks or their buffers.
+Invariants: a block lives as long as it is connected; after a flowgraph's ``stop`` none of its threads runs, whatever
+its state was; after a hier block's ``release`` only its creator still refers to it, its blocks or their buffers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,39 @@ from gr_ros2.phy.threads import start_flowgraph
 _Self = TypeVar("_Self", bound="Flowgraph")
 
 
-class Flowgraph(gr.top_block):  # type: ignore[misc]
+class _Holds:
+    """Keeps connected blocks alive.
+
+    GNU Radio's threads call the methods of a block that is written in Python, but do not keep its Python object alive.
+    Once it has a message handler, it is part of a reference cycle. Python's garbage collector then ends it at any time,
+    and GNU Radio calls what is not there any more: the process crashes.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._held: list[Any] = []
+
+    def connect(self, *points: Any) -> None:
+        """Connect streams, with the arguments of GNU Radio's method."""
+        super().connect(*points)  # type: ignore[misc]
+        self._hold(points)
+
+    def msg_connect(self, *ends: Any) -> None:
+        """Connect two message ports, with the arguments of GNU Radio's method."""
+        super().msg_connect(*ends)  # type: ignore[misc]
+        self._hold(ends)
+
+    def disconnect_all(self) -> None:
+        """Forget the stream connections, as GNU Radio's method does, and let go of all blocks."""
+        self._impl.disconnect_all()  # type: ignore[attr-defined]
+        self._held.clear()
+
+    def _hold(self, points: tuple[Any, ...]) -> None:
+        blocks = (point[0] if isinstance(point, tuple) else point for point in points)
+        self._held += [block for block in blocks if block is not self and not isinstance(block, (str, int))]
+
+
+class Flowgraph(_Holds, gr.top_block):  # type: ignore[misc]
     """Blocks that start and stop together, for instance in a ``with`` statement.
 
     :param name: name in GNU Radio's log
@@ -64,7 +96,7 @@ class Flowgraph(gr.top_block):  # type: ignore[misc]
         self.stop()
 
 
-class HierBlock(gr.hier_block2):  # type: ignore[misc]
+class HierBlock(_Holds, gr.hier_block2):  # type: ignore[misc]
     """A hier block with message ports.
 
     GNU Radio's ``disconnect_all`` forgets stream connections only. The message connections would keep it alive, and

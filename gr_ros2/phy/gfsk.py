@@ -9,6 +9,7 @@ discriminator.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ _PULSE_SYMBOLS = 4
 """Length of the Gaussian frequency pulse."""
 _LEAD, _TAIL = 4, _PULSE_SYMBOLS + 2
 """Filler bits around preamble and payload, for the pulses that reach beyond them."""
+_TAIL_SIGNS = np.tile([1.0, -1.0], _TAIL // 2)
 _DESIGN_NOISE = 0.1
 """Noise over symbol energy for which the receiver's filter is designed: 10 dB."""
 
@@ -45,7 +47,7 @@ class GfskModem(LinearModem):
         self._pulse = frequency_pulse(options.sps, options.bt)
         self.taps: NDArray[np.float32] = wiener(main_pulse(self._pulse, options.sps), options.sps).astype(np.float32)
         self._head = np.concatenate((np.tile([1.0, -1.0], _LEAD // 2), preamble_steps()))
-        self._last = np.uint8(np.prod(preamble_steps()) < 0)
+        self.last_bit = int(np.prod(preamble_steps()) < 0)
         self._prepare_estimate()
 
     @property
@@ -62,9 +64,16 @@ class GfskModem(LinearModem):
     def modulate(self, packet: bytes) -> Samples:
         data = self.payload_bits(packet)
         if self.frames.coded:
-            data = 1 ^ data ^ np.concatenate(([self._last], data[:-1]))
-        bits = np.concatenate((self._head, 2.0 * data - 1, np.tile([1, -1], _TAIL // 2)))
-        return self._wave(bits)
+            data = 1 ^ data ^ np.concatenate((np.array([self.last_bit], np.uint8), data[:-1]))
+        return self._wave(np.concatenate((self._head, 2.0 * data - 1, _TAIL_SIGNS)))
+
+    def waveform(self) -> dict[str, Any]:
+        turned = np.cumsum(self._pulse).reshape(_PULSE_SYMBOLS, self.sps)
+        sequences = np.array(list(product((0, -1, 1), repeat=_PULSE_SYMBOLS)))
+        waves = np.exp(1j * (sequences[:, ::-1] @ turned))
+        lead, tail = self._head > 0, _TAIL_SIGNS > 0
+        pieces = {"lead": lead, "lead_len": len(lead), "tail": tail, "tail_len": len(tail)}
+        return {"pulse": (), "pulse_len": len(self._pulse), "waves": waves, **pieces}
 
     def _wave(self, signs: Reals) -> Samples:
         """Samples of bits, given as signs."""
@@ -76,7 +85,7 @@ class GfskModem(LinearModem):
         # A bit is 1 where the phase equals that of the symbol before; before the first bit comes the last symbol of the
         # preamble. With a code the bits are precoded so that the phases themselves are the bits, because errors in
         # pairs would disturb the decoder.
-        return None if self.frames.coded else int(self._last)
+        return None if self.frames.coded else self.last_bit
 
 
 def frequency_pulse(sps: int, bt: float) -> Reals:

@@ -238,6 +238,15 @@ class LinearModem(BurstModem):
         likely = self.constellation.weigh(points / np.float32(gain), noise / gain**2)
         return points / np.float32(gain), self.meant(self.constellation.soft(likely))
 
+    last_bit = 0
+    """The last bit of the preamble, where its symbols are bits."""
+
+    @abstractmethod
+    def waveform(self) -> dict[str, Any]:
+        """The constants that describe how symbols become samples: ``pulse`` of a symbol, or, with frequency modulation,
+        ``waves`` of every sequence of bits (0 = none, 1 = a zero, 2 = a one, the newest one last) as long as the pulse,
+        and the bits before (``lead``) and after (``tail``) the payload."""
+
     @property
     def before_payload(self) -> int | None:
         """The last bit before the payload where a bit of the frame says whether the phase stays (differential); None
@@ -269,7 +278,7 @@ class LinearModem(BurstModem):
             "slack": _SLACK,
             "unknowns": len(self._explained),
             "differential": before is not None,
-            "last_one": bool(before),
+            "last_one": self.last_bit,
             "turn": self._turn,
             "clean_energy": self._clean_energy,
             "threshold": _THRESHOLD,
@@ -279,6 +288,7 @@ class LinearModem(BurstModem):
             "explained": self._explained,
             "points": self.constellation.points,
             "marks": self.constellation.marks,
+            **self.waveform(),
         }
         return ModemConstants("linear", values, points * bits, points)
 

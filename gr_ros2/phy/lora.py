@@ -246,6 +246,7 @@ class LoraModem(BurstModem):
             "up_chirp": self._up,
             "tapered": self._tapered,
             "words": self._words,
+            "sync_word": _SYNC,
         }
         return ModemConstants("lora", values, self.blocks(self.frames.packet_len) * self.spreading_factor * 4, symbols)
 

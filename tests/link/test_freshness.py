@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.link import Delivered, Sender
-from gr_ros2.link.freshness import TURN
+from gr_ros2.link.freshness import TURN, Turns
 from gr_ros2.wire.v0 import V0
 from tests.link.engines import delivered, drain, read, receiver, sender, take, trace
 
@@ -212,3 +212,19 @@ def test_packets_are_filled(sizes: dict[str, int]) -> None:
     assert pad / (packets * 220) < 0.10
     assert all(source.stats.sent[topic] for topic in range(len(names)))
     assert Counter(reason for _, reason in source.stats.refused).keys() == {"superseded"}
+
+
+def test_turns_go_round_and_the_first_ones_in_the_order_of_the_first_messages() -> None:
+    turns = Turns()
+    for topic_id in (4, 0, 1, 4):
+        turns.join(topic_id)
+    had = []
+    for _ in range(5 * TURN):
+        holder = turns.holder({0, 1, 4, 240})
+        turns.sent(holder)
+        had.append(holder)
+    assert had[TURN - 1 :: TURN] == [4, 0, 1, 4, 0]
+    assert set(had) == {-1, 0, 1, 4}, "240 has not joined: it has no turn"
+    for _ in range(TURN):
+        assert turns.holder({240}) == -1
+        turns.sent(-1)

@@ -1,10 +1,26 @@
-"""A Zenoh router of the tests' own, as rmw_zenoh needs one."""
+"""What tests of the middlewares share: a DDS domain of their own, and a Zenoh router, as rmw_zenoh needs one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
+
+from gr_ros2.middleware.dds import DdsMiddleware
+from tests.domains import free_domains
+
+
+@pytest.fixture
+def domain() -> int:
+    """A DDS domain nobody uses."""
+    return free_domains(1)[0]
+
+
+@pytest.fixture
+def graph(domain: int) -> Iterator[DdsMiddleware]:
+    """The DDS graph of that domain on this host."""
+    with DdsMiddleware(domain_id=domain, localhost_only=True) as graph:
+        yield graph
 
 
 @pytest.fixture(scope="session")

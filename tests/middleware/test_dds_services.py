@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 
 import pytest
@@ -11,24 +11,12 @@ from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_services import with_header, without_header
 from gr_ros2.middleware.ros_graph import NodeEntities, dds_service, ros_service
-from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller, Program
 from tests.waiting import wait_for
 
 pytest.importorskip("cyclonedds.domain", reason="the Python part of cyclonedds does not import", exc_type=ImportError)
 
 SERVICE = "/robot_1/add"
-
-
-@pytest.fixture
-def domain() -> int:
-    return free_domains(1)[0]
-
-
-@pytest.fixture
-def graph(domain: int) -> Iterator[DdsMiddleware]:
-    with DdsMiddleware(domain_id=domain, localhost_only=True) as graph:
-        yield graph
 
 
 def test_a_client_of_another_program_is_answered(graph: DdsMiddleware, domain: int) -> None:

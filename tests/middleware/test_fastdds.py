@@ -223,7 +223,7 @@ def test_a_type_has_the_hash_that_the_graph_gives_it(middleware: DdsMiddleware, 
 
         def told() -> list[str]:
             found = [e for endpoints in watching._found.values() for e in endpoints.values()]
-            return [ros_graph.hash_told(e.user_data) for e in found if e.key == publisher.writer.guid]
+            return [ros_graph.announced_hash(e.user_data) for e in found if e.key == publisher.writer.guid]
 
         wait_for(told, "our publisher")
         assert told() == [given]

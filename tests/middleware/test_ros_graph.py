@@ -127,7 +127,7 @@ def test_the_discovery_endpoint_tells_the_hash_of_its_type() -> None:
     for name, text in HUMBLE_MSGS.items():
         store.register(get_types_from_msg(text.replace("char[24]", "uint8[16]"), name))
     digest = store.hash_rihs01("rmw_dds_common/msg/ParticipantEntitiesInfo")
-    assert ros_graph.hash_told(ros_graph.DISCOVERY_USER_DATA) == digest
+    assert ros_graph.announced_hash(ros_graph.DISCOVERY_USER_DATA) == digest
 
 
 def test_who_has_short_gids() -> None:
@@ -138,8 +138,8 @@ def test_who_has_short_gids() -> None:
     assert not ros_graph.has_short_gids(ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_USER_DATA)  # another gr-ros2
     assert not ros_graph.has_short_gids("rt/chatter", told)
     unknown = ros_graph.endpoint_user_data("")
-    assert unknown and ros_graph.hash_told(unknown) == ""  # rmw_cyclonedds warns about endpoints without user data
-    assert ros_graph.hash_told(b"xtypehash=RIHS01_;") == ""
+    assert unknown and ros_graph.announced_hash(unknown) == ""  # rmw_cyclonedds warns about endpoints without user data
+    assert ros_graph.announced_hash(b"xtypehash=RIHS01_;") == ""
 
 
 def test_a_hash_without_a_text_is_that_of_the_distribution_that_has_it() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
@@ -12,24 +11,12 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.services import DESCRIPTION, Witness
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TRIES, TypeSearch
-from tests.domains import free_domains
 from tests.middleware.describing import CUSTOM, CUSTOM_TEXT, hash_of_text, message
 from tests.middleware.support import RELIABLE, Peer
 from tests.waiting import wait_for
 
 TOPIC = "/robot_1/wheels"
 DIGEST = hash_of_text(CUSTOM_TEXT)
-
-
-@pytest.fixture
-def domain() -> int:
-    return free_domains(1)[0]
-
-
-@pytest.fixture
-def graph(domain: int) -> Iterator[DdsMiddleware]:
-    with DdsMiddleware(domain_id=domain, localhost_only=True) as graph:
-        yield graph
 
 
 def node(domain: int, role: str, how: str) -> Peer:

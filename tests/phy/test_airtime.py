@@ -9,24 +9,22 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gnuradio import gr
-
 from gr_ros2.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import pdu_of
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
 
 @pytest.fixture
-def top() -> Iterator[gr.top_block]:
-    top = gr.top_block()
+def top() -> Iterator[Flowgraph]:
+    top = Flowgraph("test", "test")
     yield top
     top.stop()
-    top.wait()
 
 
-def wire(top: gr.top_block, gate: AirtimeGate) -> Probe:
+def wire(top: Flowgraph, gate: AirtimeGate) -> Probe:
     probe = Probe()
     top.kept = probe, gate  # GNU Radio calls Python blocks without a reference, also to stop them after the test
     top.msg_connect((probe, "pdus"), (gate, "pdus"))
@@ -36,7 +34,7 @@ def wire(top: gr.top_block, gate: AirtimeGate) -> Probe:
     return probe
 
 
-def test_packets_pass_one_airtime_apart_and_never_sooner(top: gr.top_block) -> None:
+def test_packets_pass_one_airtime_apart_and_never_sooner(top: Flowgraph) -> None:
     gate = AirtimeGate(0.02)
     probe = wire(top, gate)
     for number in range(10):
@@ -49,7 +47,7 @@ def test_packets_pass_one_airtime_apart_and_never_sooner(top: gr.top_block) -> N
     assert (gate.passed, gate.backlog) == (10, 0)
 
 
-def test_one_credit_first_then_one_per_packet(top: gr.top_block) -> None:
+def test_one_credit_first_then_one_per_packet(top: Flowgraph) -> None:
     probe = wire(top, AirtimeGate(0.02))
     for number in range(5):
         wait_for(lambda number=number: probe.credits == number + 1, "a credit")
@@ -58,7 +56,7 @@ def test_one_credit_first_then_one_per_packet(top: gr.top_block) -> None:
     wait_for(lambda: probe.credits == 6, "the last credit")
 
 
-def test_without_airtime_packets_pass_at_once_and_credits_go_on(top: gr.top_block) -> None:
+def test_without_airtime_packets_pass_at_once_and_credits_go_on(top: Flowgraph) -> None:
     probe = wire(top, AirtimeGate(0.0))
     for number in range(5):
         probe.post(bytes([number]))
@@ -66,7 +64,7 @@ def test_without_airtime_packets_pass_at_once_and_credits_go_on(top: gr.top_bloc
     wait_for(lambda: probe.credits >= 4, "credits for more")
 
 
-def test_a_packet_that_passes_late_is_measured(top: gr.top_block) -> None:
+def test_a_packet_that_passes_late_is_measured(top: Flowgraph) -> None:
     gate = AirtimeGate(0.01, times=True)
     gate._clock.offer(pdu_of(b"x"), time.monotonic() - 1.0)  # was due 0.99 s ago
     probe = wire(top, gate)
@@ -76,7 +74,7 @@ def test_a_packet_that_passes_late_is_measured(top: gr.top_block) -> None:
     assert list(gate.passed_at) == [happened]
 
 
-def test_when_packets_passed_is_not_kept_unless_asked_for(top: gr.top_block) -> None:
+def test_when_packets_passed_is_not_kept_unless_asked_for(top: Flowgraph) -> None:
     gate = AirtimeGate(0.0)
     probe = wire(top, gate)
     probe.post(b"x")
@@ -85,14 +83,12 @@ def test_when_packets_passed_is_not_kept_unless_asked_for(top: gr.top_block) -> 
     assert len(gate.passed_at) == 0
 
 
-def test_it_stops_with_packets_on_the_air() -> None:
-    top = gr.top_block()
+def test_it_stops_with_packets_on_the_air(top: Flowgraph) -> None:
     gate = AirtimeGate(3600.0)
     probe = wire(top, gate)
     probe.post(b"x")
     wait_for(lambda: gate.backlog == 1)
     top.stop()
-    top.wait()
     assert probe.handled == 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import weakref
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from gr_ros2.errors import PhyError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.measure import deliver, record
+from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
 
@@ -38,6 +40,27 @@ def test_it_runs_within_a_with_statement() -> None:
     passed = sink.nitems_read(0)
     graph.stop()
     assert sink.nitems_read(0) == passed
+
+
+def test_a_block_that_is_connected_is_not_collected_as_garbage() -> None:
+    """It would be: it has a message handler, which refers to it. GNU Radio would go on to call it, and crash."""
+
+    def wired() -> tuple[Flowgraph, weakref.ref[Probe]]:
+        graph, one, two = Flowgraph("test", "test"), Probe(), Probe()
+        graph.msg_connect((one, "pdus"), (two, "pdus"))
+        graph.msg_connect(two, "pdus", one, "pdus")
+        return graph, weakref.ref(one)
+
+    graph, block = wired()
+    with graph:
+        gc.collect()
+        found = block()
+        assert found is not None
+        found.post(b"x")
+        del found
+    del graph
+    gc.collect()
+    assert block() is None
 
 
 def segments() -> int:

@@ -44,9 +44,10 @@ from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
 
-SHARE = 3
+SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
-lost with any of them. A message of class latency uses any space that is free."""
+lost with any of them. With smaller fragments (3), the scans of ``six-topics-paced`` are 3 % younger without loss, and
+16 % older at 20 % loss. A message of class latency uses any space that is free."""
 TABLE_FIRST = 2
 """Number of packets up to which the table of topics goes before messages."""
 SETTLING_S = 1.0
@@ -205,6 +206,7 @@ class Outbox:
         :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
         """
         line = self._lines[topic_id]
+        self._turns.join(topic_id)
         serial = self._serial
         self._serial += 1
         self.stats.submitted[topic_id] += 1

@@ -31,7 +31,7 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 // Version of this interface and of the parameters in `modem.h`. Increase it with each change, here and in
 // `kernels/library.py`.
-GR_ROS2_API int kernels_version() { return 5; }
+GR_ROS2_API int kernels_version() { return 6; }
 
 // What it was compiled for.
 GR_ROS2_API const char* kernels_target() {
@@ -102,10 +102,11 @@ GR_ROS2_API int modem_take(const void* modem, void* stream) {
     }
 }
 
-// 1, or 0 where the kernel leaves it to numpy, or -1 without memory. `batch` is what stream.h says.
+// 1, or -1 without memory. `batch` is what stream.h says.
 GR_ROS2_API int modem_modulate(const void* modem, const void* batch) {
     try {
-        return modulate(*static_cast<const Modem*>(modem), *static_cast<const Batch*>(batch));
+        modulate(*static_cast<const Modem*>(modem), *static_cast<const Batch*>(batch));
+        return 1;
     } catch (const std::exception&) {
         return -1;
     }

@@ -11,6 +11,8 @@ constexpr double kSmallestNoise = 1e-6;
 constexpr int kPad = 4;       // FFT bins per bin of the preamble's length
 constexpr int kStep = 64;     // positions searched at a time
 constexpr double kFar = 1e6;  // samples that no burst can be late
+using Bits = std::vector<uint8_t>;
+enum Digit { kOver, kZero, kOne, kDigits };  // of a sequence of bits: none, a zero, a one
 
 // A preamble's symbols without their signs, in `symbols`, and the carrier that is left.
 struct Carrier {
@@ -31,6 +33,7 @@ struct Scratch {
     std::vector<float> heights;
     std::vector<double> drift, places, angles;
     std::vector<int> decided;
+    Bits sent;
 };
 
 Scratch& scratch() {
@@ -48,7 +51,14 @@ class Linear final : public Modem {
           known_(p.known, p.known + p.preamble),
           explained_(p.explained, p.explained + static_cast<size_t>(p.unknowns) * (p.preamble - 2 * p.edge)),
           points_(p.points, p.order, p.point_bits, p.marks),
-          fft_(kPad * p.preamble) {}
+          fft_(kPad * p.preamble),
+          pulse_(p.pulse, p.pulse + (p.lead_len ? 0 : p.pulse_len)),
+          sequences_(1),
+          lead_(p.lead, p.lead + p.lead_len),
+          tail_(p.tail, p.tail + p.tail_len) {
+        for (int k = 0; p.lead_len && k < p.pulse_len / p.sps; k++) sequences_ *= kDigits;
+        waves_.assign(p.waves, p.waves + (p.lead_len ? static_cast<size_t>(sequences_) * p.sps : 0));
+    }
 
     Search find(Samples samples) const override {
         const int sps = p_.sps;
@@ -92,7 +102,61 @@ class Linear final : public Modem {
         return kRead;
     }
 
+    void modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
+        Bits& sent = scratch().sent;
+        sent.clear();
+        const float* word = lengths_.fixed() ? nullptr : &signs_[static_cast<size_t>(lengths_.row(length)) * kWordBits];
+        for (int k = 0; word && k < kWordBits; k++) sent.push_back(word[k] > 0);
+        sent.insert(sent.end(), bits, bits + lengths_.bits(length));
+        if (p_.lead_len) modulate_frequency(sent, out);
+        else modulate_phase(sent, out);
+    }
+
    private:
+    // One pulse per symbol.
+    void modulate_phase(const Bits& sent, Sample* out) const {
+        const int payload = (static_cast<int>(sent.size()) + p_.point_bits - 1) / p_.point_bits;
+        const int count = p_.preamble + payload, most = p_.pulse_len;
+        std::fill_n(out, static_cast<int64_t>(count - 1) * p_.sps + most, Sample());
+        size_t taken = 0;
+        for (int symbol = 0; symbol < count; symbol++, out += p_.sps) {
+            Sample point;
+            if (symbol < p_.preamble) point = known_[symbol];
+            else {
+                int value = 0;
+                for (int bit = 0; bit < p_.point_bits; bit++, taken++)
+                    value = 2 * value + (taken < sent.size() ? sent[taken] : 0);
+                point = points_.point(value);
+            }
+            for (int k = 0; k < most; k++) out[k] += pulse_[k] * point;
+        }
+    }
+
+    // A quarter turn per bit. The samples between two bits depend on the bits whose pulses are not over yet.
+    void modulate_frequency(Bits& sent, Sample* out) const {
+        if (!p_.differential)
+            for (size_t k = sent.size(); k-- > 0;) sent[k] ^= 1 ^ (k ? sent[k - 1] : p_.last_one);
+        const int pulse = p_.pulse_len / p_.sps;
+        int sequence = 0, turns = 0;
+        const auto add = [&](int digit) {
+            const int over = sequence / (sequences_ / kDigits);
+            turns += over == kOne ? 1 : over == kZero ? 3 : 0;
+            sequence = sequence % (sequences_ / kDigits) * kDigits + digit;
+            const Sample* wave = &waves_[static_cast<size_t>(sequence) * p_.sps];
+            for (int k = 0; k < p_.sps; k++) out[k] = turned(wave[k], turns % 4);
+            out += p_.sps;
+        };
+        const Bits& payload = sent;
+        for (const Bits* part : {&lead_, &payload, &tail_})
+            for (const uint8_t bit : *part) add(bit ? kOne : kZero);
+        for (int k = 1; k < pulse; k++) add(kOver);
+    }
+
+    static Sample turned(Sample value, int quarters) {
+        const Sample half = quarters & 2 ? -value : value;
+        return quarters & 1 ? Sample(-half.imag(), half.real()) : half;
+    }
+
     // Number of symbols after the preamble.
     int symbols(int length) const {
         const int bits = lengths_.bits(length) + (lengths_.fixed() ? 0 : kWordBits);
@@ -387,6 +451,10 @@ class Linear final : public Modem {
     std::vector<Sample> known_, explained_;
     Constellation points_;
     Fft fft_;
+    std::vector<float> pulse_;
+    std::vector<Sample> waves_;
+    int sequences_;  // rows of `waves_`
+    Bits lead_, tail_;
 };
 
 }  // namespace

@@ -36,6 +36,7 @@ class Lora final : public Modem {
           up_(p.up_chirp, p.up_chirp + p.chips),
           tapered_(p.tapered, p.tapered + p.chips),
           words_(p.words, p.words + kWords),
+          sync_word_(p.sync_word, p.sync_word + p.sync),
           roots_(p.chips),
           fft_(p.chips),
           fine_fft_(p.fine * p.chips) {
@@ -102,7 +103,37 @@ class Lora final : public Modem {
         return kRead;
     }
 
+    void modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
+        for (int k = p_.head - p_.sync - p_.down; k > 0; k--) out = chirp(0, out);
+        for (const int start : sync_word_) out = chirp(start, out);
+        for (int k = 0; k < p_.down; k++) out = std::copy(down_.begin(), down_.end(), out);
+        const int* told = telling_.data() + static_cast<size_t>(lengths_.row(length)) * p_.before;
+        for (int k = 0; k < p_.before; k++) out = chirp(told[k], out);
+        const int given = lengths_.bits(length), factor = p_.spreading_factor;
+        int words[kMostBits];
+        for (int first = 0; first < given; first += kNibble * factor) {
+            for (int row = 0; row < factor; row++) {
+                int nibble = 0;
+                for (int at = first + row * kNibble, bit = 0; bit < kNibble; bit++, at++)
+                    nibble = 2 * nibble + (at < given ? bits[at] : 0);
+                words[row] = words_[nibble];
+            }
+            for (int column = 0; column < p_.code_bits; column++) {  // diagonal interleaver, Gray code
+                int value = 0;
+                for (int row = 0; row < factor; row++) value |= (words[(row + column) % factor] >> column & 1) << row;
+                for (int shift = 1; shift <= 8; shift *= 2) value ^= value >> shift;
+                out = chirp(value, out);
+            }
+        }
+    }
+
    private:
+    // An up-chirp from a start position on.
+    Sample* chirp(int start, Sample* out) const {
+        out = std::copy(up_.begin() + start, up_.end(), out);
+        return std::copy(up_.begin(), up_.begin() + start, out);
+    }
+
     // Number of chirps of the payload.
     int symbols(int length) const {
         const int block = kNibble * p_.spreading_factor;
@@ -419,7 +450,7 @@ class Lora final : public Modem {
     Lengths lengths_;
     std::vector<int32_t> telling_;
     std::vector<Sample> down_, up_, tapered_;
-    std::vector<int32_t> words_;
+    std::vector<int32_t> words_, sync_word_;
     std::vector<Sample> roots_;
     Fft fft_, fine_fft_;
 };

@@ -83,11 +83,8 @@ class Modem {
     // Soft bits, points and other values of a burst.
     virtual Result read(Samples samples, int64_t start, float* soft, Sample* points, Report* report) const = 0;
 
-    // The samples of the burst of a packet of `length` bytes, from the bits of its frame; false if numpy does this.
-    virtual bool modulate(const uint8_t* bits, int32_t length, Sample* out) const {
-        (void)bits, (void)length, (void)out;
-        return false;
-    }
+    // The samples of the burst of a packet of `length` bytes, from the bits of its frame.
+    virtual void modulate(const uint8_t* bits, int32_t length, Sample* out) const = 0;
 };
 
 // In each, numbers come before arrays, and `kernels/modem.py` has the same fields in the same order.
@@ -105,19 +102,20 @@ struct OfdmParameters {
 
 struct LinearParameters {
     int32_t shortest, longest;
-    int32_t sps, order, point_bits, preamble, chunk, block, rise, edge, slack, unknowns, differential, last_one;
+    int32_t sps, order, point_bits, preamble, chunk, block, rise, edge, slack, unknowns, differential, last_one,
+        pulse_len, lead_len, tail_len;
     double turn, clean_energy, threshold, alike;
     const int32_t* frame_bits;
-    const float *signs, *steps;
-    const Sample *known, *explained, *points;
-    const uint8_t* marks;
+    const float *signs, *steps, *pulse;
+    const Sample *known, *explained, *points, *waves;
+    const uint8_t *marks, *lead, *tail;
 };
 
 struct LoraParameters {
     int32_t shortest, longest;
     int32_t before, chips, spreading_factor, code_bits, step, look, head, sync, down, fine, sinc;
     double median_share, limit, threshold, gain, pace_gain, certain;
-    const int32_t *frame_bits, *telling, *words;
+    const int32_t *frame_bits, *telling, *words, *sync_word;
     const Sample *down_chirp, *up_chirp, *tapered;
 };
 

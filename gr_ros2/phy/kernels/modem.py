@@ -1,4 +1,4 @@
-"""A burst modem that uses a compiled kernel for search and demodulation.
+"""A burst modem that uses a compiled kernel for modulation, search and demodulation.
 
 Invariants: the numpy modem, which is the reference, does everything except the processing of samples; a kernel knows
 only the constants of that modem; calls from several threads do not share memory. Each call releases Python's lock, so a
@@ -50,12 +50,12 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         1,
         _fields(
             int32="shortest longest sps order point_bits preamble chunk block rise edge slack unknowns differential "
-            "last_one",
+            "last_one pulse_len lead_len tail_len",
             float64="turn clean_energy threshold alike",
             int32s="frame_bits",
-            float32s="signs steps",
-            complex64s="known explained points",
-            uint8s="marks",
+            float32s="signs steps pulse",
+            complex64s="known explained points waves",
+            uint8s="marks lead tail",
         ),
     ),
     "lora": (
@@ -63,7 +63,7 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         _fields(
             int32="shortest longest before chips spreading_factor code_bits step look head sync down fine sinc",
             float64="median_share limit threshold gain pace_gain certain",
-            int32s="frame_bits telling words",
+            int32s="frame_bits telling words sync_word",
             complex64s="down_chirp up_chirp tapered",
         ),
     ),
@@ -133,7 +133,7 @@ _NO_BURST, _READ, _CUT = range(3)
 
 
 class CompiledModem(BurstModem):
-    """The given modem, with search and demodulation by the compiled kernel.
+    """The given modem, with modulation, search and demodulation by the compiled kernel.
 
     :param reference: the numpy modem; its constants name the kernel
     :raises MemoryError: when memory is short
@@ -191,8 +191,7 @@ class CompiledModem(BurstModem):
         assert len(out) >= sizes.sum()
         arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
         batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(address, arrays))
-        if not checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch))):
-            self._reference.modulate_into(packets, gap, out)
+        checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch)))
 
     def receiver(self) -> BurstReceiver:
         return CompiledReceiver(self)

@@ -182,7 +182,7 @@ class Ofdm final : public Modem {
         return kRead;
     }
 
-    bool modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
+    void modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
         Scratch& s = prepared();
         const Told sent{0, length};
         const Constellation& points = rungs_[0].points;
@@ -209,7 +209,6 @@ class Ofdm final : public Modem {
             for (int k = 0; k < p_.size; k++) out[p_.prefix + k] = std::conj(grid[k]);
             std::copy_n(out + p_.size, p_.prefix, out);
         }
-        return true;
     }
 
    private:

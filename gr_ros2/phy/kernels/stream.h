@@ -97,18 +97,17 @@ struct Batch {
     Sample* out;
 };
 
-// The bursts of packets, one after the other; false where numpy does this.
-inline bool modulate(const Modem& modem, const Batch& b) {
+// The bursts of packets, one after the other.
+inline void modulate(const Modem& modem, const Batch& b) {
     const uint8_t* data = b.data;
     Sample* out = b.out;
     for (int64_t k = 0; k < b.count; k++) {
         const uint8_t* bits = b.frames->plain() ? b.frames->wrap(data, b.lengths[k]) : data;
-        if (!modem.modulate(bits, b.lengths[k], out)) return false;
+        modem.modulate(bits, b.lengths[k], out);
         data += b.data_sizes[k];
         out += b.sizes[k];
         std::fill_n(out - b.gap, b.gap, Sample());
     }
-    return true;
 }
 
 }  // namespace gr_ros2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -85,10 +86,15 @@ class Robot:
 
 
 class Air:
-    """Slots of a full-duplex channel; ``lost(sender, receiver)`` decides packet by packet."""
+    """Slots of a full-duplex channel; ``lost(sender, receiver)`` decides packet by packet.
 
-    def __init__(self, *robots: Robot, loss: float = 0.0, seed: int = 1) -> None:
+    :param delay: slots from the departure of a packet to its arrival
+    """
+
+    def __init__(self, *robots: Robot, loss: float = 0.0, seed: int = 1, delay: int = 1) -> None:
         self.robots = list(robots)
+        self.delay = delay
+        self.under_way: deque[list[tuple[Robot, bytes]]] = deque([[] for _ in range(delay - 1)])
         self.now = 0.0
         self.rng = random.Random(seed)
         self.lost: Callable[[Robot, Robot], bool] = lambda _, __: self.rng.random() < loss
@@ -96,14 +102,14 @@ class Air:
 
     def step(self) -> None:
         """One slot."""
-        for robot in self.robots:
-            data = robot.slot(self.now)
-            if data is not None:
-                self.recorded.append((robot, data))
-                for other in self.robots:
-                    if other is not robot and not self.lost(robot, other):
-                        other.receive(data, self.now + SLOT_S)
+        left = [(robot, data) for robot in self.robots if (data := robot.slot(self.now)) is not None]
+        self.recorded += left
+        self.under_way.append(left)
         self.now += SLOT_S
+        for robot, data in self.under_way.popleft():
+            for other in self.robots:
+                if other is not robot and not self.lost(robot, other):
+                    other.receive(data, self.now)
         for robot in self.robots:
             robot.events += robot.end.handle_timeout(self.now)
 

@@ -167,10 +167,11 @@ def test_a_message_waits_for_an_earlier_one_and_not_for_ever() -> None:
     assert waited < 0.15
 
 
-def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> None:
+@pytest.mark.parametrize("delay", [1, 8, 38])
+def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips(delay: int) -> None:
     topics = registry(odom=TopicOptions(), map=LATCHED)
     one, two, late = Robot(1, topics), Robot(2), Robot(3)
-    air = Air(one, two)
+    air = Air(one, two, delay=delay)
     one.end.submit(1, text(1, 700), air.now)
     air.run(20.0)
     assert two.delivered() == [text(1, 700)]
@@ -179,10 +180,11 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips() -> No
     assert one.end.sent.air["new"] == sent  # nothing is repeated: both have it
     air.robots.append(late)
     air.run(5.0, lambda: any(isinstance(event, Met) for event in late.events))
-    waited = air.run(5.0, lambda: bool(late.delivered()))
+    waited = air.run(10.0, lambda: bool(late.delivered()))
     packets = -(-700 // 46)
     assert late.delivered() == [text(1, 700)]
-    assert waited <= (packets + 2 * 4 + 4) * SLOT_S  # the map, two round trips of two slots each way, and the table
+    round_trip = 2 * delay * SLOT_S
+    assert waited <= 2 * round_trip + (packets + 8) * SLOT_S  # with the packets of the map and of the table
     assert two.delivered() == [text(1, 700)]
 
 
@@ -396,7 +398,7 @@ def test_what_the_air_was_spent_on_adds_up(mode: SealMode) -> None:
         air.run(0.05)
     sent = [event for event in one.events if isinstance(event, SentPacket)]
     assert len(sent) == sum(one.end.sent.air.values()) == sum(robot is one for robot, _ in air.recorded)
-    assert {event.kind for event in sent} == {"new", "repair", "hello"}
+    assert {"new", "repair", "hello"} <= {event.kind for event in sent}
     keys_sent = {part.key for event in sent for part in event.entries if part.topic_id == ODOM}
     keys_here = [event.key for event in two.events if isinstance(event, Delivered)]
     assert len(keys_here) == len(set(keys_here))

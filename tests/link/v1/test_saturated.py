@@ -19,6 +19,12 @@ def test_no_topic_is_older_than_with_version_0(name: str, loss: float) -> None:
         assert ratio <= TOLERANCE[loss], f"{topic}: {note}"
 
 
+@pytest.mark.slow
+def test_no_topic_is_older_where_packets_leave_as_soon_as_the_air_is_free() -> None:
+    for topic, ratio in paced_ratios("six-topics-paced", 0.0, seeds=(1, 2)).items():
+        assert ratio <= TOLERANCE[0.0], topic
+
+
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 def test_a_repair_that_cannot_be_interrupted_delays_no_message(loss: float) -> None:
     (ratio,) = paced_ratios("paper-ofdm-paced", loss, seeds=(1, 2)).values()
