@@ -26,7 +26,6 @@ def top() -> Iterator[Flowgraph]:
 
 def wire(top: Flowgraph, gate: AirtimeGate) -> Probe:
     probe = Probe()
-    top.kept = probe, gate  # GNU Radio calls Python blocks without a reference, also to stop them after the test
     top.msg_connect((probe, "pdus"), (gate, "pdus"))
     top.msg_connect((gate, "pdus"), (probe, "pdus"))
     top.msg_connect((gate, "credit"), (probe, "credit"))
