@@ -39,6 +39,9 @@ for name in (
 ):
     os.environ.pop(name, None)
 
+# Programs write in blocks to what is no terminal, as they do for most people.
+os.environ.pop("PYTHONUNBUFFERED", None)
+
 # Tests start hundreds of programs. Each would compile the package, and list the fonts where a test has its own home.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

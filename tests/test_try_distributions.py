@@ -44,13 +44,15 @@ def test_what_it_refuses(words: list[str], said: str) -> None:
 def test_the_clone_is_copied_without_what_git_ignores(tool: ModuleType, tmp_path: Path) -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("needs a clone: this is no git repository")
-    kept, old = tmp_path / tool.CLONE / ".venv" / "kept", tmp_path / tool.CLONE / "old" / "file"
-    for path in (kept, old):
-        path.parent.mkdir(parents=True)
+    kept, built = (tmp_path / tool.CLONE / ".venv" / name for name in ("kept", "stamp-run"))
+    old = tmp_path / tool.CLONE / "old" / "file"
+    for path in (kept, built, old):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     tool.copy_in(tmp_path)
     assert (tmp_path / tool.CLONE / "setup.py").read_bytes() == (ROOT / "setup.py").read_bytes()
     assert kept.exists()
+    assert not built.exists(), "what was built into the clone is gone, so make must build it again"
     assert not old.exists()
     assert not list((tmp_path / tool.CLONE).rglob("__pycache__"))
 

@@ -118,13 +118,21 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except GrRos2Error as error:
         return _fail(str(error), BAD_INPUT if isinstance(error, _BAD_INPUT_ERRORS) else FAILED)
     except BrokenPipeError:
-        # The reader of our output (such as `| head`) has ended. This is no error, but Python must not flush at exit.
-        sys.stdout = open(os.devnull, "w")
+        _drop_output()  # the reader of our output (such as `| head`) has ended, which is no error
         return 0
     except OSError as error:
         # Code that writes a file reports its errors with its name. Other errors come here, such as those of our output.
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _drop_output()
         return _fail(f"{error.filename or 'a file or the output'}: {error.strerror or error}", FAILED)
     return status if isinstance(status, int) else 0
+
+
+def _drop_output() -> None:
+    """Python writes at exit what the output has not taken yet; where that fails, the exit status is its own, 120."""
+    sys.stdout = open(os.devnull, "w")
 
 
 def _fail(message: str, status: int) -> int:

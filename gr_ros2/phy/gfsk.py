@@ -64,7 +64,7 @@ class GfskModem(LinearModem):
     def modulate(self, packet: bytes) -> Samples:
         data = self.payload_bits(packet)
         if self.frames.coded:
-            data = 1 ^ data ^ np.concatenate((np.array([self.last_bit], np.uint8), data[:-1]))
+            data = np.uint8(1) ^ data ^ np.concatenate((np.array([self.last_bit], np.uint8), data[:-1]))
         return self._wave(np.concatenate((self._head, 2.0 * data - 1, _TAIL_SIGNS)))
 
     def waveform(self) -> dict[str, Any]:

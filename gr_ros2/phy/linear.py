@@ -99,6 +99,8 @@ class LinearModem(BurstModem):
 
     taps: Samples | NDArray[np.float32]
     """The receiver's filter."""
+    _pulse: Reals
+    """The pulse of each symbol; with frequency modulation, that of its frequency."""
 
     @property
     @abstractmethod
@@ -241,11 +243,12 @@ class LinearModem(BurstModem):
     last_bit = 0
     """The last bit of the preamble, where its symbols are bits."""
 
-    @abstractmethod
     def waveform(self) -> dict[str, Any]:
         """The constants that describe how symbols become samples: ``pulse`` of a symbol, or, with frequency modulation,
         ``waves`` of every sequence of bits (0 = none, 1 = a zero, 2 = a one, the newest one last) as long as the pulse,
         and the bits before (``lead``) and after (``tail``) the payload."""
+        unused = {"waves": (), "lead": (), "lead_len": 0, "tail": (), "tail_len": 0}
+        return {"pulse": self._pulse, "pulse_len": len(self._pulse), **unused}
 
     @property
     def before_payload(self) -> int | None:

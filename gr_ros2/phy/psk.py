@@ -58,10 +58,6 @@ class PskModem(LinearModem):
     def modulate(self, packet: bytes) -> Samples:
         return shape(np.concatenate((self._known, self.payload(packet))), self._pulse, self.sps).astype(np.complex64)
 
-    def waveform(self) -> dict[str, Any]:
-        unused = {"waves": (), "lead": (), "lead_len": 0, "tail": (), "tail_len": 0}
-        return {"pulse": self._pulse, "pulse_len": len(self._pulse), **unused}
-
 
 class PskPhy(LinearPhy):
     """Single carrier for narrow channels without echoes: use `ofdm` where an echo is as long as a symbol.

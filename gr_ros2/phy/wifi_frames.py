@@ -142,7 +142,7 @@ def interleaving(carrier_bits: int) -> NDArray[np.int64]:
     """For each coded bit of a symbol, its place among the bits of the carriers (section 17.3.5.7)."""
     count = carrier_bits * CARRIERS
     k = np.arange(count)
-    i = count // 16 * (k % 16) + k // 16
+    i: NDArray[np.int64] = count // 16 * (k % 16) + k // 16
     s = max(carrier_bits // 2, 1)
     return s * (i // s) + (i + count - 16 * i // count) % s
 

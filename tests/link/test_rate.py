@@ -45,10 +45,13 @@ def test_the_rung_is_nearly_the_best_at_every_snr(snr_db: float) -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.floats(-5, 35), st.integers(0, 10_000))
-def test_at_an_edge_the_rung_hardly_changes_though_the_snr_is_measured_with_errors(snr_db: float, seed: int) -> None:
-    later = settled(snr_db, noise_db=0.3, reports=1000, seed=seed)[500:]
-    assert sum(one != two for one, two in pairwise(later)) <= 16
+@given(st.sampled_from(LADDER[1:]), st.floats(-1.0, 1.5), st.integers(0, 10_000))
+def test_at_an_edge_the_rung_hardly_changes_though_the_snr_is_measured_with_errors(
+    faster: Rung, above_db: float, seed: int
+) -> None:
+    later = settled(faster.half_db + above_db, noise_db=0.3, reports=1000, seed=seed)[500:]
+    changes = sum(one != two for one, two in pairwise(later))
+    assert changes <= len(later) / 8, "the most seen in 2000 trials was 38; 190 if it were not more patient each time"
     assert max(later) - min(later) <= 1
 
 

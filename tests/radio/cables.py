@@ -83,12 +83,14 @@ def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_STREAM) -> list
 class Direwolves:
     """Two direwolf TNCs at 9600 baud. The audio that one sends is what the other hears.
 
-    Each writes its audio to a named pipe (ALSA's plugin `file`), from which it goes to the other one as UDP.
+    Each writes its audio to a named pipe (ALSA's plugin `file`), from which it goes to the other one as UDP. There is
+    one line for each direction, so they are full duplex. In half duplex, direwolf from 1.7 on hears nothing while it
+    sends.
     """
 
     _CONFIG = (
         "ADEVICE udp:{audio} tx\nARATE 48000\nACHANNELS 1\nCHANNEL 0\nMYCALL N0CALL\nMODEM 9600\nTXDELAY 5\n"
-        "TXTAIL 2\nDWAIT 0\nPERSIST 255\nSLOTTIME 1\nAGWPORT 0\nKISSPORT {kiss}\n"
+        "TXTAIL 2\nFULLDUP ON\nAGWPORT 0\nKISSPORT {kiss}\n"
     )
 
     def __init__(self, folder: Path) -> None:
@@ -140,7 +142,7 @@ class Direwolves:
                 # Silence crosses too: a TNC counts time in samples, and would find the channel busy for ever.
                 audio = os.read(descriptor, _AUDIO) if ready else bytes(_AUDIO)
                 out.sendto(audio, ("127.0.0.1", port))
-                self._stop.wait(0.002)  # a TNC that is flooded loses some
+                self._stop.wait(0.005)  # a TNC that is flooded loses some
         os.close(descriptor)
 
     def __enter__(self) -> Direwolves:

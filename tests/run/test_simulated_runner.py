@@ -91,8 +91,7 @@ def test_without_noise_real_time_samples_and_packets_agree() -> None:
     assert samples.topics == packets.topics
     there, simulated = real.topics[0].latency_s, samples.topics[0].latency_s
     assert there.p50 is not None and simulated.p50 is not None
-    # What the computer adds: DDS, Python, and a flowgraph that shares two cores with whatever else runs.
-    assert simulated.p50 < there.p50 < simulated.p50 + 1
+    assert simulated.p50 < there.p50, "the computer adds DDS, Python, and a flowgraph that waits for a processor"
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ times as many in separate groups of 64.
 *Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
 then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
 reports are rare or take long, it cannot know that so soon: it sends about as many repairs as losses are to be expected,
-before a report names them. Where reports come at once, the sender may also repair before it knows of a loss, but only
-``AHEAD`` times as often as packets are lost: a message that waits for a repair delays all later ones of its topic.
+before a report names them. Where reports come at once, the sender may also repair before it knows of a loss, as often
+as ``AHEAD`` allows: a message that waits for a repair delays all later ones of its topic.
 
 *Overload.* If the idle slots cannot make up for the losses, a long window decodes nothing at all. The window is then
 reduced to ``FEW`` packets, and to those of the newest message.
@@ -51,8 +51,9 @@ MAP = 64
 PROMPT = 1 / 64
 """Share of packets lost from which on a receiver reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
-AHEAD = 2.2
-"""Most repairs per packet lost, as long as repairs are sent before a report calls for them."""
+AHEAD = 1.4
+"""Most repairs per new packet that are sent before a report calls for them, divided by ``loss / (1 - loss)^3``: a
+packet, its repair and the report that would call for another one are all lost with that probability."""
 TURN = 3
 """While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
@@ -339,7 +340,7 @@ class RepairWindow:
     def _note_losses(self) -> None:
         self.loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
         loss = min(self.loss, _MOST_LOSS)
-        self._share = AHEAD * loss / (1 - loss)
+        self._share = AHEAD * loss / (1 - loss) ** 3
 
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
         """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.

@@ -267,7 +267,7 @@ def test_repairs_that_no_report_calls_for_are_few(loss: float) -> None:
         while sender.next(at) is not None:
             ahead += 1
         sender.report(9, number, (1 << 64) - 1, settled=True, loss=loss, now=at + 0.01)
-    most = AHEAD * loss / (1 - loss) * count
+    most = AHEAD * loss / (1 - loss) ** 3 * count
     assert 0.9 * most <= ahead <= most + 2
 
 
