@@ -99,6 +99,8 @@ class LinearModem(BurstModem):
 
     taps: Samples | NDArray[np.float32]
     """The receiver's filter."""
+    pulse: Reals
+    """A symbol as sent; not used with frequency modulation."""
     _pulse: Reals
     """The pulse of each symbol; with frequency modulation, that of its frequency."""
 
@@ -133,9 +135,15 @@ class LinearModem(BurstModem):
         return 2 * self.sps
 
     @property
-    @abstractmethod
     def preamble(self) -> Samples:
         """The first samples of every burst, as sent."""
+        return shape(self._known, self.pulse, self.sps).astype(np.complex64)
+
+    def samples_of(self, packet_len: int) -> int:
+        return (self.symbols(packet_len) - 1) * self.sps + len(self.pulse)
+
+    def modulate(self, packet: bytes) -> Samples:
+        return shape(np.concatenate((self._known, self.payload(packet))), self.pulse, self.sps).astype(np.complex64)
 
     def _prepare_estimate(self) -> None:
         """Compute the preamble after the receive filter, without noise."""
@@ -248,7 +256,7 @@ class LinearModem(BurstModem):
         ``waves`` of every sequence of bits (0 = none, 1 = a zero, 2 = a one, the newest one last) as long as the pulse,
         and the bits before (``lead``) and after (``tail``) the payload."""
         unused = {"waves": (), "lead": (), "lead_len": 0, "tail": (), "tail_len": 0}
-        return {"pulse": self._pulse, "pulse_len": len(self._pulse), **unused}
+        return {"pulse": self.pulse, "pulse_len": len(self.pulse), **unused}
 
     @property
     def before_payload(self) -> int | None:

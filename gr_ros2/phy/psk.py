@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.phy.burst import Frames, Samples
-from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, shape
+from gr_ros2.phy.burst import Frames
+from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy
 
 _ORDER = {"bpsk": 2, "qpsk": 4, "8psk": 8}
 _PULSE_SYMBOLS = 10
@@ -41,22 +41,13 @@ class PskModem(LinearModem):
         pulse = np.array(taps)
         pulse /= np.sqrt((pulse**2).sum())
         self.taps: NDArray[np.float32] = pulse.astype(np.float32)
-        self._pulse = pulse * np.sqrt(self.symbol_energy)
+        self.pulse = pulse  # whose length gives the energy of a symbol
+        self.pulse = pulse * np.sqrt(self.symbol_energy)
         self._prepare_estimate()
 
     @property
     def symbol_energy(self) -> float:
         return self.burst_samples / self.symbols(self.frames.packet_len)
-
-    def samples_of(self, packet_len: int) -> int:
-        return (self.symbols(packet_len) - 1) * self.sps + len(self.taps)
-
-    @property
-    def preamble(self) -> Samples:
-        return shape(self._known, self._pulse, self.sps).astype(np.complex64)
-
-    def modulate(self, packet: bytes) -> Samples:
-        return shape(np.concatenate((self._known, self.payload(packet))), self._pulse, self.sps).astype(np.complex64)
 
 
 class PskPhy(LinearPhy):
