@@ -91,12 +91,12 @@ def test_a_map_crosses_once_and_a_robot_that_joins_late_gets_it_by_asking(tmp_pa
 
 @pytest.mark.slow
 def test_a_message_of_almost_16_MB_crosses_and_memory_stays_bounded(tmp_path: Path) -> None:
-    """Over a modem of 100 Mbit/s, by UDP between addresses that only this process uses."""
+    """Over a modem of 20 Mbit/s, by UDP between addresses that only this process uses."""
     host = f"127.{20 + (os.getpid() >> 16) % 200}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
     ends = [{"name": "udp", "listen": f"{host}:{4001 + n}", "send_to": [f"{host}:{4002 - n}"]} for n in (0, 1)]
     values: dict[str, Any] = {
         **{"version": 1, "packet_len": 4095, "registry": "", "ros_source": {"topics": "auto"}},
-        "phy": {"name": "modem", "options": {"bit_rate": 1e8}},
+        "phy": {"name": "modem", "options": {"bit_rate": 2e7}},
     }
     sent = message(1, 4) + random.Random(1).randbytes(MAX_MESSAGE - 1004)
     heard: list[bytes] = []
