@@ -154,6 +154,8 @@ class Endpoint:
         self._hold = Hold()
         self._repair_at = -inf
         """Time in s up to which repairs wait, because a new message is about to come."""
+        self._calm_since = inf
+        """Time in s at which no repair was wanted, if only the time has changed since; otherwise infinite."""
         self._talk = Talk(settings, boot, encrypts=self.keys.encrypts)
         self._started = False
         self._hello_number = -1
@@ -373,10 +375,14 @@ class Endpoint:
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
         if min(leaving) > now and self._mode() != "off" and self.window.unconfirmed(now):
-            poll_s = _POLL_S if self.window.loss else _CALM_POLL_S
-            doubt = min(now + poll_s, self.window.next_doubt(now))
-            leaving.append(max(self._repair_at, now if self._mode() == "idle" else doubt))
+            leaving.append(max(self._repair_at, now if self._mode() == "idle" else self._next_look(now)))
         return max(min(leaving), self._pace.slot)
+
+    def _next_look(self, now: float) -> float:
+        """When a thrifty sender may want to repair something."""
+        if not self.window.loss:
+            return min(now + _CALM_POLL_S, self.window.next_doubt(now))
+        return min(now + _POLL_S, self.window.next_doubt(self._calm_since)) if self._calm_since < inf else now
 
     # ---- what leaves
 
@@ -443,6 +449,7 @@ class Endpoint:
         clear = write_header(header)
         data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
         self.window.sent(number, body, data, lives, now)
+        self._calm_since = inf
         if lives:
             self._hold.left(now, self.window.loss)
         return self._leave(data, Packet(header, tuple(entries), encrypted=self._encrypts), "new", now, parts)
@@ -470,6 +477,7 @@ class Endpoint:
         self._repair_at = -inf
         chosen = self.window.next(now, self._held)
         held = self._repair_at > now
+        self._calm_since = now if chosen is None and not held else inf
         if chosen is None:
             lives = () if held else self.window.exhausted(now)
             return self._source([], lives, 0, (), now) if lives else None
@@ -644,6 +652,7 @@ class Endpoint:
             loss = entry.loss / 128
             sender = self._sender.src_id
             self.window.report(sender, number, entry.arrived, settled=entry.settled, loss=loss, now=now)
+            self._calm_since = inf
             self.outbox.reported = True
             if self._rate is not None and entry.snr_db is not None:
                 self._rate.report(sender, entry.snr_db, loss, now)

@@ -493,3 +493,21 @@ def test_the_destination_changes_between_robots_and_not_to_all_of_them() -> None
     with pytest.raises(ConfigError, match=r"dst_id = 255: a change between .* needs a restart"):
         one.reconfigure(dst_id=255)
     assert one.settings.dst_id == 2
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.2, 0.4])
+def test_no_repair_leaves_before_the_sending_thread_is_told_to_look(loss: float) -> None:
+    """The thread sleeps until ``next_departure``, which it asks again after a message, a credit or a report."""
+    one, two = Robot(1, registry()), Robot(2)
+    air, repairs = Air(one, two, loss=loss), 0
+    for number in range(600):
+        one.end.submit(ODOM, text(number), air.now)
+        for _ in range(3):
+            if one.end.out_of_credit:
+                one.end.credit()
+            at, before = one.end.next_departure(), one.end.sent.air["repair"]
+            air.step()
+            if one.end.sent.air["repair"] > before:
+                repairs += 1
+                assert at is not None and at < air.now, "the slot in which it left"
+    assert repairs > 100 * loss
