@@ -51,7 +51,7 @@ MAP = 64
 PROMPT = 1 / 64
 """Share of packets lost from which on a receiver reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
-AHEAD = 1.0
+AHEAD = 1.2
 """Most repairs per new packet that are sent before a report calls for them, divided by ``loss / (1 - loss)^3``: a
 packet, its repair and the report that would call for another one are all lost with that probability."""
 TURN = 3
