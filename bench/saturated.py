@@ -205,7 +205,7 @@ def paced_ratios(
         [paced(name, version, loss, back=back and version > 0, seed=seed, best_effort=best_effort) for seed in seeds]
         for version in (0, 1)
     )
-    return {topic: sum(run[topic] for run in after) / sum(run[topic] for run in before) for topic in before[0]}
+    return {topic: sum(ages[topic] for ages in after) / sum(ages[topic] for ages in before) for topic in before[0]}
 
 
 def saturated() -> list[Row]:

@@ -40,8 +40,8 @@ def stream(setting: int) -> tuple[Any, frozenset[bytes], Samples]:
     draw = random.Random(setting)
     packets = [draw.randbytes(PACKET_LEN) for _ in range(BURSTS)]
     parts = [np.zeros(150, np.complex64)]
+    rungs = phy.running_modem.rungs
     for number, packet in enumerate(packets):
-        rungs = phy.running_modem.rungs
         rung = rungs[2 * number % len(rungs)]
         parts += [rung.modulate(packet), np.zeros(phy.gap, np.complex64)]
     whole = np.concatenate([*parts, np.zeros(300, np.complex64)])

@@ -31,25 +31,25 @@ class _Holds:
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._held: list[Any] = []
+        """Blocks whose streams are connected."""
+        self._messages: list[tuple[Any, ...]] = []
+        """The ends of message connections."""
 
     def connect(self, *points: Any) -> None:
         """Connect streams, with the arguments of GNU Radio's method."""
         super().connect(*points)  # type: ignore[misc]
-        self._hold(points)
+        blocks = (point[0] if isinstance(point, tuple) else point for point in points)
+        self._held += [block for block in blocks if block is not self]
 
     def msg_connect(self, *ends: Any) -> None:
         """Connect two message ports, with the arguments of GNU Radio's method."""
         super().msg_connect(*ends)  # type: ignore[misc]
-        self._hold(ends)
+        self._messages.append(ends)
 
     def disconnect_all(self) -> None:
-        """Forget the stream connections, as GNU Radio's method does, and let go of all blocks."""
+        """Forget the stream connections, as GNU Radio's method does, and let go of their blocks."""
         self._impl.disconnect_all()  # type: ignore[attr-defined]
         self._held.clear()
-
-    def _hold(self, points: tuple[Any, ...]) -> None:
-        blocks = (point[0] if isinstance(point, tuple) else point for point in points)
-        self._held += [block for block in blocks if block is not self and not isinstance(block, (str, int))]
 
 
 class Flowgraph(_Holds, gr.top_block):  # type: ignore[misc]
@@ -102,15 +102,6 @@ class HierBlock(_Holds, gr.hier_block2):  # type: ignore[misc]
     GNU Radio's ``disconnect_all`` forgets stream connections only. The message connections would keep it alive, and
     with it shared memory, of which a system has 4096 segments: an OFDM receiver of stock blocks takes 60.
     """
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self._messages: list[tuple[Any, ...]] = []
-
-    def msg_connect(self, *ends: Any) -> None:
-        """Connect two message ports, with the arguments of GNU Radio's method."""
-        super().msg_connect(*ends)
-        self._messages.append(ends)
 
     def release(self) -> None:
         """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""

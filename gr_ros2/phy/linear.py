@@ -101,8 +101,6 @@ class LinearModem(BurstModem):
     """The receiver's filter."""
     pulse: Reals
     """A symbol as sent; not used with frequency modulation."""
-    _pulse: Reals
-    """The pulse of each symbol; with frequency modulation, that of its frequency."""
 
     @property
     @abstractmethod

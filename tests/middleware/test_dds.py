@@ -443,6 +443,16 @@ def test_discovery_is_on_the_interface_that_the_environment_says(
     assert result.stdout.split() == groups, result.stderr
 
 
+def started(stack: ExitStack, path: str, role: str, chosen: str, named: str = "") -> Peer:
+    """A node in a network namespace, with a range and static peers."""
+    environment = {"ROS_LOCALHOST_ONLY": "0", RANGE: chosen, PEERS: named}
+    command = [*PEER, "7", "/a", STRING, role, "reliable", "transient_local", "1"]
+    peer = inside(path, lambda: Peer(command, environment))
+    stack.callback(peer.close)
+    wait_for(lambda: peer.ready, "a node that has started")
+    return peer
+
+
 @needs_namespaces
 @pytest.mark.parametrize(
     ("first", "second"),
@@ -462,13 +472,7 @@ def test_static_peers_are_found_on_another_machine(first: tuple[str, str], secon
         for path, address, device, *_ in ends:
             setup = f"ip link set lo up && ip addr add {address}/24 dev {device} && ip link set {device} up"
             inside(path, lambda command=setup: subprocess.run(command, shell=True, check=True))  # type: ignore[misc]
-        peers = []
-        for path, _, _, (chosen, named), role in ends:
-            environment = {"ROS_LOCALHOST_ONLY": "0", RANGE: chosen, PEERS: named}
-            command = [*PEER, "7", "/a", STRING, role, "reliable", "transient_local", "1"]
-            peers.append(inside(path, lambda c=command, e=environment: Peer(c, e)))  # type: ignore[misc]
-            stack.callback(peers[-1].close)
-            wait_for(lambda: peers[-1].ready, "a machine that has started")
+        peers = [started(stack, path, role, *discovery) for path, _, _, discovery, role in ends]
         peers[0].publish([message(1)])
         wait_for(lambda: peers[1].received == [message(1)], "the message across the cable")
 
@@ -480,13 +484,7 @@ def test_nodes_of_one_machine_find_each_other_whatever_their_range(ranges: tuple
     with ExitStack() as stack:
         machine = stack.enter_context(Namespace()).path
         inside(machine, lambda: subprocess.run(INTERFACES, shell=True, check=True))
-        peers = []
-        for chosen, role in zip(ranges, ("pub", "sub"), strict=True):
-            environment = {"ROS_LOCALHOST_ONLY": "0", RANGE: chosen, PEERS: ""}
-            command = [*PEER, "7", "/a", STRING, role, "reliable", "transient_local", "1"]
-            peers.append(inside(machine, lambda c=command, e=environment: Peer(c, e)))  # type: ignore[misc]
-            stack.callback(peers[-1].close)
-            wait_for(lambda: peers[-1].ready, "a node that has started")
+        peers = [started(stack, machine, role, chosen) for role, chosen in zip(("pub", "sub"), ranges, strict=True)]
         peers[0].publish([message(1)])
         wait_for(lambda: peers[1].received == [message(1)], "the message from one interface to the other")
 

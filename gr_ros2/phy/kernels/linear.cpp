@@ -109,14 +109,13 @@ class Linear final : public Modem {
         for (int k = 0; word && k < kWordBits; k++) sent.push_back(word[k] > 0);
         sent.insert(sent.end(), bits, bits + lengths_.bits(length));
         if (p_.lead_len) modulate_frequency(sent, out);
-        else modulate_phase(sent, out);
+        else modulate_phase(sent, p_.preamble + symbols(length), out);
     }
 
    private:
-    // One pulse per symbol.
-    void modulate_phase(const Bits& sent, Sample* out) const {
-        const int payload = (static_cast<int>(sent.size()) + p_.point_bits - 1) / p_.point_bits;
-        const int count = p_.preamble + payload, most = p_.pulse_len;
+    // One pulse for each of `count` symbols.
+    void modulate_phase(const Bits& sent, int count, Sample* out) const {
+        const int most = p_.pulse_len;
         std::fill_n(out, static_cast<int64_t>(count - 1) * p_.sps + most, Sample());
         size_t taken = 0;
         for (int symbol = 0; symbol < count; symbol++, out += p_.sps) {

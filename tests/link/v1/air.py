@@ -93,7 +93,6 @@ class Air:
 
     def __init__(self, *robots: Robot, loss: float = 0.0, seed: int = 1, delay: int = 1) -> None:
         self.robots = list(robots)
-        self.delay = delay
         self.under_way: deque[list[tuple[Robot, bytes]]] = deque([[] for _ in range(delay - 1)])
         self.now = 0.0
         self.rng = random.Random(seed)
