@@ -76,7 +76,7 @@ def _link(number: int, version: int, folder: Path) -> RobotLink:
                 "state": str(folder / f"state-{number}"),
                 "phy": {"name": "ofdm", "sample_rate": 1e5},
                 "front_end": {"name": "zmq", "bind": own, "connect": [other]},
-                "ros_source": {"namespace": f"/robot_{number}", "scheduler": "freshness", **graph},
+                "ros_source": {"namespace": f"/robot_{number}", **graph},
                 "ros_sink": graph,
             }
         )

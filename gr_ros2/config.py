@@ -34,7 +34,7 @@ from gr_ros2.names import (
     checked_namespace_form,
     checked_topic_form,
 )
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.setting import AUTO, Auto, OnlyIn, settings_of
 from gr_ros2.topic_choice import checked_words, words_of
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
 from gr_ros2.yaml_bounds import read_bounded
@@ -142,18 +142,18 @@ class Agreed(Packets):
 
     :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
     :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
-    :param key: file of the fleet's keys (gr-ros2 key new), with version 1; '' sends packets that anybody can read and
-        forge; with one, sealed packets alone are taken
+    :param key: file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one,
+        sealed packets alone are taken
     :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
-    :param state: file that counts this robot's starts and says what was heard before a restart (version 1); '' keeps it
-        in the user's state folder
+    :param state: file that counts this robot's starts and says what was heard before a restart; '' keeps it in the
+        user's state folder
     """
 
     registry: Annotated[Text, Field(title="Registry CSV")]
-    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 0
-    key: Annotated[str, Field(title="Keys of the fleet")] = ""
-    seal: Literal["encrypt", "authenticate"] = "encrypt"
-    state: Annotated[str, Field(title="State file")] = ""
+    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 1
+    key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet")] = ""
+    seal: Annotated[Literal["encrypt", "authenticate"], OnlyIn(1)] = "encrypt"
+    state: Annotated[str, OnlyIn(1), Field(title="State file")] = ""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -181,7 +181,7 @@ class TopicOptions(Queued):
         publishers' QoS (docs/explanation/scheduling.md)
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
         publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
-    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
+    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000
     :param max_rate: messages/s sent at most, 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
@@ -192,10 +192,10 @@ class TopicOptions(Queued):
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     depth: Count | Auto = AUTO
     publish_as: TopicForm = AUTO
-    queue: QueuePolicy | Auto = AUTO
-    deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
-    weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
-    max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    queue: Annotated[QueuePolicy | Auto, OnlyIn(1)] = AUTO
+    deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
+    weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     codec: str = AUTO
     quantize: str = ""
 
@@ -216,7 +216,6 @@ class EndConfig(Agreed):
         front end loops back. A sink that has one drops and counts its own packets and those for others
     :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
     :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
-    :param compression: code every message, C = 1; on at both ends or at none
     :param dictionaries: files of dictionaries of your own, made by `gr-ros2 dict train`; the same at both ends
     :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
     :param debug: readable log of headers, topic ids and entries
@@ -226,10 +225,18 @@ class EndConfig(Agreed):
     robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
     middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
-    compression: bool = False
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> EndConfig:
+        refuse_without_effect(self, self.version)
+        for name, options in self.topic_options.items():
+            refuse_without_effect(options, self.version, f"topic_options.{name}.")
+        if self.seal != "encrypt" and not self.key:
+            raise ValueError(f"seal = {self.seal!r}: nothing is sealed without a key; set key")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -240,7 +247,7 @@ class SourceConfig(Queued, EndConfig):
         -NAME leaves out. Of the registry, where there is one ([] = all); otherwise, with version 1, of the ROS graph,
         which says type and QoS ([] = none)
     :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
-        call; this needs both directions of a link and version 1
+        call; this needs both directions of a link
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
     :param dst_id: destination id, 255 broadcast
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
@@ -254,10 +261,11 @@ class SourceConfig(Queued, EndConfig):
     :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
         joins fragments of different messages)
-    :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
     :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
         version 1 only while no robot reports
-    :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
+    :param compression: code every message, which a receiver sees by itself; auto = with version 1, which the paper's
+        version 0 leaves off
+    :param repair: what idle air is spent on: idle = all of it on what may have been lost, thrifty = as
         much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
     :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
     """
@@ -267,24 +275,24 @@ class SourceConfig(Queued, EndConfig):
         BeforeValidator(lambda given: words_of(given) if isinstance(given, str) else given),
         AfterValidator(checked_words),
     ] = ()
-    services: Annotated[bool, Field(title="Services and actions too")] = True
+    services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
-    min_fragment: Annotated[int, Field(ge=1, title="Smallest fragment (bytes)")] = 16
-    greedy: bool = False
-    flush_timeout_s: Seconds = 0.0
+    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, title="Smallest fragment (bytes)")] = 16
+    greedy: Annotated[bool, OnlyIn(0)] = False
+    flush_timeout_s: Annotated[Seconds, OnlyIn(0)] = 0.0
     subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
-    hop: Annotated[int, Field(ge=0, le=15, title="Hop limit (hops)")] = 1
+    hop: Annotated[int, OnlyIn(0), Field(ge=0, le=15, title="Hop limit (hops)")] = 1
     packet_rate: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
     ] = AUTO
     queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
     backpressure: bool = False
-    entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
-    scheduler: str = "paper"
+    entry_ids: Annotated[Literal["sequential", "random"], OnlyIn(0), Field(title="Entry IDs")] = "sequential"
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
-    repair: Repairs | Auto = AUTO
-    expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
+    compression: bool | Auto = AUTO
+    repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
+    expected_loss: Annotated[float, OnlyIn(1), Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
 
     @field_validator("repair", mode="before")
     @classmethod
@@ -308,6 +316,11 @@ class SourceConfig(Queued, EndConfig):
     def wire_format(self) -> Format:
         """The wire format of the version in which packets are written."""
         return format_of(self.version)
+
+    @property
+    def compresses(self) -> bool:
+        """Whether messages are coded: as ``compression`` says, or as the version has it."""
+        return self.version != 0 if self.compression == AUTO else self.compression
 
     def src_id(self) -> int:
         """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
@@ -333,8 +346,8 @@ class SinkConfig(EndConfig):
 
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
-    :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
-    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired (version 1)
+    :param reassembly_timeout_s: s an incomplete message is kept
+    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all
@@ -346,11 +359,11 @@ class SinkConfig(EndConfig):
 
     namespace_format: NamespaceForm = "/rx_robot_{src_id}"
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
-    reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
-    hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
+    reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
+    hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
-    max_bytes: Annotated[int, Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
+    max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
@@ -540,6 +553,23 @@ class DiagnosticsConfig:
     silence_warn_s: Seconds = 3.0
     silence_error_s: Seconds = 10.0
     queue_warn: Probability = 0.8
+
+
+def refuse_without_effect(config: Any, version: int, where: str = "") -> None:
+    """Refuse settings that only the other version of the wire format has. At their defaults they are taken.
+
+    :param config: an object of a settings class
+    :param version: the version that runs
+    :param where: what the names of the settings begin with in the error
+    :raises ValueError: naming setting, value and version
+    """
+    for setting in settings_of(type(config)):
+        value = getattr(config, setting.name)
+        if setting.version not in (None, version) and value != setting.default:
+            raise ValueError(
+                f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out, or set "
+                f"version: {setting.version}"
+            )
 
 
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:

@@ -7,7 +7,7 @@ here. A new setting is therefore one field of a dataclass and its line in the do
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
@@ -18,6 +18,14 @@ from pydantic.fields import FieldInfo
 Auto = Literal["auto"]
 AUTO: Final = "auto"
 """The value of a setting that is derived from others or chosen by a device; the setting's meaning says how."""
+
+
+@dataclass(frozen=True)
+class OnlyIn:
+    """Marks a setting that only one version of the wire format has, as in ``Annotated[bool, OnlyIn(0)]``."""
+
+    version: int
+
 
 REQUIRED: Final = object()
 """Stands for the default of a setting that has none."""
@@ -41,6 +49,7 @@ class Setting:
     :param most: largest allowed number; None if there is no such limit
     :param above: numbers must be above this; None if there is no such limit
     :param below: numbers must be below this; None if there is no such limit
+    :param version: the only version of the wire format that has it; None if all have
     """
 
     name: str
@@ -54,6 +63,13 @@ class Setting:
     most: float | None = None
     above: float | None = None
     below: float | None = None
+    version: int | None = None
+
+    @property
+    def explained(self) -> str:
+        """Its meaning in plain text, and in which version it exists if not in all."""
+        meaning = self.meaning.replace("``", "")
+        return meaning if self.version is None else f"{meaning} (version {self.version} only)"
 
     @property
     def derives(self) -> bool:
@@ -79,10 +95,16 @@ class Setting:
         return tuple(kind for kind in members(self.hint) if get_origin(kind) is not Literal and kind is not NoneType)
 
 
-def settings_of(cls: type[Any]) -> list[Setting]:
+_FOUND: dict[type[Any], list[Setting]] = {}
+"""The settings of each class that was asked for."""
+
+
+def settings_of(cls: type[Any]) -> Sequence[Setting]:
     """Every field of a settings class, in their order."""
-    described, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
-    return [_setting(item, hints[item.name], described.get(item.name, ""), called) for item in fields(cls)]
+    if cls not in _FOUND:
+        described, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
+        _FOUND[cls] = [_setting(item, hints[item.name], described.get(item.name, ""), called) for item in fields(cls)]
+    return _FOUND[cls]
 
 
 def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> Setting:
@@ -106,6 +128,7 @@ def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> S
         next((bound.le for bound in bounds if isinstance(bound, Le)), None),  # type: ignore[arg-type]
         next((bound.gt for bound in bounds if isinstance(bound, Gt)), None),  # type: ignore[arg-type]
         next((bound.lt for bound in bounds if isinstance(bound, Lt)), None),  # type: ignore[arg-type]
+        next((mark.version for mark in marks if isinstance(mark, OnlyIn)), None),
     )
 
 

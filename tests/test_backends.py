@@ -15,7 +15,6 @@ import pytest
 import gr_ros2
 from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.errors import BackendMissingError, ConfigError
-from gr_ros2.link import SCHEDULER
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
@@ -93,7 +92,7 @@ def test_a_thread_loads_too() -> None:
         assert pool.submit(TABLE.load, "there").result() is OrderedDict
 
 
-@pytest.mark.parametrize("table", [MIDDLEWARE, PHY, FRONT_ENDS, SCHEDULER], ids=lambda table: table.family)
+@pytest.mark.parametrize("table", [MIDDLEWARE, PHY, FRONT_ENDS], ids=lambda table: table.family)
 def test_every_row_has_a_summary_of_one_line(table: BackendTable[Backend]) -> None:
     assert table.own
     assert all(row.summary and "\n" not in row.summary for row in table.own.values())

@@ -76,6 +76,7 @@ WITHOUT_BACKENDS = (
 
 KNOW_THEIR_VERSION = (
     "wire/",
+    "link/schedule.py",
     "link/sender.py",
     "link/receiver.py",
     "link/reassemble.py",

@@ -320,6 +320,6 @@ def test_options_may_be_of_topics_that_others_announce() -> None:
     assert [topic.options.depth for topic in registry.with_options(options, announced=True)] == [3]
     with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
         registry.with_options(options)
-    check_outputs(registry, SinkConfig(topic_options=options, version=1))
+    check_outputs(registry, SinkConfig(topic_options=options))
     with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
-        check_outputs(registry, SinkConfig(topic_options=options))
+        check_outputs(registry, SinkConfig(topic_options=options, version=0))

@@ -24,7 +24,7 @@ from gr_ros2.study.ablation import Variant, run_variants, worth_grid
 def ablate(
     scenario: str, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]
 ) -> None:
-    """Run SCENARIO as is, then without compression, pull, repair, reports, freshness, queue latest: one at a time"""
+    """Run SCENARIO as is, then without compression, pull, repair, reports, queue latest: one at a time"""
     out = out or Path("results") / f"ablate-{Path(scenario).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
 

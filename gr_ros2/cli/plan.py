@@ -43,19 +43,13 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
     console.print(_verdict(forecast), soft_wrap=True)
     if forecast.air:
         console.print(_air(forecast), soft_wrap=True)
-    if (needed := planner.reassembly_timeout_s(forecast)) is not None:
-        console.print(
-            f"Needed: --set ros_sink.reassembly_timeout_s={needed:g}: up to {forecast.pause_s:.2f} s lie between two "
-            f"fragments of a message, after {planner.scenario.ros_sink.reassembly_timeout_s:g} s the sink gives it up",
-            soft_wrap=True,
-        )
     if not no_advice:
         found = planner.advice()
         for advice in found[:_ADVICE]:
             console.print(_line(advice), soft_wrap=True)
         if not found:
             console.print(
-                "No change of packet_len, compression, scheduler or pacing makes more better than worse.",
+                "No change of packet_len, compression or pacing makes more better than worse.",
                 soft_wrap=True,
             )
 

@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from math import inf
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from gr_ros2.boots import BootFile
-from gr_ros2.config import SinkConfig, SourceConfig, build
+from gr_ros2.config import SinkConfig, SourceConfig, build, refuse_without_effect
 from gr_ros2.errors import ConfigError
 from gr_ros2.keys import read_key_file
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
@@ -34,6 +34,9 @@ from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.registry import Registry, Topic
 from gr_ros2.setting import Auto
 from gr_ros2.wire import BROADCAST
+
+if TYPE_CHECKING:
+    from gr_ros2.compression import LinkCodec
 
 _T = TypeVar("_T")
 
@@ -77,18 +80,15 @@ def read_registry(registry: str | Registry, *, needed: bool = True) -> Registry:
     return Registry.from_csv(registry)
 
 
-def message_codec(config: SourceConfig | SinkConfig, registry: Registry) -> MessageCodec | None:
-    """The codec of a link with compression; None for a link without.
+def message_codec(dictionaries: Sequence[str], registry: Sequence[Topic] = ()) -> LinkCodec:
+    """The codec of a link.
 
     :param registry: with topic options applied
-
     :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
     """
-    if not config.compression:
-        return None
-    from gr_ros2.compression import LinkCodec  # imported here: links without compression do not need it
+    from gr_ros2.compression import LinkCodec  # imported here: it takes longer than the rest of a block
 
-    return LinkCodec(registry, config.dictionaries)
+    return LinkCodec(registry, dictionaries)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def make_endpoint(
     :param source: settings of the sending half; None: it sends nothing
     :param sink: settings of the receiving half; None: it receives nothing
     :param start: for version 1 only
-    :param codec: codec of all messages; None: made here if ``compression`` is on
+    :param codec: codec of all messages; None: made here
     :param calls: whether services cross the link: the last row of the endpoint's registry is for requests and replies
     :raises ConfigError: for settings that contradict each other
     """
@@ -141,27 +141,26 @@ def make_endpoint(
             "take gr-ros2 link or RosLink"
         )
     rows = registry if source is None else registry.with_options(source.topic_options)
+    end = source if source is not None else sink
+    version = 1 if end is None else end.version
+    for topic in rows:
+        try:
+            refuse_without_effect(topic.options, version, f"topic {topic.name}: ")
+        except ValueError as error:
+            raise ConfigError(f"registry: {error}") from None
     if calls:
         rows = rows.with_calls()
-    to_air = from_air = codec
-    if codec is None:
-        to_air = None if source is None else message_codec(source, rows)
-        from_air = (
-            None
-            if sink is None
-            else message_codec(sink, registry.with_options(sink.topic_options, announced=sink.version != 0))
-        )
-    version = source.version if source is not None else 0 if sink is None else sink.version
+    to_air = None
+    if source is not None and source.compresses:
+        to_air = codec or message_codec(source.dictionaries, rows)
+    dictionaries = () if sink is None else sink.dictionaries
     if not version:
         if start is not None and start.ladder:
             raise ConfigError("phy.options.rate = 'adaptive' with version 0, which has no reports; set version to 1")
+        from_air = None if sink is None else codec or message_codec(dictionaries, registry)
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or Start()
-    dictionaries = () if sink is None else sink.dictionaries
-    if codec is None:
-        from gr_ros2.compression import LinkCodec
-
-        known = LinkCodec((), dictionaries)
+    known = message_codec(dictionaries)
     return EndpointV1(
         None if source is None or not rows else rows,
         settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),

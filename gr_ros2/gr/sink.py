@@ -247,13 +247,6 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
         return {**counted, "topics": {self._name(key): topic for key, topic in topics.items()}}
 
-    def set_reassembly_timeout_s(self, reassembly_timeout_s: float) -> None:
-        """Set how long an incomplete message is kept, s (raises ConfigError out of range)."""
-        with self._lock:
-            self.config = replaced(self.config, reassembly_timeout_s=reassembly_timeout_s)
-            self._end.keep_incomplete(reassembly_timeout_s)
-            self._timer_due.notify_all()
-
     def set_debug(self, debug: bool) -> None:
         """Turn the readable log of headers, topic ids and entries on or off."""
         with self._lock:

@@ -201,7 +201,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
         if self.choice:
             self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
-        if self.config.version and self.config.compression and isinstance(self.middleware, ServiceGraph):
+        if self.config.version and self.config.compresses and isinstance(self.middleware, ServiceGraph):
             self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
         return True
 
@@ -270,21 +270,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """
         self._reconfigure(packet_rate=packet_rate)
 
-    def set_flush_timeout_s(self, flush_timeout_s: float) -> None:
-        """Set how long a partly filled packet waits for more entries, s."""
-        self._reconfigure(flush_timeout_s=flush_timeout_s)
-
-    def set_greedy(self, greedy: bool) -> None:
-        """Set whether a packet may hold several entries of one topic."""
-        self._reconfigure(greedy=greedy)
-
     def set_dst_id(self, dst_id: int) -> None:
         """Set the destination id; 255 is broadcast."""
         self._reconfigure(dst_id=dst_id)
-
-    def set_hop(self, hop: int) -> None:
-        """Set the initial hop count."""
-        self._reconfigure(hop=hop)
 
     def set_queue_depth(self, queue_depth: int) -> None:
         """Set how many messages may wait per topic; 0 is unlimited."""
@@ -302,8 +290,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def _reconfigure(self, **changes: Any) -> None:
         with self._lock:
+            config = replaced(self.config, **changes)
             self._end.reconfigure(**changes)
-            self.config = replaced(self.config, **changes)
+            self.config = config
             self._work.notify_all()
             self._room.notify_all()
 

@@ -17,12 +17,10 @@ from gr_ros2.link.events import (
     SentPacket,
 )
 from gr_ros2.link.receiver import Receiver
-from gr_ros2.link.schedule import SCHEDULER
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 
 __all__ = [
-    "SCHEDULER",
     "Accepted",
     "Delivered",
     "Endpoint",

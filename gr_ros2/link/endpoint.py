@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
-from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig, replaced
+from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
@@ -20,6 +20,19 @@ from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.registry import NewRow, Registry
+
+LIVE_SETTINGS = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
+"""Settings of a sending half that may change at run time, the same in every version."""
+
+
+def check_live(changes: Mapping[str, Any]) -> None:
+    """Refuse to change other settings than ``LIVE_SETTINGS``.
+
+    :raises ConfigError: naming the setting and those that can change
+    """
+    for name in changes:
+        if name not in LIVE_SETTINGS:
+            raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
 
 
 class Endpoint(Protocol):
@@ -113,14 +126,10 @@ class Endpoint(Protocol):
         """Messages that wait or are partly sent, per topic id."""
 
     def reconfigure(self, **changes: Any) -> None:
-        """Change settings of the sending half at run time.
+        """Change settings of the sending half at run time, some of ``LIVE_SETTINGS``.
 
         :raises ConfigError: for a value out of range or a setting that cannot change
         """
-
-    def keep_incomplete(self, timeout_s: float) -> None:
-        """Set how long (s) an incomplete message waits for its next fragment. Version 1 waits while it may be
-        repaired."""
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A repeat of it is delivered again."""
@@ -234,22 +243,13 @@ class EndpointV0:
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """Do nothing: both ends of version 0 code by the same dictionaries."""
 
-    def follow(
-        self,
-        topic_id: int,
-        *,
-        reliable: bool = True,  # noqa: ARG002 - version 0 delivers as it comes
-        latched: bool = False,  # noqa: ARG002 - the registry says it at both ends
-        depth: int = 0,
-        lifespan_s: float = 0.0,
-        period_s: float = 0.0,
-    ) -> bool:
-        """See :class:`Endpoint`."""
-        return self._half().follow(topic_id, depth=depth, lifespan_s=lifespan_s, period_s=period_s)
+    def follow(self, topic_id: int, **qos: Any) -> bool:  # noqa: ARG002
+        """Do nothing: version 0 delivers as it comes, and the registry says the rest at both ends."""
+        return False
 
-    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:  # noqa: ARG002 - all topics have the same
         """See :class:`Endpoint`."""
-        return self._half().queue(topic_id)
+        return "fifo", 0.0
 
     def depth(self, topic_id: int) -> int:
         """See :class:`Endpoint`."""
@@ -265,12 +265,8 @@ class EndpointV0:
 
     def reconfigure(self, **changes: Any) -> None:
         """See :class:`Endpoint`."""
+        check_live(changes)
         self._half().reconfigure(**changes)
-
-    def keep_incomplete(self, timeout_s: float) -> None:
-        """See :class:`Endpoint`."""
-        if self._receiver is not None:
-            self._receiver.config = replaced(self._receiver.config, reassembly_timeout_s=timeout_s)
 
     def unpublished(self, event: Delivered) -> Lost:
         """See :class:`Endpoint`."""

@@ -1,20 +1,17 @@
-"""Schedulers choose the fragments of the next packet: their interface, and the paper's scheduler (section 5.2). The
-other one is ``freshness``.
+"""Version 0 chooses the fragments of the next packet as the paper has it (section 5.2).
 
-Invariant: a scheduler only plans. It changes only its own order of topics and the cut of waiting messages that is not
+Invariant: the scheduler only plans. It changes only its own order of topics and the cut of waiting messages that is not
 fixed yet. The sender executes the last plan or asks for another one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from gr_ros2.backends import Backend, BackendTable
 from gr_ros2.config import SourceConfig
 from gr_ros2.link.fragment import Outgoing, fragment_len
-from gr_ros2.registry import Registry
-from gr_ros2.wire import Format
+from gr_ros2.wire.v0 import V0
 
 
 class Plan(NamedTuple):
@@ -30,43 +27,31 @@ class Plan(NamedTuple):
     full: bool
 
 
-class Scheduler(Protocol):
-    """Chooses what goes into the next packet. It is made from the source's configuration, registry and wire format."""
-
-    config: SourceConfig
-
-    def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
-        """The next packet's content from the messages waiting per topic id, or None if nothing is waiting."""
-
-    def sent(self, plan: Plan) -> None:
-        """The last plan was executed."""
-
-
 class PaperScheduler:
     """Round robin over topics: one entry per topic and packet, or with ``greedy`` several back to back.
 
     A topic that got an entry goes to the end of the queue; a topic whose next fragment did not fit keeps its place.
     """
 
-    def __init__(self, config: SourceConfig, registry: Registry, wire_format: Format) -> None:  # noqa: ARG002 - all topics are alike
+    def __init__(self, config: SourceConfig) -> None:
         self.config = config
-        self._format = wire_format
         self._line: list[int] = []
 
     def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
+        """The next packet's content from the messages waiting per topic id, or None if nothing is waiting."""
         pending = [topic_id for topic_id, queue in queues.items() if queue]
         if not pending:
             return None
         for topic_id in pending:
             if topic_id not in self._line:
                 self._line.append(topic_id)
-        config, wire = self.config, self._format
+        config = self.config
         picks: list[Outgoing] = []
         chosen: list[int] = []
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
-                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment, wire)
+                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment, V0)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
                 chosen += lengths
@@ -74,9 +59,9 @@ class PaperScheduler:
                 whole = message.index + len(lengths) == message.total
                 if not (config.greedy and lengths and whole):
                     break
-            if len(picks) == wire.max_entries:
+            if len(picks) == V0.max_entries:
                 break
-        room = wire.room(config.packet_len, len(picks), payload)
+        room = V0.room(config.packet_len, len(picks), payload)
         return Plan(tuple(picks), tuple(chosen), room < config.min_fragment)
 
     def _fitting(self, message: Outgoing, cut: int, entries: int, payload: int) -> list[int]:
@@ -84,8 +69,8 @@ class PaperScheduler:
         lengths: list[int] = []
         length = message.plan(cut)
         index, remaining = message.index, message.remaining
-        room, packet_len = self._format.room, self.config.packet_len
-        most = self._format.max_entries if self.config.greedy else 1
+        room, packet_len = V0.room, self.config.packet_len
+        most = V0.max_entries if self.config.greedy else 1
         while len(lengths) < most and index < message.total:
             if length > room(packet_len, entries + len(lengths), payload):
                 break
@@ -97,18 +82,7 @@ class PaperScheduler:
         return lengths
 
     def sent(self, plan: Plan) -> None:
+        """The last plan was executed."""
         for topic_id in dict.fromkeys(message.topic_id for message in plan.picks):
             self._line.remove(topic_id)
             self._line.append(topic_id)
-
-
-SCHEDULER = BackendTable(
-    "scheduler",
-    {
-        "paper": Backend("gr_ros2.link.schedule", "PaperScheduler", "round robin over topics, as in the paper"),
-        "freshness": Backend(
-            "gr_ros2.link.freshness", "FreshnessScheduler", "what lowers the weighted age most per airtime"
-        ),
-    },
-    Backend,
-)

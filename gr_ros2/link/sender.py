@@ -1,36 +1,31 @@
-"""The sending engine: messages in, packets out.
+"""The sending engine of version 0, the paper's: messages in, packets out.
 
-Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason (``queues``
-lists them); a message whose first fragment was sent is dropped only when its deadline cannot be met any more; packets
-leave only when the pace (rate or credit) allows; a packet is composed when it is requested, never before; time is
-an argument and never goes back.
+Invariants: every submitted message is accepted once and then leaves whole or is refused with a named reason; a message
+whose first fragment was sent is not dropped; packets leave only when the pace (rate or credit) allows; a packet is
+composed when it is requested, never before; time is an argument and never goes back.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy, SourceConfig, replaced
+from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import ConfigError
-from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
-from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
-from gr_ros2.link.schedule import SCHEDULER, Plan, Scheduler
+from gr_ros2.link.queues import TopicQueue
+from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
-
-LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "greedy", "dst_id", "hop", "repeat_s", "queue_depth")
-"""Settings that make sense to change while running."""
 
 Observer = Callable[[SenderEvent], None]
 
@@ -67,19 +62,15 @@ class Sender:
         self._observer = observer
         self._codec = codec
         self._largest = V0.largest_message(config.packet_len)
-        self._scheduler: Scheduler = SCHEDULER.load(config.scheduler)(config, self.registry, V0)
-        self._queues = {topic.topic_id: _queue(topic) for topic in self.registry}
-        self._classes = [(QOS_NAMES.index(topic.options.qos), topic.options.weight) for topic in self.registry]
-        """Class and weight of each topic's messages."""
+        self._scheduler = PaperScheduler(config)
+        self._queues = {topic.topic_id: TopicQueue("fifo") for topic in self.registry}
+        self._classes = [QOS_NAMES.index(topic.options.qos) for topic in self.registry]
         self._depths = [topic.options.queue_depth for topic in self.registry]
         self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
         """Topics whose newest message is kept for robots that join late."""
-        self._with_deadline = self._deadlines()
-        self._capped = any(topic.options.max_rate for topic in self.registry)
         self._plan: Plan | None = None
-        self._plan_until = -inf
-        """Time from which the plan is out of date without a further call; -inf: it is out of date already."""
-        self._now = -inf
+        self._stale = True
+        """Whether the waiting messages have changed since the last plan."""
         self._ids, self._numbers = 1 << V0.id_bits, 1 << V0.number_bits
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
         self._seq = self._rng.randrange(self._numbers)
@@ -92,8 +83,8 @@ class Sender:
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         """Take a serialized message.
 
-        It may be refused (``too_large``), and it may cause waiting messages of its topic to be dropped
-        (``queue_bound`` or ``superseded``); all are counted and observed.
+        It may be refused (``too_large``), and it may cause the oldest waiting message of its topic to be dropped
+        (``queue_bound``); all are counted and observed.
 
         :raises ConfigError: for a topic id that is not in the registry
         """
@@ -110,11 +101,11 @@ class Sender:
         if len(payload) > self._largest:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
             return
-        qos, weight = self._classes[topic_id]
-        message = Outgoing(serial, topic_id, payload, qos, now, weight)
-        if dropped := self._queues[topic_id].admit(message, self.depth(topic_id)):
-            self._drop(dropped)
-        self._changed(now)
+        message = Outgoing(serial, topic_id, payload, self._classes[topic_id], now)
+        for dropped in self._queues[topic_id].admit(message, self.depth(topic_id)):
+            if not dropped.message.repeat:
+                self._refuse(dropped.message.serial, topic_id, dropped.row, dropped.detail)
+        self._stale = True
         if topic_id in self._keeps:
             self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.config.repeat_s
@@ -135,9 +126,7 @@ class Sender:
             return None
         if self._repeat_at:
             self._repeat(now)
-        if self._with_deadline:
-            self._expire(now)
-        plan = self._planned(now)
+        plan = self._planned()
         if plan is None or now < self._departure(plan):
             return None
         data = self._compose(plan, now)
@@ -150,33 +139,10 @@ class Sender:
         if self.out_of_credit:
             return None
         times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
-        plan = self._planned(self._now)
+        plan = self._planned()
         if plan is not None:
             times.append(self._departure(plan))
-        if self._plan_until < inf:
-            times.append(self._plan_until)
         return max(min(times), self._pace.slot) if times else None
-
-    def follow(self, topic_id: int, *, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0) -> bool:
-        """Adapt a topic's queue to the QoS of its publishers, where the configuration leaves it open.
-
-        :param depth: depth of their history, 0 for unbounded or unknown
-        :param lifespan_s: s after which a message is useless, 0 without limit
-        :param period_s: s within which they promise a message, 0 for no promise
-        :return: whether the policy or deadline changed; ``queue`` returns them
-        """
-        queue = self._queues[topic_id]
-        wanted = queue_for(self.registry[topic_id].options, depth, lifespan_s, period_s)
-        if wanted == self.queue(topic_id):
-            return False
-        queue.change(*wanted)
-        self._with_deadline = self._deadlines()
-        return True
-
-    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """Policy and deadline (s, 0 for none) of a topic's queue."""
-        queue = self._queues[topic_id]
-        return queue.policy, queue.deadline_s
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
@@ -217,56 +183,20 @@ class Sender:
     def reconfigure(self, **settings: Any) -> None:
         """Change settings while running.
 
-        :raises ConfigError: for a value out of range or a setting that cannot change
+        :raises ConfigError: for a value out of range
         """
-        for name in settings:
-            if name not in LIVE_SETTINGS:
-                raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
         self.config = replaced(self.config, **settings)
         self._scheduler.config = self.config
-        self._plan_until = -inf
+        self._stale = True
         if "packet_rate" in settings:
             self._pace.change(self.config.packet_rate)
 
-    def _deadlines(self) -> list[TopicQueue]:
-        return [queue for queue in self._queues.values() if queue.deadline_s]
-
-    def _changed(self, now: float) -> None:
-        """The waiting messages have changed since the last plan."""
-        self._now = now
-        self._plan_until = -inf
-
-    def _planned(self, now: float) -> Plan | None:
+    def _planned(self) -> Plan | None:
         """The next packet's content; planned again only when something has changed."""
-        if now >= self._plan_until:
-            self._now = now
-            queues: Mapping[int, Sequence[Outgoing]] = self._queues
-            self._plan_until = inf
-            if self._capped:
-                queues = {topic_id: queue.open(now) for topic_id, queue in self._queues.items()}
-                self._plan_until = min(queue.opens(now) for queue in self._queues.values())
-            self._plan = self._scheduler.plan(queues)
+        if self._stale:
+            self._plan = self._scheduler.plan(self._queues)
+            self._stale = False
         return self._plan
-
-    def _expire(self, now: float) -> None:
-        """Drop messages that are too late or will be too late."""
-        for queue in self._with_deadline:
-            if queue:
-                payload = V0.single_entry_payload(self.config.packet_len)
-                late = list(queue.expire(now, self.interval, LEAD_S, payload))
-                if late:
-                    self._drop(late)
-                    self._changed(now)
-
-    def _drop(self, dropped: Iterable[Dropped]) -> None:
-        for item in dropped:
-            message = item.message
-            if message.repeat:
-                continue
-            self._refuse(message.serial, message.topic_id, item.row, item.detail)
-            if self._latched.get(message.topic_id, (-1,))[0] == message.serial:
-                # The message is useless now, or a newer one exists; so it is not kept for robots that join late.
-                del self._latched[message.topic_id], self._repeat_at[message.topic_id]
 
     def _departure(self, plan: Plan) -> float:
         """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout_s``."""
@@ -303,7 +233,7 @@ class Sender:
         data = V0.encode(packet, config.packet_len)
         self._seq = (self._seq + 1) % self._numbers
         self._scheduler.sent(plan)
-        self._changed(now)
+        self._stale = True
         stats = self.stats
         stats.packets += 1
         stats.air["new"] += 1
@@ -327,13 +257,10 @@ class Sender:
             if now >= at:
                 self._repeat_at[topic_id] = now + self.config.repeat_s
                 if not self._queues[topic_id]:
-                    weight = self.registry[topic_id].options.weight
                     serial, payload = self._latched[topic_id]
-                    self._queues[topic_id].append(
-                        Outgoing(serial, topic_id, payload, QOS_BULK, now, weight, repeat=True)
-                    )
+                    self._queues[topic_id].append(Outgoing(serial, topic_id, payload, QOS_BULK, now, repeat=True))
                     self.stats.repeats += 1
-                    self._changed(now)
+                    self._stale = True
 
     def _too_large(self, size: int) -> str:
         needed = V0.smallest_packet_len(size)
@@ -347,10 +274,6 @@ class Sender:
     def _observe(self, event: SenderEvent) -> None:
         if self._observer is not None:
             self._observer(event)
-
-
-def _queue(topic: Topic) -> TopicQueue:
-    return TopicQueue(*queue_for(topic.options), topic.options.max_rate)
 
 
 def _packet_qos(plan: Plan) -> int:

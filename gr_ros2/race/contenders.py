@@ -37,8 +37,8 @@ class Contender:
     :param stack: what carries the messages
     :param reliable: whether data that is lost on the air is sent again
     :param summary: description in one line
-    :param settings: ``version`` and ``compression`` of both blocks, further settings of the ``source``, and perhaps
-        ``queue`` of the topic (`gr-ros2`); or ``transport`` and ``congestion`` control of Zenoh
+    :param settings: ``version`` and ``compression`` of both ends and further settings of the ``source`` (`gr-ros2`);
+        or ``transport`` and ``congestion`` control of Zenoh
     """
 
     stack: Stack
@@ -53,13 +53,13 @@ CONTENDERS = {
         "gr-ros2",
         False,
         "version 0, compressed",
-        {"version": 0, "compression": True, "source": {"scheduler": "freshness", "queue_depth": 8}},
+        {"version": 0, "compression": True, "source": {"queue_depth": 8}},
     ),
     "gr-ros2-plain": Contender(
         "gr-ros2",
         False,
         "version 0, as it is, a packet per message",
-        {"version": 0, "compression": False, "source": {"scheduler": "freshness"}, "queue": "latest"},
+        {"version": 0, "compression": False, "source": {"queue_depth": 1}},
     ),
     "cyclone-best-effort": Contender("dds", False, "Cyclone DDS, best effort"),
     "cyclone-reliable": Contender("dds", True, "Cyclone DDS, reliable"),

@@ -19,7 +19,7 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link import ReceiverEvent, SenderEvent
@@ -33,7 +33,6 @@ from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
 from gr_ros2.race.tun import Tun, loopback_up
 from gr_ros2.registry import Registry
-from gr_ros2.setting import AUTO
 
 DOMAINS = (1, 2)
 """DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""
@@ -148,10 +147,9 @@ class RaceRosLink:
             "version": self._settings["version"],
             "robot_id": SOURCE_ID + direction,
             "packet_len": self._packet_len,
-            "compression": self._settings["compression"],
         }
-        options = {self._registry[0].name: TopicOptions(queue=self._settings.get("queue", AUTO))}
-        source = SourceConfig(subscriber_depth=DEPTH, topic_options=options, **common, **self._settings["source"])
+        compression = self._settings["compression"]
+        source = SourceConfig(subscriber_depth=DEPTH, compression=compression, **common, **self._settings["source"])
         sink = SinkConfig(publisher_depth=DEPTH, **common)
         phy = self._radio.with_frames_of(self._packet_len)
         start = Start(1, reports=True, any_length=phy.any_length)

@@ -13,14 +13,14 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, WireVersion, build
+from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import ENDS, SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
@@ -42,7 +42,6 @@ class LinkConfig(AnyLink):
 
     registry: str = ""
     name: Text = "link"
-    version: WireVersion = 1
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
     record: Annotated[str, Field(title="Recording of what is received")] = ""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
@@ -95,11 +94,9 @@ def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
     :param where: what to call the mapping in errors, for instance its file name
     :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; the message names it
     """
-    values = {"version": 1, **values}
+    values = dict(values)
     shared = {key: values[key] for key in SHARED_KEYS if key in values}
     values |= with_shared(values, shared, f"{where}: " if where else "")
-    if values["version"] == 1:
-        values |= {end: {"compression": True, **values[end]} for end in ENDS if isinstance(values.get(end), Mapping)}
     return build(LinkConfig, values, where)
 
 

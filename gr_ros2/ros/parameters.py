@@ -78,7 +78,7 @@ def _parameter(name: str, value: Any, setting: Setting) -> Parameter:
     return Parameter(
         name,
         _plain(value),
-        setting.meaning,
+        setting.explained,
         None if least is None else float(least),
         None if most is None else float(most),
         "; ".join(rules),

@@ -158,7 +158,7 @@ def simulate(
 
     :param phy: None makes the scenario's
     :param messages: in time order; None takes the scenario's source
-    :param codec: of both ends; None makes one where ``compression`` is on
+    :param codec: of both ends; None makes one
     :param on_packet: called with every packet that leaves the source
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
@@ -226,7 +226,7 @@ def make_ends(
     """The ends of a link, see :func:`gr_ros2.run.ends.halves_of_ends`.
 
     :param ways: one scenario per direction
-    :param codec: of all messages; None makes one where ``compression`` is on
+    :param codec: of all messages; None makes one
     :param any_length: whether the PHY carries shorter packets in less time
     :param ladder: the rungs of an adaptive rate; () for a fixed rate
     """

@@ -42,24 +42,22 @@ def variants(scenario: Scenario) -> list[Variant]:
     """
     source = scenario.ros_source
     found = [Variant(WHOLE)]
-    if source.compression:
-        found.append(Variant("no-compression", ("ros_source.compression=false", "ros_sink.compression=false")))
+    if source.compresses:
+        found.append(Variant("no-compression", ("ros_source.compression=false",)))
     if source.packet_rate != 0:
         found.append(Variant("no-pull", ("ros_source.packet_rate=0",)))
     if source.version and source.repair != "off":
         found.append(Variant("no-repair", ("ros_source.repair='off'",)))
     if scenario.reports is not None:
         found.append(Variant("no-reports", ("reports=null",)))
-    if not source.version and source.scheduler == "freshness":  # version 1 always has it
-        found.append(Variant("no-freshness", ("ros_source.scheduler=paper",)))
     registry = scenario.load_registry().with_options(source.topic_options)
-    latest = [topic.name for topic in registry if queue_for(topic.options)[0] == "latest"]
+    latest = [topic.name for topic in registry if source.version and queue_for(topic.options)[0] == "latest"]
     if latest:
         found.append(Variant("no-latest", tuple(f"ros_source.topic_options.{name}.queue=fifo" for name in latest)))
     if len(found) == 1:
         raise ConfigError(
-            f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, repair, reports, freshness "
-            "or queue latest"
+            f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, repair, reports or queue "
+            "latest"
         )
     return found
 

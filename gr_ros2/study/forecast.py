@@ -19,7 +19,6 @@ from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.events import AirKind
-from gr_ros2.link.freshness import TURN
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
@@ -35,8 +34,6 @@ OVERHEAD_S = 0.0025
 """s that middleware, Python and the OFDM receiver add to the airtime of a message, as measured on two idle cores."""
 _WALL_S = 1.7e9
 """s since 1970. A fixed time, so that a plan is the same on every day."""
-_MARGIN = 1.5
-"""Ratio of a proposed ``reassembly_timeout_s`` to the longest pause: a lost packet and a busy computer add time."""
 _PARTS = (1, 2, 3)
 """Numbers of packets per message for which packet lengths are tried."""
 _YOUNGER = 0.97
@@ -80,8 +77,6 @@ class Forecast:
     :param used: part of the airtime that is used, 0..1
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
     :param pad: part of the packets' bytes that is PAD
-    :param pause_s: s that may pass between two fragments of a message while other messages are sent; 0 where every
-        message has only one fragment
     """
 
     packet_len: int
@@ -90,11 +85,9 @@ class Forecast:
     used: float
     air_bytes_per_message: float | None
     pad: float
-    pause_s: float
     topics: tuple[TopicForecast, ...]
     air: Mapping[str, float] = field(default_factory=dict)
-    """Packets per message sent, by their purpose: new messages, repair, reports, hellos. Version 0 does not
-    distinguish them."""
+    """Packets per message sent, by their purpose: new messages, repair, reports, hellos."""
 
     @property
     def load(self) -> float:
@@ -182,12 +175,14 @@ class Advice:
 class Planner:
     """Forecasts for one scenario and variants of it, with the same messages.
 
-    :raises ConfigError: for a PHY that takes no airtime, or a scenario that cannot be set up
+    :raises ConfigError: for version 0, a PHY that takes no airtime, or a scenario that cannot be set up
     """
 
     def __init__(self, scenario: Scenario) -> None:
         if not PHY.load(scenario.phy.name).has_airtime:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
+        if not scenario.version:
+            raise ConfigError("version = 0: has nothing to choose by, as the paper has it; set version: 1 for a plan")
         if not scenario.simulated:
             # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
@@ -202,13 +197,6 @@ class Planner:
     def forecast(self) -> Forecast:
         """The scenario as it is."""
         return self._forecast(self.scenario)
-
-    def reassembly_timeout_s(self, forecast: Forecast) -> float | None:
-        """The sink's ``reassembly_timeout_s`` that this traffic needs, s. None where the configured one is long enough
-        for messages of several fragments, which wait between their fragments."""
-        if self.scenario.ros_sink.reassembly_timeout_s > forecast.pause_s:
-            return None
-        return float(np.ceil(10 * _MARGIN * forecast.pause_s) / 10)
 
     def advice(self) -> list[Advice]:
         """Single changes that make topics younger or save airtime. Changes that make no topic worse come first; within
@@ -243,13 +231,8 @@ class Planner:
 
     def _variants(self, base: Scenario) -> Iterator[tuple[str, Scenario]]:
         source, sink = base.ros_source, base.ros_sink
-        if not source.compression:
-            yield (
-                "ros_source.compression=true ros_sink.compression=true",
-                replace(base, ros_source=replace(source, compression=True), ros_sink=replace(sink, compression=True)),
-            )
-        if not source.version and source.scheduler != "freshness":
-            yield "ros_source.scheduler=freshness", replace(base, ros_source=replace(source, scheduler="freshness"))
+        if not source.compresses:
+            yield "ros_source.compression=true", replace(base, ros_source=replace(source, compression=True))
         if source.packet_rate == 0:
             yield "ros_source.packet_rate=auto", replace(base, ros_source=replace(source, packet_rate=AUTO))
         for packet_len in self._packet_lens():
@@ -285,32 +268,28 @@ class Planner:
         if not compression:
             return None
         if self._remembering is None:
-            codec = message_codec(replace(self.scenario.ros_source, compression=True), self.registry)
-            assert codec is not None
-            self._remembering = _Remembering(codec)
+            self._remembering = _Remembering(message_codec(self.scenario.ros_source.dictionaries, self.registry))
         return self._remembering
 
     def _size(self, topic_id: int, payload: bytes) -> int:
         """Bytes of a message on the air, without headers."""
-        codec = self._codec(self.scenario.ros_source.compression)
+        codec = self._codec(self.scenario.ros_source.compresses)
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
-        codec = self._codec(scenario.ros_source.compression)
+        codec = self._codec(scenario.ros_source.compresses)
         duration = scenario.duration_s or self._messages[-1].t
         messages = [message for message in self._messages if message.t <= duration]
         shares: Counter[int] = Counter()
         padded = sent_bytes = 0
         spent = 0.0
-        cut = False
 
         wire = scenario.ros_source.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, sent_bytes, spent, cut
-            cut = cut or any(entry.total > 1 for entry in sent.entries)
+            nonlocal padded, sent_bytes, spent
             own_airtime = phy.airtime(len(sent.data))
             spent += own_airtime
             sent_bytes += len(sent.data)
@@ -349,7 +328,6 @@ class Planner:
             used=min(spent / duration, 1.0),
             air_bytes_per_message=sent_bytes / delivered if delivered else None,
             pad=padded / sent_bytes if sent_bytes else 0.0,
-            pause_s=cut * airtime * _turn(scenario) * len(topics),
             topics=tuple(topics),
             air=_air(run),
         )
@@ -396,11 +374,6 @@ def _air(run: Simulated) -> dict[str, float]:
     packets = {kind: run.packets.get(f"air_{kind}", 0) for kind in get_args(AirKind)}
     messages = max(sum(run.stats.sent.values()), 1)
     return {kind: count / messages for kind, count in packets.items()} if any(packets.values()) else {}
-
-
-def _turn(scenario: Scenario) -> int:
-    """Packets until a waiting topic has its turn again, divided by the number of topics."""
-    return TURN if scenario.ros_source.scheduler == "freshness" else 1
 
 
 def _age(result: TopicResult) -> float:

@@ -17,12 +17,12 @@ def registry(topics: int = 3) -> Registry:
 
 
 def sender(topics: int = 3, seed: int = 0, **settings: Any) -> Sender:
-    config = build(SourceConfig, {"robot_id": 1, **settings})
+    config = build(SourceConfig, {"robot_id": 1, "version": 0, **settings})
     return Sender(registry(topics), config, rng=random.Random(seed))
 
 
 def receiver(topics: int = 3, **settings: Any) -> Receiver:
-    return Receiver(registry(topics), build(SinkConfig, settings))
+    return Receiver(registry(topics), build(SinkConfig, {"version": 0, **settings}))
 
 
 def drain(engine: Sender, now: float = 0.0) -> list[bytes]:

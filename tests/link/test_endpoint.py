@@ -14,8 +14,8 @@ from tests.link.engines import registry
 
 
 def end(robot: int, *, sends: bool = True, hears: bool = True, told: list[SenderEvent] | None = None) -> EndpointV0:
-    source = SourceConfig(robot_id=robot, packet_len=64, packet_rate=100.0) if sends else None
-    sink = SinkConfig(packet_len=64, robot_id=robot, reassembly_timeout_s=0.5) if hears else None
+    source = SourceConfig(version=0, robot_id=robot, packet_len=64, packet_rate=100.0) if sends else None
+    sink = SinkConfig(version=0, packet_len=64, robot_id=robot, reassembly_timeout_s=0.5) if hears else None
     observer = None if told is None else told.append
     return EndpointV0(registry(), source, sink, rng=random.Random(robot), observer=observer)
 

@@ -78,7 +78,7 @@ def backwards(total: int, *, sequential: bool) -> Sending:
 def carry(send: Sending, loss: float, seed: int) -> tuple[int, set[int]]:
     """Deliveries that are mixed, or the second of their message, and the messages that were delivered."""
     rng = random.Random(seed)
-    sink = Receiver(registry(1), build(SinkConfig, {"packet_len": 64}))
+    sink = Receiver(registry(1), build(SinkConfig, {"version": 0, "packet_len": 64}))
     got: set[int] = set()
     corrupt = 0
     for number, piece in enumerate(send(rng)):

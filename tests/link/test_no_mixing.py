@@ -42,7 +42,8 @@ class Link:
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
         self.receiver = Receiver(
-            registry(self.topics), build(SinkConfig, {"packet_len": 64, "reassembly_timeout_s": self.timeout})
+            registry(self.topics),
+            build(SinkConfig, {"version": 0, "packet_len": 64, "reassembly_timeout_s": self.timeout}),
         )
         self.arrived: dict[bytes, int] = {}
         self.complete: set[bytes] = set()
@@ -52,7 +53,9 @@ class Link:
         self.restart()
 
     def restart(self) -> None:
-        config = build(SourceConfig, {"robot_id": 1, "packet_len": 64, "queue_depth": 0, "entry_ids": self.entry_ids})
+        config = build(
+            SourceConfig, {"version": 0, "robot_id": 1, "packet_len": 64, "queue_depth": 0, "entry_ids": self.entry_ids}
+        )
         self.sender = Sender(registry(self.topics), config, rng=self.rng, observer=self.observe)
         self.payloads: list[bytes] = []
         self.delayed.clear()

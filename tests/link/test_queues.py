@@ -11,41 +11,56 @@ from hypothesis import strategies as st
 
 from gr_ros2.config import TopicOptions, build
 from gr_ros2.errors import ConfigError
-from gr_ros2.link import Sender
+from gr_ros2.link import SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.queues import TopicQueue, queue_for
-from tests.link.engines import delivered, drain, read, receiver, sender
+from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.registry import Registry, Topic
+from gr_ros2.wire.v1 import TABLE_TOPIC, Part
+from tests.link.engines import sender
+from tests.link.v1.air import Robot
 
 
-def engine(**options: Any) -> Sender:
-    return sender(topics=1, packet_len=64, topic_options={"t0": TopicOptions(**options)})
+def robot(topics: int = 1, packet_rate: float | str = "auto", **options: Any) -> Robot:
+    """A robot of version 1, which has these policies, in packets of 64 B with room for 51."""
+    rows = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions(**options)) for n in range(topics)]
+    return Robot(1, Registry(rows), hears=False, repair="off", packet_rate=packet_rate)
 
 
-def refused(engine: Sender) -> dict[str, int]:
-    return {reason: count for (_, reason), count in engine.stats.refused.items()}
+def leave(source: Robot, now: float, most: int = 1000) -> list[bytes]:
+    """The parts of messages that leave at a time, as many as there are, or as are wanted."""
+    parts: list[bytes] = []
+    while len(parts) < most and source.slot(now) is not None:
+        left = source.events[-1]
+        assert isinstance(left, SentPacket)
+        found = [part for part in left.packet.entries if isinstance(part, Part)]
+        parts += [part.payload for part in found if part.topic_id != TABLE_TOPIC]
+    return parts
+
+
+def refused(end: Endpoint) -> dict[str, int]:
+    return {reason: count for (_, reason), count in end.sent.refused.items()}
 
 
 def test_latest_sends_the_newest_and_finishes_what_it_began() -> None:
-    source = engine(queue="latest")
-    source.submit(0, b"a" * 100, 0.0)
-    first = source.next_packet(0.0)
+    source = robot(queue="latest")
+    leave(source, 0.0)
+    source.end.submit(0, b"a" * 100, 0.1)
+    begun = leave(source, 0.1, 1)
     for letter in (b"b", b"c", b"d"):
-        source.submit(0, letter * 20, 0.0)
-    assert [read(data).entries[0].payload for data in [first or b"", *drain(source)]] == [
-        b"a" * 51,
-        b"a" * 49,
-        b"d" * 20,
-    ]
-    assert refused(source) == {"superseded": 2}
+        source.end.submit(0, letter * 20, 0.1)
+    assert b"".join([*begun, *leave(source, 0.1)]) == b"a" * 100 + b"d" * 20
+    assert refused(source.end) == {"superseded": 2}
 
 
 def test_latest_holds_a_recording_back_while_one_waits() -> None:
-    source = engine(queue="latest")
-    assert source.room(0)
-    source.submit(0, b"a" * 100, 0.0)
-    assert not source.room(0)
-    source.next_packet(0.0)
-    assert source.room(0)
+    source = robot(queue="latest")
+    leave(source, 0.0)
+    assert source.end.room(0)
+    source.end.submit(0, b"a" * 100, 0.1)
+    assert not source.end.room(0)
+    leave(source, 0.1, 1)
+    assert source.end.room(0)
 
 
 def test_a_queue_follows_the_depth_of_its_topic() -> None:
@@ -71,23 +86,23 @@ def test_a_queue_follows_the_depth_of_its_topic() -> None:
 def test_a_queue_follows_its_publishers_where_it_is_not_configured(
     options: dict[str, Any], depth: int, lifespan_s: float, period_s: float, queue: tuple[str, float]
 ) -> None:
-    source = engine(**options)
+    source = robot(**options).end
     before = source.queue(0)
     assert source.follow(0, depth=depth, lifespan_s=lifespan_s, period_s=period_s) == (source.queue(0) != before)
     assert source.queue(0) == queue
 
 
 def test_a_lifespan_found_late_holds_for_what_waits() -> None:
-    source = engine()
-    source.submit(0, b"old", 0.0)
-    source.follow(0, lifespan_s=0.1)
-    source.submit(0, b"young", 0.09)
-    assert [read(data).entries[0].payload for data in drain(source, 0.15)] == [b"young"]
-    assert refused(source) == {"stale": 1}
-    source.submit(0, b"for ever again", 0.2)
-    source.follow(0)
-    assert source.queue(0) == ("fifo", 0.0)
-    assert len(drain(source, 9.0)) == 1
+    source = robot()
+    source.end.submit(0, b"old", 0.0)
+    source.end.follow(0, lifespan_s=0.1)
+    source.end.submit(0, b"young", 0.09)
+    assert leave(source, 0.15) == [b"young"]
+    assert refused(source.end) == {"stale": 1}
+    source.end.submit(0, b"for ever again", 0.2)
+    source.end.follow(0)
+    assert source.end.queue(0) == ("fifo", 0.0)
+    assert leave(source, 9.0) == [b"for ever again"]
 
 
 def test_a_deadline_queue_needs_a_deadline() -> None:
@@ -96,40 +111,32 @@ def test_a_deadline_queue_needs_a_deadline() -> None:
 
 
 def test_what_has_waited_too_long_is_stale() -> None:
-    source = engine(queue="deadline", deadline_s=0.1)
-    source.submit(0, b"old", 0.0)
-    source.submit(0, b"new", 0.06)
-    assert [read(data).entries[0].payload for data in drain(source, 0.1)] == [b"new"]
-    assert refused(source) == {"stale": 1}
+    source = robot(queue="deadline", deadline_s=0.1)
+    source.end.submit(0, b"old", 0.0)
+    source.end.submit(0, b"new", 0.06)
+    assert leave(source, 0.1) == [b"new"]
+    assert refused(source.end) == {"stale": 1}
 
 
 def test_what_cannot_be_across_in_time_is_not_started() -> None:
-    source = sender(
-        topics=1, packet_len=64, packet_rate=10, topic_options={"t0": TopicOptions(queue="deadline", deadline_s=0.25)}
-    )
-    source.submit(0, bytes(3 * 51), 0.0)
-    source.submit(0, bytes(2 * 51), 0.0)
-    totals = []
-    now = 0.0
-    while (at := source.next_timeout()) is not None:
-        now = max(now, at)
-        totals += [read(data).entries[0].total for data in drain(source, now)]
-    assert refused(source) == {"cannot_complete": 1}, "three packets at ten a second take 300 ms"
-    assert totals == [2, 2]
+    source = robot(packet_rate=10.0, queue="deadline", deadline_s=0.25)
+    for step in range(10):  # hello and table
+        source.slot(0.1 * step)
+    source.end.submit(0, bytes(150), 1.0)
+    source.end.submit(0, bytes(70), 1.0)
+    left = [part for step in range(10) for part in leave(source, 1.0 + 0.1 * step)]
+    assert refused(source.end) == {"cannot_complete": 1}, "more than two packets at ten a second take 300 ms"
+    assert sum(map(len, left)) == 70
 
 
-def test_what_has_become_pointless_is_abandoned_and_the_next_arrives() -> None:
-    source = engine(queue="deadline", deadline_s=0.1)
-    sink = receiver(topics=1, packet_len=64)
-    source.submit(0, b"a" * 100, 0.0)
-    first = source.next_packet(0.0)
-    assert first is not None
-    sink.receive(first, 0.0)
-    source.submit(0, b"b" * 30, 0.2)
-    packets = drain(source, 0.2)
-    assert refused(source) == {"abandoned": 1}
-    assert [payload for data in packets for payload in delivered(sink.receive(data, 0.2))] == [b"b" * 30]
-    assert source.stats.sent[0] == 1
+def test_what_has_become_pointless_is_abandoned_and_the_next_leaves() -> None:
+    source = robot(queue="deadline", deadline_s=0.1)
+    leave(source, 0.0)
+    source.end.submit(0, b"a" * 100, 0.1)
+    leave(source, 0.1, 1)
+    source.end.submit(0, b"b" * 30, 0.3)
+    assert leave(source, 0.3) == [b"b" * 30]
+    assert refused(source.end) == {"abandoned": 1}
 
 
 def test_the_pace_of_credits_is_learnt_while_busy() -> None:
@@ -155,50 +162,41 @@ def test_idle_time_is_no_pace() -> None:
 
 
 def test_a_rate_cap_spaces_the_messages_of_a_topic() -> None:
-    source = engine(queue="latest", max_rate=10.1)
+    source = robot(queue="latest", max_rate=10.1)
     sent = []
     for millisecond in range(0, 1000, 20):
-        source.submit(0, millisecond.to_bytes(2, "big"), millisecond / 1e3)
-        sent += [(millisecond, data) for data in drain(source, millisecond / 1e3)]
-    assert [millisecond for millisecond, _ in sent] == list(range(0, 1000, 100)), "ten a second"
-    assert all(int.from_bytes(read(data).entries[0].payload, "big") == at for at, data in sent), "always the newest"
+        source.end.submit(0, millisecond.to_bytes(2, "big"), millisecond / 1e3)
+        sent += [(millisecond, int.from_bytes(part, "big")) for part in leave(source, millisecond / 1e3)]
+    assert sent == [(at, at) for at in range(0, 1000, 100)], "ten a second, always the newest"
 
 
 def test_a_capped_message_says_when_it_may_go() -> None:
-    source = engine(max_rate=10)
-    source.submit(0, b"a", 0.0)
-    source.submit(0, b"b", 0.0)
-    assert len(drain(source, 0.0)) == 1
-    assert source.next_timeout() == pytest.approx(0.1)
-    assert len(drain(source, 0.1)) == 1
-    assert source.next_timeout() is None
+    source = robot(max_rate=10)
+    source.end.submit(0, b"a", 0.0)
+    source.end.submit(0, b"b", 0.0)
+    assert leave(source, 0.0) == [b"a"]
+    assert source.end.outbox.next_timeout(0.0) == pytest.approx(0.1)
+    assert leave(source, 0.1) == [b"b"]
+    assert source.end.outbox.next_timeout(0.1) is None
 
 
-@pytest.mark.parametrize("scheduler", ["paper", "freshness"])
 @given(
     steps=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 300), st.floats(0, 0.05)), max_size=60),
     policy=st.sampled_from(["latest", "fifo", "deadline"]),
     max_rate=st.sampled_from([0.0, 30.0]),
 )
-def test_every_message_ends_once(
-    scheduler: str, steps: list[tuple[int, int, float]], policy: str, max_rate: float
-) -> None:
-    options = build(TopicOptions, {"queue": policy, "deadline_s": 0.06, "max_rate": max_rate, "queue_depth": 3})
-    source = sender(
-        packet_len=64, scheduler=scheduler, packet_rate=50, topic_options={f"t{number}": options for number in range(3)}
-    )
+def test_every_message_ends_once(steps: list[tuple[int, int, float]], policy: str, max_rate: float) -> None:
+    source = robot(3, queue=policy, deadline_s=0.06, max_rate=max_rate, queue_depth=3)
     now = 0.0
     for topic, size, pause in steps:
-        source.submit(topic, bytes(size), now)
+        source.end.submit(topic, bytes(size), now)
         now += pause
-        drain(source, now)
-    while (at := source.next_timeout()) is not None:
-        now = max(now + 1e-6, at)
-        drain(source, now)
-    drain(source, now + 10.0)
-    ended = Counter(topic for topic, _ in source.stats.refused.elements()) + source.stats.sent
-    assert source.idle
-    assert ended == source.stats.submitted
+        source.slot(now)
+    for step in range(300):
+        leave(source, now + 0.02 * step)
+    ended = Counter(topic for topic, _ in source.end.sent.refused.elements()) + source.end.sent.sent
+    assert source.end.outbox.idle
+    assert ended == source.end.sent.submitted
 
 
 def test_a_message_may_be_useless_before_the_deadline_of_its_queue() -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 from gr_ros2.config import QueuePolicy
 from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
+from gr_ros2.link.endpoint import check_live
 from gr_ros2.link.events import (
     AirKind,
     Delivered,
@@ -73,10 +74,12 @@ from gr_ros2.wire.v1 import (
     write_standing,
 )
 
+GIVE_UP_S = 10.0
+"""s of silence after which a robot is regarded as gone."""
+HOP = 1
+"""Hop count of addressed packets: nothing relays them yet."""
 FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
-LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
-"""Settings that may change at run time. Other settings of a sending block that do not concern version 1 are ignored."""
 _POLL_S, _CALM_POLL_S = 0.02, 0.1
 """s after which a thrifty sender that is in doubt checks again; the second one while no receiver loses packets."""
 
@@ -244,7 +247,7 @@ class Endpoint:
 
         :raises ConfigError: for a value out of range, or that cannot change now
         """
-        changes = {name: value for name, value in changes.items() if name in LIVE_SETTINGS}
+        check_live(changes)
         settings = replace(self.settings, **changes)
         if (settings.dst_id == BROADCAST) != (self.settings.dst_id == BROADCAST):
             raise ConfigError(
@@ -269,9 +272,6 @@ class Endpoint:
     def held_bytes(self) -> int:
         """Memory in use for incomplete messages."""
         return sum(neighbour.inbox.held for neighbour in self.neighbours)
-
-    def keep_incomplete(self, timeout_s: float) -> None:
-        """Do nothing: an incomplete message is kept as long as it may be repaired."""
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
@@ -347,7 +347,7 @@ class Endpoint:
         for neighbour in self.neighbours:
             self._report_all(neighbour.inbox.handle_timeout(now))
         self.neighbours.settle(now)
-        for gone in self.neighbours.silent(now - self.settings.give_up_s):
+        for gone in self.neighbours.silent(now - GIVE_UP_S):
             self._forget(gone.src_id)
             self._report_all([Gone(gone.src_id, gone.boot)])
         self.outbox.reported = self.window.reported
@@ -357,7 +357,7 @@ class Endpoint:
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
-        times += [n.heard + self.settings.give_up_s for n in self.neighbours if not n.gone]
+        times += [n.heard + GIVE_UP_S for n in self.neighbours if not n.gone]
         return min(times, default=None)
 
     def next_departure(self, *, credited: bool = False) -> float | None:
@@ -548,7 +548,7 @@ class Endpoint:
 
     def _header(self, qos: int, number: int) -> Header:
         settings = self.settings
-        hop = settings.hop if settings.dst_id != BROADCAST else 0
+        hop = HOP if settings.dst_id != BROADCAST else 0
         return Header(qos, self._sealed, settings.src_id, number & 0xFFFF, settings.dst_id, hop)
 
     def _mode(self) -> RepairMode:

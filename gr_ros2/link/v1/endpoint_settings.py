@@ -25,47 +25,32 @@ class Settings:
     :param packet_len: bytes of the longest packet, the same at all ends
     :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
     :param dst_id: id of the robot that packets are for, 255 = all robots
-    :param hop: hop count of addressed packets
     :param repair: what idle slots carry; auto takes ``thrifty`` where reports come and ``idle`` where none do
     :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one that can still be repaired
-    :param report_every: packets received from one report to the next; more while none is lost
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
-    :param give_up_s: s of silence after which a robot is regarded as gone
-    :param reassembly_timeout_s: s that an incomplete message waits for its next fragment
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
-    :param min_fragment: fewest bytes of a message that begin in a packet which has entries of others
-    :param flush_timeout_s: s that a partly filled packet waits for more entries
     :param packet_rate: packets/s at most; auto = as many as credits allow, where credits are given; 0 = no limit
     :param queue_depth: messages that may wait per topic; 0 = no limit
-    :param depth: number of newer messages of the same topic after which a message is not repaired any more. It applies
-        to topics without lifespan, while no robot reports
     """
 
     src_id: int
     packet_len: int = 220
     fixed: bool = True
     dst_id: int = BROADCAST
-    hop: int = 1
     repair: RepairMode | Auto = AUTO
     expected_loss: float = 0.2
     hears: bool = True
     half_duplex: bool = False
     hold_s: float = 1.0
-    report_every: int = 5
     repeat_s: float = 10.0
-    give_up_s: float = 10.0
-    reassembly_timeout_s: float = 60.0
     max_source_bytes: int = 32_000_000
     max_sources: int = 16
-    min_fragment: int = 16
-    flush_timeout_s: float = 0.0
     packet_rate: float | Auto = AUTO
     queue_depth: int = 100
-    depth: int = 48
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:
@@ -100,7 +85,6 @@ def settings_of(
         packet_len=take.packet_len if source is None else source.packet_len,
         fixed=fixed,
         dst_id=send.dst_id,
-        hop=send.hop,
         repair=send.repair,
         expected_loss=send.expected_loss,
         hears=hears,
@@ -109,8 +93,6 @@ def settings_of(
         repeat_s=send.repeat_s,
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,
-        min_fragment=send.min_fragment,
-        flush_timeout_s=send.flush_timeout_s,
         packet_rate=send.packet_rate,
         queue_depth=send.queue_depth,
     )

@@ -36,6 +36,10 @@ Events = list[Delivered | Lost | Announced]
 
 _PACKET_COST = 150
 """Bytes of bookkeeping that are counted per packet held."""
+_INCOMPLETE_S = 60.0
+"""s that an incomplete message waits for its next fragment."""
+_REPORT_EVERY = 5
+"""Packets received from one report to the next; more while none is lost."""
 _SMOOTHING = 1 / 32
 _HOPE = 1 / 16
 _REPORT_S, _CALM_S = 0.1, 0.5
@@ -210,7 +214,7 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
+        for partial in self._reassembly.expired(now - _INCOMPLETE_S):
             self._lose(partial, LedgerRow.EXPIRED)
         return self._given()
 
@@ -221,7 +225,7 @@ class Inbox:
             times.append(self._gaps[0][0] + self._settings.hold_s)
         waiting = self._reassembly.next_timeout()
         if waiting is not None:
-            times.append(waiting + self._settings.reassembly_timeout_s)
+            times.append(waiting + _INCOMPLETE_S)
         return min(times) if times else None
 
     def close(self, reason: LedgerRow) -> Events:
@@ -244,7 +248,7 @@ class Inbox:
     def report_due(self, now: float) -> float:
         """When the next report is due, as long as there are packets since the last one."""
         half = self._settings.half_duplex
-        every = self._settings.report_every * (4 if half else 1)
+        every = _REPORT_EVERY * (4 if half else 1)
         most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
         if ((self._missed or self._snr_changed) and not half) or self.unreported >= most:
             return now

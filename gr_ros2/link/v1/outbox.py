@@ -1,7 +1,7 @@
 """What waits to be sent, and what goes into the next packet.
 
 *Order.* Messages of class latency go first, then default, then bulk. Within a class, the message with the largest value
-per byte sent goes first, ``weight * g^2 / c`` (see ``link.freshness``). Every ``TURN``-th packet begins with the topic
+per byte sent goes first, ``weight * g^2 / c`` (see ``freshness``). Every ``TURN``-th packet begins with the topic
 whose last turn is longest ago, so that no topic starves.
 
 *Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
@@ -29,12 +29,12 @@ from gr_ros2.config import QueuePolicy
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
 from gr_ros2.registry import Registry, Topic
@@ -47,7 +47,8 @@ from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
 lost with any of them. With smaller fragments (3), the scans of ``six-topics-paced`` are 3 % younger without loss, and
-16 % older at 20 % loss. A message of class latency uses any space that is free."""
+16 % older at 20 % loss. A message of class latency uses any space that is free from ``MIN_FRAGMENT`` bytes on."""
+MIN_FRAGMENT = 16
 TABLE_FIRST = 2
 """Number of packets up to which the table of topics goes before messages."""
 SETTLING_S = 1.0
@@ -61,6 +62,9 @@ receiver goes on without it after ``hold_s``; what comes back later than that is
 REPORTED_DEPTH = 160
 """Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
 known; but it is repaired for as long as a receiver waits for it (``hold_s``)."""
+UNREPORTED_DEPTH = 48
+"""Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
+to topics without lifespan."""
 _ENTRY = 3
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -323,19 +327,12 @@ class Outbox:
                 heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
         if not picks:
             return None
-        wait = self._settings.flush_timeout_s
-        if wait and room - used >= self._settings.min_fragment + _ENTRY:
-            since = min(min(message.submitted, self._lines[message.topic_id].queue.since) for message, _ in picks)
-            if now < since + wait:
-                return None
         return self._take(picks, number, used, now)
 
     def next_timeout(self, now: float) -> float | None:
         """When ``fill`` may have something; None if nothing waits."""
         times = [
-            max(opens if (opens := line.queue.opens(now)) < inf else now, self._flush(line.queue, now))
-            for line in self._lines.values()
-            if line.queue
+            opens if (opens := line.queue.opens(now)) < inf else now for line in self._lines.values() if line.queue
         ]
         return min(times) if times else None
 
@@ -385,9 +382,6 @@ class Outbox:
     def _find_deadlines(self) -> None:
         self.deadlines = [line.queue for line in self._lines.values() if line.queue.deadline_s]
 
-    def _flush(self, queue: TopicQueue, now: float) -> float:
-        return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
-
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
         return self._queue_depth(self._lines[topic_id])
@@ -422,7 +416,7 @@ class Outbox:
         """Whether a fragment of this many bytes is worth its header."""
         if not used:
             return True
-        if taken < max(self._settings.min_fragment, 0 if message.qos == 1 else room // SHARE):
+        if taken < (MIN_FRAGMENT if message.qos == 1 else room // SHARE):
             return False
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
@@ -461,7 +455,7 @@ class Outbox:
         line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
         lives = line.lives
-        most, least_s = self._settings.depth, 0.0
+        most, least_s = UNREPORTED_DEPTH, 0.0
         if line.queue.policy == "latest":
             most = 1
         elif self.reported:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.rate import Rung
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import GIVE_UP_S, Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.registry import Registry
 from gr_ros2.wire import BROADCAST
@@ -75,7 +75,7 @@ def test_a_receiver_that_falls_silent_is_served_at_the_most_robust_rung_until_it
     fleet.snrs[3] = None
     assert fleet.run(200)[-1] == 0
     fleet.sender.handle_timeout(fleet.now)
-    fleet.now += fleet.sender.settings.give_up_s
+    fleet.now += GIVE_UP_S
     fleet.run(1)
     fleet.sender.handle_timeout(fleet.now)
     assert fleet.run(200)[-1] == 2

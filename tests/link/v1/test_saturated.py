@@ -42,14 +42,14 @@ def test_waiting_for_reports_makes_odometry_older_only_where_it_comes_in_order(
 
 @pytest.mark.parametrize("name", SCENARIOS[1:])
 def test_a_full_link_repairs_nothing(name: str) -> None:
-    _, air = run(name, 1, 0.2, seconds=10.0)
+    _, air = run(name, 0.2, seconds=10.0)
     assert air["new"] > 0.9 * air["sent"]
     assert not air["repair"]
 
 
 def test_a_full_link_that_nobody_answers_tells_its_topics_in_the_first_second() -> None:
     for seed in range(1, 9):
-        topics, _ = run("six-topics-paced", 1, 0.2, seconds=5.0, seed=seed)
+        topics, _ = run("six-topics-paced", 0.2, seconds=5.0, seed=seed)
         busy = [topic for topic in topics if topic.submitted > 100]
         assert busy
         assert all(topic.delivered > 5 for topic in busy)
