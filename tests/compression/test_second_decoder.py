@@ -56,7 +56,7 @@ def named(kind: str) -> Any:
 
 
 def test_models() -> None:
-    assert second.SHARES == VECTORS["models"]
+    assert VECTORS["models"] == second.SHARES
     for letter in second.CLASSES:
         assert [share for _, share in class_table(letter).codes] == VECTORS["models"][letter]
     assert [share for _, share in _LENGTHS.codes] == VECTORS["models"]["LENGTHS"]
