@@ -1,4 +1,4 @@
-"""The message codec's receiving half: whatever the bytes, a message or a CodecError, in time that grows with the bytes.
+"""The receiving half of the message codec: any bytes give a message or a CodecError, with work that grows with them.
 
 The codec is new for every input, so that nothing is remembered: the first message of its kind is the dearest.
 """
@@ -15,8 +15,8 @@ from gr_ros2.registry import Registry, Topic
 from gr_ros2.sim import Fleet, SimSettings
 from gr_ros2.sim.sensors import TYPES as SIMULATED
 
-BASE_S, BYTE_S = 1.5e-3, 12e-6
-"""s of processor time that a coded message may take, and more for each byte of it."""
+BASE, PER_BYTE = 20_000, 500
+"""Lines of Python that a coded message may take, and more for each byte of it."""
 _OTHERS = (
     "std_msgs/msg/String", "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Int16MultiArray", "my_msgs/msg/Thing",
     "geometry_msgs/msg/PoseArray", "visualization_msgs/msg/MarkerArray", "diagnostic_msgs/msg/DiagnosticArray",
@@ -31,11 +31,7 @@ def compression(data: bytes) -> None:
     """The first byte chooses the topic, the rest is the coded message."""
     topic_id, coded = (data[0] if data else 0) % len(TYPES), data[1:]
     one = Registry([Topic(0, "topic", TYPES[topic_id])])
-
-    def fresh() -> partial[None]:
-        return partial(_decode, LinkCodec(one, max_size=_MAX_SIZE), coded)
-
-    within(BASE_S + BYTE_S * len(coded), fresh)
+    within(BASE + PER_BYTE * len(coded), partial(_decode, LinkCodec(one, max_size=_MAX_SIZE), coded))
 
 
 def _decode(codec: LinkCodec, coded: bytes) -> None:

@@ -17,13 +17,13 @@ from fuzz.loop import KEPT, main, within
 from gr_ros2.cli.control_socket import ControlSocket, parse, receive
 
 _PATIENCE_S = 60.0
-BASE_S, BYTE_S = 1e-3, 2e-6
-"""s of processor time that a line may take, and more for each byte of it."""
+BASE, PER_BYTE = 1500, 1
+"""Lines of Python that a line may take, and more for each byte of it."""
 
 
 def control_socket(data: bytes) -> None:
     """One client's bytes, then a client who knows what to say."""
-    within(BASE_S + BYTE_S * len(data), lambda: partial(_parsed, data))
+    within(BASE + PER_BYTE * len(data), partial(_parsed, data))
     path = _server()
     assert "name" in (said := _say(path, data)) or "error" in said
     assert _say(path, b'{"port": 7, "address": "x"}\n') == {"name": "fuzzed", "url": "x:7"}

@@ -6,7 +6,6 @@ Invariant: the same seed gives the same inputs; an input that fails is named in 
 from __future__ import annotations
 
 import argparse
-import math
 import random
 import sys
 import time
@@ -15,14 +14,15 @@ from contextlib import ExitStack
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
+from types import FrameType
 from typing import Any
 
 Harness = Callable[[bytes], None]
+TraceFunction = Callable[[FrameType, str, Any], Any]
 _INTERESTING = (0, 1, 15, 16, 64, 127, 128, 254, 255)
 _MOST = 4096
 KEPT = ExitStack()
 """What a harness opens at its first input and keeps until the last, such as a server."""
-_TRIES = 4
 
 
 def inputs(corpus: Sequence[bytes], seed: int) -> Iterator[bytes]:
@@ -46,24 +46,34 @@ def run(harness: Harness, corpus: Sequence[bytes], seed: int, count: int) -> Non
             _one(harness, data)
 
 
-def within(limit_s: float, fresh: Callable[[], Callable[[], object]]) -> None:
-    """Hold the processor time of one call to a limit.
+def within(most: int, call: Callable[[], object]) -> None:
+    """Hold the work of one call to a limit. Lines of Python are counted, so every machine gives the same answer.
 
-    A call that took too long is tried anew, since it may have paid for somebody else's garbage collection.
-
-    :param limit_s: s of this thread's processor time
-    :param fresh: makes the call, with nothing remembered from one made before
-    :raises AssertionError: when every try took longer
+    :param most: lines that may be executed in this thread
+    :raises AssertionError: at the first line beyond
     """
-    fastest = math.inf
-    for _ in range(_TRIES):
-        call = fresh()
-        begin = time.thread_time()
+    done = 0
+
+    def count(frame: FrameType, event: str, _: object) -> TraceFunction:
+        nonlocal done
+        if event == "line":
+            done += 1
+            if done > most:
+                raise _TooMuch(f"{frame.f_code.co_filename}:{frame.f_lineno}")
+        return count
+
+    before = sys.gettrace()
+    sys.settrace(count)
+    try:
         call()
-        fastest = min(fastest, time.thread_time() - begin)
-        if fastest <= limit_s:
-            return
-    raise AssertionError(f"{fastest * 1e3:.2f} ms of processor time, at most {limit_s * 1e3:.2f} ms are allowed")
+    except _TooMuch as error:
+        raise AssertionError(f"more than {most} lines of Python, at {error}") from None
+    finally:
+        sys.settrace(before)
+
+
+class _TooMuch(BaseException):
+    """Not an Exception, which the code that is counted may catch."""
 
 
 def main(harness: Harness, corpus: Sequence[bytes]) -> None:

@@ -14,8 +14,8 @@ from gr_ros2.wire.v0 import with_crc, without_crc
 
 PACKET_LEN = 40
 _BODY_LEN = len(without_crc(bytes(PACKET_LEN)))
-BASE_S, BYTE_S = 2e-3, 1e-5
-"""s of processor time that a script may take, and more for each byte of it."""
+BASE, PER_BYTE = 500, 20
+"""Lines of Python that a script may take, and more for each byte of it."""
 _STEP = 1 + _BODY_LEN
 _WAITS_S = (0.0, 0.0, 0.001, 0.03, 0.6, 2.0, 70.0, 1e6)
 _REGISTRY = Registry.from_rows({"a": "std_msgs/String", "map": "std_msgs/String", "c": "std_msgs/String"})
@@ -24,7 +24,7 @@ _CONFIG = SinkConfig(packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096
 
 def receiver(data: bytes) -> None:
     """A script of packets: each a byte that says how long to wait and whether the CRC is right, then its bytes."""
-    within(BASE_S + BYTE_S * len(data), lambda: partial(_hear, data))
+    within(BASE + PER_BYTE * len(data), partial(_hear, data))
 
 
 def _hear(data: bytes) -> None:

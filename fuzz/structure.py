@@ -13,8 +13,8 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.errors import CodecError
 from gr_ros2.registry import Topic
 
-BASE_S, BYTE_S = 12e-3, 12e-6
-"""s of processor time for an announcement and a message, and more for each byte of the message. A structure is prepared
+BASE, PER_BYTE = 500_000, 500
+"""Lines of Python for an announcement and a message, and more for each byte of the message. A structure is prepared
 once, when its table arrives."""
 _MAX_SIZE = 1 << 20
 _TOPIC = Topic(0, "topic", "my_msgs/msg/Thing")
@@ -28,11 +28,7 @@ def structure(data: bytes) -> None:
     """The first byte is the length of the structure, then the structure, then the coded message."""
     length = data[0] if data else 0
     text, coded = data[1 : 1 + length].decode("latin-1"), data[1 + length :]
-
-    def fresh() -> partial[None]:
-        return partial(_decode, LinkCodec((), max_size=_MAX_SIZE), text, coded)
-
-    within(BASE_S + BYTE_S * len(coded), fresh)
+    within(BASE + PER_BYTE * len(coded), partial(_decode, LinkCodec((), max_size=_MAX_SIZE), text, coded))
 
 
 def _decode(codec: LinkCodec, text: str, coded: bytes) -> None:

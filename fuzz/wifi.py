@@ -10,8 +10,8 @@ import numpy as np
 from fuzz.loop import main, within
 from gr_ros2.phy.wifi_frames import ENCODINGS, DataFrames, FrameDecoder
 
-BASE_S, BYTE_S = 1e-2, 2e-5
-"""s of processor time that a frame may take, and more for each byte of it."""
+BASE, PER_BYTE = 1500, 1
+"""Lines of Python that a frame may take, and more for each byte of it."""
 _HEAD, _LONGEST = 3, 4096
 _FRAMES = DataFrames("02:67:72:2d:72:32", "02:67:72:00:00:01")
 
@@ -22,7 +22,7 @@ def wifi(data: bytes) -> None:
     length = int.from_bytes(data[1:_HEAD], "big") % _LONGEST
     count = 48 * encoding.symbols(length - 36)
     symbols = np.resize(np.frombuffer(data[_HEAD:] or b"\0", np.uint8), count).reshape(-1, 48)
-    within(BASE_S + BYTE_S * length, lambda: partial(FrameDecoder().decode, encoding, length, symbols))
+    within(BASE + PER_BYTE * length, partial(FrameDecoder().decode, encoding, length, symbols))
     frame = FrameDecoder().decode(encoding, length, symbols)
     assert frame is None or len(frame) == length - 4
     packet = _FRAMES.unwrap(data)

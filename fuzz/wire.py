@@ -11,8 +11,8 @@ from gr_ros2.errors import WireError
 from gr_ros2.wire import decode
 from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
 
-BASE_S, BYTE_S = 5e-4, 5e-7
-"""s of processor time that a packet may take, and more for each byte of it."""
+BASE, PER_BYTE = 300, 2
+"""Lines of Python that a packet may take, and more for each byte of it."""
 _NO_SOURCE = 255
 """A source id that decoders take and encoders refuse."""
 
@@ -21,7 +21,7 @@ def wire(data: bytes) -> None:
     """Decode the bytes as they are, and again with the CRC made right, which random bytes hardly ever are."""
     for packet in (data, with_crc(data)):
         check(packet)
-        within(BASE_S + BYTE_S * len(packet), lambda: partial(_decoded, packet))  # noqa: B023 - called at once
+        within(BASE + PER_BYTE * len(packet), partial(_decoded, packet))
 
 
 def _decoded(data: bytes) -> None:

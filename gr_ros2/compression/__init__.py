@@ -1,8 +1,7 @@
-"""Message compression inside version 0: fewer bytes per message, each message coded independently (the C bit of the
-header).
+"""Message compression: fewer bytes per message, each message coded independently.
 
-``LinkCodec(registry)`` is the message codec of a sender and a receiver;
-``docs/explanation/compression.md`` has the format.
+``LinkCodec(registry)`` is the message codec of a sender and a receiver; ``docs/reference/message-coding.md`` has the
+format.
 """
 
 from __future__ import annotations

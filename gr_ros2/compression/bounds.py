@@ -1,5 +1,7 @@
 """Limits of a coded message: the size of the decoded message and the number of its parts, by the number of coded bytes.
 
+The coded bytes are counted without those that name codec and dictionary.
+
 Invariants: the limits are part of the format, so both ends compute the same; every limit depends only on the length of
 the coded message, so that a short message costs its receiver little, whatever it claims. A sender pads a coded message
 that would be too short for its content (``least``).

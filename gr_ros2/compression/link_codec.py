@@ -230,22 +230,22 @@ class TopicCodec:
         if not coded:
             raise DamagedError("damaged message: it is empty")
         number, codec = coded[0] >> 4, coded[0] & 15
-        max_size = min(self._max_size, bounds.largest(len(coded)))
         if coded[0] == STORED:
             if len(coded) - 1 > self._max_size:
                 raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
             return coded[1:]
         if codec not in (ZSTD, FIELDS, FIELDS_AND_MORE) or (number == 0 and codec != ZSTD):
             raise CodecError(f"unknown codec {codec} with dictionaries {number}")
-        if number == 0:
-            return self._plain.decompress(coded[1:], max_size)
         start = 3 if number in (OWN, ANNOUNCED) else 1
+        body = coded[start:]
+        max_size = min(self._max_size, bounds.largest(len(body)))
+        if number == 0:
+            return self._plain.decompress(body, max_size)
         coders = self._held.get(bytes([number]) + coded[1:start])
         if coders is None:
             names = {OWN: f"own dictionary {coded[1:start].hex()}", ANNOUNCED: f"structure {coded[1:start].hex()}"}
             which = names.get(number, f"shipped dictionaries {number}")
             raise UnknownDictionaryError(f"message coded with {which}, not held here")
-        body = coded[start:]
         if codec == ZSTD:
             if coders.zstd is None:
                 raise UnknownDictionaryError(f"dictionaries {number} have none for {coders.type_name}")
