@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from gr_ros2.backlog import Backlog
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def test_work_is_done_in_its_order(backlog: Backlog) -> None:
     done: list[int] = []
     for number in range(50):
         assert backlog.offer(1, done.append, number)
-    assert backlog.settle(30)
+    assert backlog.settle(PATIENCE_S)
     assert backlog.offer(1, done.append, 50)  # it was idle in the meantime
     assert backlog.close()
     assert done == list(range(51))
@@ -48,7 +49,7 @@ def test_what_does_not_fit_is_refused_at_once(backlog: Backlog) -> None:
 def test_one_piece_may_be_larger_than_the_bound(backlog: Backlog) -> None:
     done: list[int] = []
     assert backlog.offer(1000, done.append, 1)
-    assert backlog.settle(30)
+    assert backlog.settle(PATIENCE_S)
     assert done == [1]
 
 
@@ -60,6 +61,6 @@ def test_put_waits_for_room(backlog: Backlog) -> None:
     giver.join(0.05)
     assert giver.is_alive()
     gate.set()
-    giver.join(30)
-    assert backlog.settle(30)
+    giver.join(PATIENCE_S)
+    assert backlog.settle(PATIENCE_S)
     assert done == [1]

@@ -1,4 +1,4 @@
-"""What holds of every test: it says what it expects."""
+"""What holds of every test: it says what it expects, and expects nothing of the machine's speed."""
 
 from __future__ import annotations
 
@@ -31,9 +31,113 @@ def silent(tree: ast.Module) -> list[str]:
     return [each.name for each in functions if each.name.startswith("test_") and not expects(each, helpers)]
 
 
+CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
+FIRST = {"join", "settimeout", "wait"}
+GIVING_UP = {*FIRST, "acquire", "communicate", "run", "urlopen", "wait_for"}
+"""What takes a timeout, as its argument ``timeout`` or as its first; a number there is a bound on the machine."""
+
+
+def is_clock(node: ast.AST) -> bool:
+    """Whether a value is what a clock says now, whatever module the clock is of, in seconds or nanoseconds."""
+    return isinstance(node, ast.Call) and name_of(node.func).removesuffix("_ns") in CLOCKS
+
+
+def name_of(node: ast.AST) -> str:
+    """Of a variable, an attribute, or what is indexed or called on; '' of anything else."""
+    while isinstance(node, ast.Subscript):
+        node = node.value
+    return node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+
+
+def clocked(tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Names that hold readings of a clock, and those that hold differences of such."""
+    readings: set[str] = set()
+    durations: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and name_of(node.func) == "append" and any(map(is_clock, node.args)):
+            readings.add(name_of(node.func.value))  # type: ignore[attr-defined]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            names = {name_of(target) for target in (node.targets if isinstance(node, ast.Assign) else [node.target])}
+            if is_clock(node.value):
+                readings |= names
+            elif spans(node.value, readings, durations):
+                durations |= names
+    return readings - {""}, durations - {""}
+
+
+def spans(node: ast.AST, readings: set[str], durations: set[str]) -> bool:
+    """Whether a value is a time that has passed, or a point in time that moves with the clock."""
+    for part in ast.walk(node):
+        sides = (part.left, part.right) if isinstance(part, ast.BinOp) and isinstance(part.op, ast.Sub) else ()
+        if name_of(part) in durations or any(is_clock(side) or name_of(side) in readings for side in sides):
+            return True
+    return False
+
+
+def hurried(tree: ast.Module) -> list[int]:
+    """Lines that fail on a slow machine: a time that has to be short enough, and patience given as a number."""
+    readings, durations = clocked(tree)
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            for left, sense, right in zip(sides[:-1], node.ops, sides[1:], strict=True):
+                less = left if isinstance(sense, ast.Lt | ast.LtE) else right
+                if isinstance(sense, ast.Lt | ast.LtE | ast.Gt | ast.GtE) and (
+                    is_clock(less) or spans(less, readings, durations)
+                ):
+                    found.append(node.lineno)
+        elif isinstance(node, ast.Call) and name_of(node.func) in GIVING_UP:
+            named = [word.value for word in node.keywords if word.arg == "timeout"]
+            given = named or (node.args if name_of(node.func) in FIRST else [])
+            if len(given) == 1 and isinstance(given[0], ast.Constant) and type(given[0].value) in (int, float):
+                found += [node.lineno] * (given[0].value >= 1)
+    return sorted(found)
+
+
 @pytest.mark.parametrize("path", sorted(TESTS.rglob("test_*.py")), ids=lambda path: str(path.relative_to(TESTS)))
 def test_every_test_asserts_something_a_reader_can_see(path: Path) -> None:
     assert silent(ast.parse(path.read_text())) == []
+
+
+@pytest.mark.parametrize("path", sorted(TESTS.rglob("*.py")), ids=lambda path: str(path.relative_to(TESTS)))
+def test_no_test_bounds_the_time_that_it_takes(path: Path) -> None:
+    """Count work (tests.work), compare with a yardstick measured beside it, or measure it in bench/."""
+    if path.name != "waiting.py":
+        assert hurried(ast.parse(path.read_text())) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "began = time.monotonic()\nassert time.monotonic() - began < 2",
+        "took = perf.perf_counter() - began\nassert 5 > took",
+        "heard.append(time.monotonic())\nassert heard[-1] - heard[0] <= 16",
+        "self.began = time.time()\nend = time.time()\ntook = end - self.began\nassert 0 < took < 20",
+        "while time.monotonic() < end: pass",
+        "assert abs(stamp - time.time()) < 60",
+        "process.wait(20)",
+        "process.communicate(timeout=30)",
+        "thread.join(5)",
+        "subprocess.run(command, timeout=60)",
+    ],
+)
+def test_a_bound_on_time_is_found(text: str) -> None:
+    assert hurried(ast.parse(text)) != []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "began = time.monotonic()\nassert time.monotonic() - began >= 0.1",
+        "before = time.time()\nassert before <= stamp <= time.time()",
+        "process.wait(PATIENCE_S)\nprocess.wait()\nstop.wait(0.01)\n', '.join(words)",
+        "took = 3.0 - 1.0\nassert took < 5",
+    ],
+)
+def test_what_a_slow_machine_does_not_break_is_left_alone(text: str) -> None:
+    assert hurried(ast.parse(text)) == []
 
 
 def test_a_test_without_an_assertion_is_found() -> None:

@@ -1,4 +1,4 @@
-"""A condition that holds ends the waiting; one that never does fails the test in its own words."""
+"""A condition that holds ends the waiting; one towards which nothing moves fails the test in its own words."""
 
 from __future__ import annotations
 
@@ -18,3 +18,14 @@ def test_what_never_comes_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(waiting, "PATIENCE_S", 0.01)
     with pytest.raises(AssertionError, match=r"waited 0\.01 s for the tide"):
         wait_for(lambda: False, "the tide")
+
+
+def test_patience_begins_anew_with_each_step_of_what_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter(range(1000))
+    monkeypatch.setattr(waiting.time, "monotonic", lambda: float(next(now)))
+    monkeypatch.setattr(waiting.time, "sleep", lambda _: None)
+    monkeypatch.setattr(waiting, "PATIENCE_S", 5.0)
+    steps = iter(range(40))
+    wait_for(lambda: next(steps) == 39, "forty steps", progress=lambda: next(steps))
+    with pytest.raises(AssertionError, match="waited 5 s for the tide, the last step of it low"):
+        wait_for(lambda: False, "the tide", progress=lambda: "low")

@@ -1,27 +1,39 @@
-"""How tests wait: for a condition, never for a time."""
+"""How tests wait: for a condition, never for a time.
+
+Invariant: patience ends a hang and nothing else. It is far longer than anything here takes on a slow computer. Where
+work takes long by itself, patience begins anew with each step of that work.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 120.0
-"""s after which a condition counts as failed: only a hang takes that long, also on a busy machine."""
+PATIENCE_S = 300.0
+"""s without progress after which a condition counts as failed; also the timeout of whatever takes one."""
 
 _SHORTEST_S, _LONGEST_S = 0.001, 0.02
 """Pauses between two looks; they grow, so that waiting leaves the processor to what is waited for."""
 
 
-def wait_for(condition: Callable[[], object], what: str = "condition") -> None:
+def wait_for(
+    condition: Callable[[], object], what: str = "condition", progress: Callable[[], object] | None = None
+) -> None:
     """Return once a condition holds.
 
     :param condition: called again and again until it returns something true
     :param what: is waited for, as the failure says it
+    :param progress: called after each look; while what it returns changes, patience begins anew
     :raises AssertionError: it does not hold in time, which fails the test
     """
     end = time.monotonic() + PATIENCE_S
     pause = _SHORTEST_S
+    reached: object = None
     while not condition():
-        assert time.monotonic() < end, f"waited {PATIENCE_S:g} s for {what}"
+        if progress is not None and (now := progress()) != reached:
+            reached, end = now, time.monotonic() + PATIENCE_S
+        if time.monotonic() > end:
+            where = "" if progress is None else f", the last step of it {reached}"
+            raise AssertionError(f"waited {PATIENCE_S:g} s for {what}{where}")
         time.sleep(pause)
         pause = min(2 * pause, _LONGEST_S)

@@ -18,9 +18,7 @@ import pytest
 
 from gr_ros2.cli.control_socket import ControlSocket, folder, request, running_programs
 from gr_ros2.errors import ConfigError, RunError
-from tests.waiting import wait_for
-
-PATIENCE_S = 60.0
+from tests.waiting import PATIENCE_S, wait_for
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ import pytest
 
 from gr_ros2.cli.ending import INTERRUPTED
 from tests.domains import free_domains
+from tests.waiting import PATIENCE_S
 
 PLAN = ("plan", "demo")
 GRAPH = ("registry", "from-graph", "--wait", "60")
@@ -41,7 +42,7 @@ def test_a_signal_while_modules_are_loaded(words: tuple[str, ...], loaded: str, 
         else:
             pytest.fail(f"{loaded} was never loaded")
         process.send_signal(number)
-        _, rest = process.communicate(timeout=60)
+        _, rest = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     said = [line for line in rest.splitlines() if line and not line.startswith("import time:")]

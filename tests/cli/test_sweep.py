@@ -17,7 +17,7 @@ from gr_ros2.cli.main import BAD_INPUT, FAILED, INTERRUPTED, run
 from gr_ros2.study.sweep.definition import builtin_sweeps
 from tests.e2e.support import COMMAND
 from tests.study.sweeps import write_sweep_file
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 def test_without_a_name_it_lists_the_built_in_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,7 +95,7 @@ def test_a_sweep_that_is_stopped_ends_and_can_be_continued(tmp_path: Path, numbe
             os.killpg(process.pid, number)  # as a terminal does: the workers get it too
         else:
             process.send_signal(number)
-        said, errors = process.communicate(timeout=60)
+        said, errors = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert (process.returncode, errors) == (INTERRUPTED, "")

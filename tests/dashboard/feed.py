@@ -67,7 +67,7 @@ class Feed:
         """Bytes come to the receiver."""
         self._tell(self.receiver.receive(data, now), now)
 
-    def wait(self, now: float) -> None:
+    def pass_time(self, now: float) -> None:
         """Time passes at the receiver."""
         self._tell(self.receiver.handle_timeout(now), now)
 

@@ -27,9 +27,8 @@ from gr_ros2.dashboard import admission
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.errors import ConfigError
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
-PATIENCE_S = 60.0
 PULL = ('{"msgid": "1", "msgtype": "PULL-DOC-REQ"}', "{}", "{}")
 
 

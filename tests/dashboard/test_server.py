@@ -20,10 +20,11 @@ from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.errors import ConfigError
 from tests.dashboard.feed import NAMES, REGISTRY, Feed, at
+from tests.waiting import PATIENCE_S
 
 
 def get(url: str) -> str:
-    with urlopen(url, timeout=30) as answer:
+    with urlopen(url, timeout=PATIENCE_S) as answer:
         text: str = answer.read().decode()
     return text
 
@@ -42,7 +43,7 @@ def test_another_site_may_not_talk_to_it(own: bool, status: int) -> None:
     with Dashboard(port=0) as dashboard:
         token = re.search(r'"token":"([^"]+)"', get(dashboard.url))
         assert token is not None
-        connection = HTTPConnection("127.0.0.1", dashboard.port, timeout=30)
+        connection = HTTPConnection("127.0.0.1", dashboard.port, timeout=PATIENCE_S)
         headers = {
             "Connection": "Upgrade",
             "Upgrade": "websocket",

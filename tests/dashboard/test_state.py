@@ -39,7 +39,7 @@ def lossy_run(seed: int, *observers: Hears, share: float = 0.05) -> Feed:
         if step % 40 == 0:
             feed.submit(1, bytes(60_000), now)  # too large
         feed.fly(now)
-        feed.wait(now)
+        feed.pass_time(now)
     return feed
 
 
@@ -55,7 +55,7 @@ def test_live_numbers_are_the_results(seed: int, with_ledger: bool) -> None:
     state = make(recorder if with_ledger else None)
     feed = lossy_run(seed, recorder, state)
     feed.sender.missed(0, 5)
-    feed.wait(61.0)
+    feed.pass_time(61.0)
     snapshot = state.tick(60.0)
     result = result_of(recorder)
     assert snapshot.phase == "running"

@@ -21,6 +21,7 @@ from gr_ros2.run.scenario import load_scenario, scenario_from
 from gr_ros2.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
 from tests.once import once
+from tests.waiting import PATIENCE_S
 
 LINK: dict[str, Any] = {
     "registry": "table4",
@@ -187,7 +188,7 @@ def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **({} if home is None else {"HOME": str(home)})}
     environment["XDG_CACHE_HOME"] = str((home or folder).parent / "cache")
     command = [sys.executable, "-m", "gr_ros2.cli", *arguments]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, f"{' '.join(arguments)}: {done.stderr}"
     return done
 

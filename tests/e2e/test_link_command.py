@@ -16,7 +16,7 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains
 from tests.e2e.support import COMMAND, set_options
 from tests.middleware.support import CUSTOM, message
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_messages_come_back_until_it_is_stopped(
 
             wait_for(answered, "messages to come back")
             running.send_signal(number)
-            output, errors = running.communicate(timeout=30)
+            output, errors = running.communicate(timeout=PATIENCE_S)
         finally:
             running.kill()
     assert (running.returncode, errors) == (0, "")
@@ -79,7 +79,7 @@ def test_messages_come_back_until_it_is_stopped(
 
 
 def test_it_ends_after_a_duration(config: Path) -> None:
-    output, errors = link(config, "--duration", "0.2").communicate(timeout=60)
+    output, errors = link(config, "--duration", "0.2").communicate(timeout=PATIENCE_S)
     assert errors == ""
     assert output.splitlines()[-1].startswith("0 s; nothing sent, no publisher on /robot_1/chat; ")
     assert "no key, so anybody can read" in output
@@ -96,7 +96,7 @@ def test_it_ends_after_a_duration(config: Path) -> None:
 )
 def test_what_is_wrong_is_said_in_a_line(config: Path, change: str, said: str, status: int) -> None:
     failed = link(config, *set_options([change]))
-    output, errors = failed.communicate(timeout=60)
+    output, errors = failed.communicate(timeout=PATIENCE_S)
     assert (failed.returncode, output) == (status, "")
     assert errors.startswith("gr-ros2: ") and said in errors
     assert errors.count("\n") == 1

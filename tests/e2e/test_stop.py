@@ -14,7 +14,7 @@ import pytest
 
 from gr_ros2.record.result import read_result
 from tests.e2e.support import COMMAND, check_books, delivered_bag, on_free_domains, set_options
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 class Run:
@@ -52,8 +52,8 @@ class Run:
 
     def end(self) -> str:
         """Wait for the end; what it said on stderr."""
-        _, errors = self.process.communicate(timeout=60)
-        self._reader.join(10)
+        _, errors = self.process.communicate(timeout=PATIENCE_S)
+        self._reader.join(PATIENCE_S)
         os.close(self._terminal)
         return errors
 

@@ -27,7 +27,7 @@ from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.registry import Registry
 from tests.gr.probe import Hears, Probe
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 REGISTRY = Registry.from_rows(
     {"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid", "cmd_vel": "geometry_msgs/Twist"}
@@ -318,7 +318,7 @@ def test_nothing_waits_while_latencies_are_sorted(rig: Rig, monkeypatch: pytest.
     summary = LatencyWindow.summary
 
     def watched(window: LatencyWindow, *newest: int) -> LatencySummary:
-        free.append(sink._lock.acquire(timeout=5))
+        free.append(sink._lock.acquire(timeout=PATIENCE_S))
         sink._lock.release()
         return summary(window, *newest)
 

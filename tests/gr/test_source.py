@@ -25,7 +25,7 @@ from gr_ros2.registry import Registry
 from gr_ros2.wire.v0 import V0
 from tests.domains import free_domains
 from tests.gr.probe import Hears, Probe
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 DOMAIN = 61
@@ -139,7 +139,7 @@ def test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up
     def observe(event: SenderEvent) -> None:
         recorder.sender_event(1, event)
         held.set()
-        release.wait(20)
+        release.wait(PATIENCE_S)
 
     source = rig.make(topics=["odom"], subscriber_depth=5, observer=Hears(observe))
     rig.publish(bytes(40))

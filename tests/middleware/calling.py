@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gr_ros2.middleware.services import ServiceGraph
+from tests.waiting import PATIENCE_S
 
 ADD = "example_interfaces/srv/AddTwoInts"
 LOOPBACK = (
@@ -120,9 +121,9 @@ class Program:
             with suppress(BrokenPipeError):
                 self.process.stdin.close()
         try:
-            self.process.wait(10)
+            self.process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        self._thread.join(5)
+        self._thread.join(PATIENCE_S)
         self.process.stdout.close()

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Sequence
 
 from gr_ros2.middleware import Qos
+from tests.waiting import PATIENCE_S
 
 STRING, CUSTOM = "std_msgs/msg/String", "robot_msgs/msg/WheelState"
 RELIABLE = Qos("reliable", "volatile", 0)
@@ -81,9 +82,9 @@ class Peer:
         if not self._process.stdin.closed:
             self._process.stdin.close()
         try:
-            self._process.wait(10)
+            self._process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._thread.join(5)
+        self._thread.join(PATIENCE_S)
         self._process.stdout.close()

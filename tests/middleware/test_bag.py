@@ -16,7 +16,7 @@ from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, TopicInfo, bag_recorder
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
 from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 Storage = Literal["mcap", "sqlite3"]
 both_storages = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -108,7 +108,7 @@ def test_finished_comes_after_the_last_callback(tmp_path: Path) -> None:
         received.append(payload)
         if len(received) == 10:
             reached.set()
-            release.wait(20)
+            release.wait(PATIENCE_S)
 
     with BagMiddleware(path=write(tmp_path / "bag"), speed=0) as bag:
         bag.subscribe("/a", STRING, RELIABLE, callback)

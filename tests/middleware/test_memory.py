@@ -11,7 +11,7 @@ from gr_ros2.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_depth_bounds_what_waits_and_drops_are_counted(ends: Ends) -> None:
     def callback(payload: bytes) -> None:
         received.append(payload)
         reached.set()
-        release.wait(20)
+        release.wait(PATIENCE_S)
 
     subscription = ends[0].subscribe("/a", STRING, Qos(depth=3), callback)
     publisher = ends[1].advertise("/a", STRING, RELIABLE)

@@ -32,7 +32,7 @@ from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.setting import Auto
 from tests.domains import domain
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 STRING = "std_msgs/msg/String"
 DOMAIN, ELSEWHERE = domain(4), domain(5)
@@ -220,7 +220,7 @@ def test_unbounded_depth_loses_nothing(start: Start) -> None:
     received: list[bytes] = []
 
     def take(payload: bytes) -> None:
-        release.wait(20)
+        release.wait(PATIENCE_S)
         received.append(payload)
 
     two.subscribe("/chatter", STRING, everything, take)
@@ -374,7 +374,7 @@ def test_context_shut_down_from_outside_ends_in_errors_not_in_a_hang(start: Star
     subscription = one.subscribe("/chatter", STRING, RELIABLE, print)
     publisher = one.advertise("/chatter", STRING, RELIABLE)
     one._context.shutdown()  # as rclpy's handler of SIGINT in a host does to every context
-    one._thread.join(20)
+    one._thread.join(PATIENCE_S)
     assert not one._thread.is_alive()
     with pytest.raises(MiddlewareError, match="the middleware is closed"):
         one.advertise("/chatter", STRING, RELIABLE)
@@ -390,20 +390,20 @@ def test_close_does_not_wait_for_a_callback_that_never_returns(start: Start) -> 
 
     def hang(_: bytes) -> None:
         entered.set()
-        release.wait(60)
+        release.wait(PATIENCE_S)
 
     subscription = one.subscribe("/chatter", STRING, RELIABLE, hang)
     publisher = one.advertise("/chatter", STRING, RELIABLE)
     wait_for(publisher.matched)
     publisher.publish(text("x"))
     publisher.publish(text("y"))
-    assert entered.wait(20)
+    assert entered.wait(PATIENCE_S)
     subscription.close()
     one.close()
     assert not release.is_set()
     entered.clear()
     release.set()
-    one._thread.join(20)
+    one._thread.join(PATIENCE_S)
     assert not one._thread.is_alive()
     assert not entered.is_set(), "a callback began after close"
 
@@ -415,7 +415,9 @@ middleware = MIDDLEWARE.load("rclpy")(domain_id={DOMAIN})
 middleware.subscribe("/chatter", "{STRING}", Qos(), print)
 middleware.advertise("/chatter", "{STRING}", Qos()).publish(b"\\0\\1\\0\\0\\1\\0\\0\\0\\0")
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -12,10 +12,9 @@ from gnuradio import gr, pdu
 
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.phy.threads import lift_message_limit
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 OVER_GNU_RADIOS_LIMIT = 8192 + 2500  # of which 1024 find room behind the port
-LIMIT_S = 60.0
 
 
 class KeptAliveSink(gr.sync_block):  # type: ignore[misc]
@@ -27,7 +26,7 @@ class KeptAliveSink(gr.sync_block):  # type: ignore[misc]
         self.taken = 0
 
     def work(self, input_items: list[Any], output_items: list[Any]) -> int:  # noqa: ARG002
-        self.go.wait(LIMIT_S)
+        self.go.wait(PATIENCE_S)
         self.taken += len(input_items[0])
         return len(input_items[0])
 

@@ -12,7 +12,7 @@ from gr_ros2.race.links import RaceIpLink, RaceRadio
 from gr_ros2.race.namespaces import Namespace, inside
 from gr_ros2.race.tun import INTERFACE, QUEUE_BYTES
 from tests.race.support import needs_namespaces
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 pytestmark = needs_namespaces
 
@@ -26,7 +26,7 @@ def udp(namespace: Namespace, address: str) -> socket.socket:
     def opened() -> socket.socket:
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         made.bind((address, PORT))
-        made.settimeout(20)
+        made.settimeout(PATIENCE_S)
         return made
 
     return inside(namespace.path, opened)

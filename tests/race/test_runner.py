@@ -11,7 +11,7 @@ import pytest
 
 from gr_ros2.race.contenders import CONTENDERS
 from tests.race.support import needs_namespaces
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 pytestmark = needs_namespaces
 
@@ -75,7 +75,7 @@ def test_ctrl_c_and_sudden_death_leave_no_process(tmp_path: Path) -> None:
             wait_for(lambda pid=process.pid: len(descendants(pid)) >= 4, "no workers")  # type: ignore[misc]
             started = descendants(process.pid)
             process.send_signal(how)
-            process.wait(60)
+            process.wait(PATIENCE_S)
             if how == signal.SIGINT:
                 assert process.returncode == 130
             wait_for(lambda pids=started: not any(map(alive, pids)), "workers are left")  # type: ignore[misc]

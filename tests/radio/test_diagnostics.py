@@ -43,6 +43,7 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
             "diagnostics": {"period_s": 0.1, "latency_warn_s": 1.0},
         }
     )
+    began = int(time.time())
     arrays: list[Any] = []
     counters: list[Any] = []
 
@@ -74,7 +75,7 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert float(seconds) >= 2.0
     values = {item.key: item.value for item in topic.values}
     assert 2 <= float(values["latency (s)"]) <= float(values["age (s)"]) + 0.01
-    assert abs(arrays[-1].header.stamp.sec - time.time()) < 60
+    assert began <= arrays[-1].header.stamp.sec <= time.time()
     assert counters[-1]["sink"]["topics"]["/rx_robot_1/point"]["delivered"] > 0
     assert counters[-1]["phy"]["name"] == "psk"
     snr_db = {item.key: item.value for item in receiver.values}["SNR (dB)"]

@@ -11,7 +11,7 @@ import rclpy.executors
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 class Graph:
@@ -44,4 +44,4 @@ class Graph:
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
-        self._thread.join(5)
+        self._thread.join(PATIENCE_S)

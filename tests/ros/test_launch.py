@@ -26,7 +26,7 @@ from std_msgs.msg import String
 
 from tests.domains import free_domains
 from tests.ros.graph import Graph
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 ROS2 = shutil.which("ros2")
@@ -134,7 +134,7 @@ def test_two_robots_until_ctrl_c(robots: list[subprocess.Popen[str]], domains: l
     for process in robots:
         os.killpg(process.pid, signal.SIGINT)
     for process in robots:
-        output, _ = process.communicate(timeout=30)
+        output, _ = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, output
         assert "Traceback" not in output
     assert "process has finished cleanly" in output
@@ -145,8 +145,8 @@ def test_wrong_settings_through_both_commands(domains: list[int]) -> None:
     said = "gr_ros2 link: link 'nowhere.yaml': no such file"
     run = ros2(["run", "gr_ros2", "link", "--ros-args", "-p", "config:=nowhere.yaml"], 0)
     launch = ros2(["launch", "gr_ros2", "link_launch.py", "config:=nowhere.yaml"], 0)
-    output, _ = run.communicate(timeout=60)
+    output, _ = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 2
     assert output.count(said) == 1 and "Traceback" not in output
-    output, _ = launch.communicate(timeout=60)
+    output, _ = launch.communicate(timeout=PATIENCE_S)
     assert output.count(said) == 1 and "exit code 2" in output

@@ -22,7 +22,7 @@ from std_msgs.msg import Header, String
 
 from tests.domains import free_domains
 from tests.ros.graph import Graph
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, str(ROOT / "resource" / "link"), "--ros-args"]
@@ -80,7 +80,7 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
         assert heard[0].frame_id == "robot_1/odom"
         wait_for(lambda: counters and counters[-1]["sink"]["topics"], "statistics")
         process.send_signal(ending)
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
     finally:
         process.kill()
         process.communicate()
@@ -93,7 +93,7 @@ def test_ctrl_c_while_it_starts(config: Path, loaded: str) -> None:
         maps = Path("/proc", str(process.pid), "maps")
         wait_for(lambda: loaded in maps.read_text(), f"{loaded} to be loaded")
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
+        _, said = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
         assert "Traceback" not in said
     finally:
@@ -134,7 +134,7 @@ def test_what_the_library_logs_is_in_the_log_of_ros(config: Path, graph: Graph) 
         wait_for(lambda: publisher.publish(Header()) or "0:header" in said.get(INFO, ""), "a packet")
         wait_for(lambda: "/robot_1/other: a publisher sends" in said.get(WARN, ""), "the warning")
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
     finally:
         process.kill()
         process.communicate()

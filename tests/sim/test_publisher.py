@@ -11,9 +11,7 @@ import pytest
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.base import Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.sim import Fleet, SimPublisher, SimSettings
-from tests.waiting import wait_for
-
-DEADLINE_S = 30
+from tests.waiting import PATIENCE_S, wait_for
 
 
 class Recorder(Middleware):
@@ -76,7 +74,7 @@ def test_everything_goes_out_once_and_not_before_its_time(fleet: Fleet, graph: R
     assert not play.finished
     begin = time.monotonic()
     play.start()
-    assert play.wait(DEADLINE_S)
+    assert play.wait(PATIENCE_S)
     play.close()
     expected = list(fleet.messages(1.0))
     assert [(topic, payload) for _, topic, payload in graph.got] == [(m.topic, m.payload) for m in expected]
@@ -96,7 +94,7 @@ def test_qos(fleet: Fleet, graph: Recorder) -> None:
 def test_a_graph_per_robot(fleet: Fleet, graph: Recorder) -> None:
     play = SimPublisher(fleet, {2: graph}, 0.2)
     play.start()
-    assert play.wait(DEADLINE_S)
+    assert play.wait(PATIENCE_S)
     assert graph.got
     assert all(topic.startswith("/robot_2/") for _, topic, _ in graph.got)
     assert set(play.published) <= set(graph.qos) == set(play.publishers)
@@ -106,7 +104,7 @@ def test_a_late_play_catches_up_without_losing_anything(fleet: Fleet, graph: Rec
     readings = iter([0.0])
     play = SimPublisher(fleet, graph, 0.5, clock=lambda: next(readings, 100.0))  # late from the first message on
     play.start()
-    assert play.wait(DEADLINE_S)
+    assert play.wait(PATIENCE_S)
     assert play.published.total() == len(list(fleet.messages(0.5)))
     assert play.worst_lag_s == 100.0
 
@@ -135,7 +133,7 @@ def test_an_error_of_the_graph_is_raised_by_stop(fleet: Fleet) -> None:
     graph = Recorder(refuse_after=5)
     play = SimPublisher(fleet, graph, 5.0)
     play.start()
-    assert play.wait(DEADLINE_S)
+    assert play.wait(PATIENCE_S)
     with pytest.raises(MiddlewareError, match="closed"):
         play.stop()
     assert play.published.total() == 5
