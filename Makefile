@@ -1,7 +1,6 @@
 # Everything a person needs: make demo, make test, make quick, make bench, make lint, make grc.
-# Set-up happens by itself and is remembered in .venv/stamp-*.
+# Set-up happens by itself: tools/set-up.
 
-PYTHON := /usr/bin/python3
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -36,20 +35,11 @@ grc: setup
 	$(BIN)/gr-ros2 grc-path --install
 	gnuradio-companion gr_ros2/examples/ofdm_loopback.grc
 
-setup: $(VENV)/stamp-run
-setup-dev: $(VENV)/stamp-dev
+setup:
+	@tools/set-up run
 
-$(VENV)/stamp-run: tools/install-system requirements.txt setup.py $(wildcard gr_ros2/phy/kernels/*.cpp gr_ros2/phy/kernels/*.h)
-	tools/install-system run
-	test -x $(BIN)/pip || $(PYTHON) -m venv --system-site-packages $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-input -r requirements.txt
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
-	touch $@
-
-$(VENV)/stamp-dev: $(VENV)/stamp-run requirements-dev.txt
-	tools/install-system test
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-input -r requirements-dev.txt
-	touch $@
+setup-dev:
+	@tools/set-up test
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info gr_ros2/phy/kernels/*.so gr_ros2/middleware/*.so

@@ -1,6 +1,7 @@
 """Package metadata; it stands here and not in pyproject.toml because colcon reads it from here."""
 
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,8 @@ COMPILE = [
 ]
 VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if platform.machine() in ("x86_64", "AMD64") else {})
 """Libraries of compiled kernels: for every processor of the architecture (64-bit ARM has NEON), and for newer ones."""
+
+(version,) = re.findall(r'^__version__ = "(.+)"$', Path("gr_ros2/__init__.py").read_text(encoding="utf-8"), re.M)
 
 
 def files(pattern: str) -> list[str]:
@@ -80,7 +83,7 @@ class BuildLibraries(build_ext):
 
 setup(
     name="gr-ros2",
-    version="0.1.0",
+    version=version,
     description="Native ROS 2 topics over any GNU Radio physical layer, without IP",
     long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",

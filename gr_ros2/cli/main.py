@@ -20,6 +20,12 @@ from gr_ros2.cli.ending import BAD_INPUT, FAILED, INTERRUPTED, on_signals
 from gr_ros2.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
 
 _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
+_GNU_RADIO = ("gnuradio", "pmt")
+_NO_GNU_RADIO = (
+    "this needs GNU Radio 3.10, which this Python does not find: apt install gnuradio, and install gr-ros2 in an "
+    "environment made by /usr/bin/python3 -m venv --system-site-packages; without it there are packet, registry, dict, "
+    "key and scenarios, and with `phy: modem` or `direct` also plan, and replay by packets (`time: packets`)"
+)
 
 Commands = Mapping[str, tuple[str, str]]
 """name -> (``module:attribute``, the line that help shows), in the order in which help lists them."""
@@ -117,6 +123,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _fail("interrupted", INTERRUPTED)
     except GrRos2Error as error:
         return _fail(str(error), BAD_INPUT if isinstance(error, _BAD_INPUT_ERRORS) else FAILED)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _GNU_RADIO:
+            raise
+        return _fail(_NO_GNU_RADIO, BAD_INPUT)
     except BrokenPipeError:
         _drop_output()  # the reader of our output (such as `| head`) has ended, which is no error
         return 0

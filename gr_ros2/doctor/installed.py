@@ -16,11 +16,12 @@ from gr_ros2.backends import BackendTable
 from gr_ros2.config import DEFAULT_MIDDLEWARE
 from gr_ros2.doctor.finding import Finding
 from gr_ros2.doctor.programs import output_of
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.errors import BackendMissingError, PhyError
 from gr_ros2.grc_python import finds_us, grc_program
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.phy.kernels.library import loaded
+from gr_ros2.phy.preferences import check_preferences
 from gr_ros2.radio import FRONT_ENDS
 
 OLDEST, NEWEST = (3, 10), (3, 14)
@@ -54,6 +55,11 @@ def gnu_radio() -> Finding:
         remedy = f"make the environment from the system's Python: {_SYSTEM}" if there else "sudo apt install gnuradio"
         return Finding("GNU Radio", "failed", f"cannot be imported ({last})", remedy)
     if version.startswith(GNU_RADIO):
+        try:
+            check_preferences()
+        except PhyError as error:
+            what, _, remedy = str(error).partition("; ")
+            return Finding("GNU Radio", "failed", f"{version}; {what}", remedy)
         return Finding("GNU Radio", "ok", version)
     return Finding("GNU Radio", "failed", f"{version}; this needs {GNU_RADIO}x", "sudo apt install gnuradio")
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from gnuradio import fec, gr
 from numpy.typing import NDArray
 
 from gr_ros2.errors import BackendMissingError
@@ -50,6 +49,13 @@ _POLAR_DESIGN_DB = 1.0
 _GOLDEN = 0.618
 
 
+def _fec() -> Any:
+    """GNU Radio's module. It is imported when a code is made, because the compiled kernels need it for no more."""
+    from gnuradio import fec
+
+    return fec
+
+
 class Decoders(Protocol):
     """Decoders of the codes."""
 
@@ -75,7 +81,7 @@ class GnuRadioDecoders:
     def convolutional(self, bits: int) -> Decoder:
         """See :class:`Decoders`."""
         arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
-        return partial(_work, fec.cc_decoder.make(*arguments, -1, fec.CC_TERMINATED, False), size=bits)
+        return partial(_work, _fec().cc_decoder.make(*arguments, -1, _fec().CC_TERMINATED, False), size=bits)
 
     def ldpc(self, path: Path, room: int) -> Decoder:
         """See :class:`Decoders`."""
@@ -84,7 +90,7 @@ class GnuRadioDecoders:
     def polar(self, size: int, frozen: list[int]) -> Decoder:
         """See :class:`Decoders`."""
         room = size - len(frozen)
-        return partial(_work, fec.polar_decoder_sc.make(size, room, frozen, [0] * len(frozen)), size=room)
+        return partial(_work, _fec().polar_decoder_sc.make(size, room, frozen, [0] * len(frozen)), size=room)
 
 
 GNU_RADIO = GnuRadioDecoders()
@@ -151,7 +157,7 @@ class Convolutional(Code):
         super().__init__(bits)
         self.coded_bits = self.coded(bits)
         arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
-        self._encoder = fec.cc_encoder.make(*arguments, fec.CC_TERMINATED, False)
+        self._encoder = _fec().cc_encoder.make(*arguments, _fec().CC_TERMINATED, False)
         self._decode = decoders.convolutional(bits)
 
     @staticmethod
@@ -201,11 +207,13 @@ class Matrix:
     """
 
     def __init__(self, decoders: Decoders, room: int, size: int, name: str) -> None:
+        from gnuradio import gr
+
         path = Path(gr.prefix()) / "share" / "gnuradio" / "fec" / "ldpc" / f"{name}.alist"
         if not path.is_file():
             raise BackendMissingError(f"fec 'ldpc' needs {path}, which comes with GNU Radio (apt install gnuradio)")
         self.room, self.size, self.checks = room, size, size - room
-        self.encoder = fec.ldpc_encoder.make(str(path))
+        self.encoder = _fec().ldpc_encoder.make(str(path))
         self.decode = decoders.ldpc(path, room)
 
 
@@ -259,9 +267,9 @@ def _ldpc_decoder(path: str) -> Any:
     """A decoder that takes log-likelihood ratios. GNU Radio's decoder does so from 3.10.8 on; earlier ones take the
     ratios for a sigma of √½."""
     try:
-        return fec.ldpc_decoder.make(path, 0.5**0.5, LDPC_ROUNDS)
+        return _fec().ldpc_decoder.make(path, 0.5**0.5, LDPC_ROUNDS)
     except TypeError:
-        return fec.ldpc_decoder.make(path, LDPC_ROUNDS)
+        return _fec().ldpc_decoder.make(path, LDPC_ROUNDS)
 
 
 class Polar(Blocks):
@@ -272,7 +280,7 @@ class Polar(Blocks):
         self.coded_bits = self.coded(bits)
         self._size = size = self.coded_bits // self.count
         frozen = np.sort(np.argsort(capacities(size, _POLAR_DESIGN_DB), kind="stable")[: size - self.each]).tolist()
-        self._encoder = fec.polar_encoder.make(size, self.each, frozen, [0] * len(frozen), False)
+        self._encoder = _fec().polar_encoder.make(size, self.each, frozen, [0] * len(frozen), False)
         self._decode = decoders.polar(size, frozen)
 
     @classmethod

@@ -15,6 +15,7 @@ from gnuradio import gr
 
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import SymbolSource
+from gr_ros2.phy.preferences import check_preferences
 from gr_ros2.phy.threads import start_flowgraph
 
 _Self = TypeVar("_Self", bound="Flowgraph")
@@ -57,9 +58,11 @@ class Flowgraph(_Holds, gr.top_block):  # type: ignore[misc]
 
     :param name: name in GNU Radio's log
     :param called: name in errors
+    :raises PhyError: when GNU Radio cannot write its preferences
     """
 
     def __init__(self, name: str, called: str) -> None:
+        check_preferences()
         super().__init__(name, catch_exceptions=True)
         self._called = called
         self._running = False

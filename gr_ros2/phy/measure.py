@@ -21,8 +21,9 @@ from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import PDUS, pdu_of
-from gr_ros2.phy.threads import run_flowgraph, start_flowgraph, wait_for_end
+from gr_ros2.phy.threads import run_flowgraph
 
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
@@ -70,13 +71,13 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
     :param packets: of lengths that the PHY allows
     :raises PhyError: for a PHY without samples, or when the samples do not come
     """
-    top, transmitter, sink = gr.top_block(), phy.transmitter(), blocks.vector_sink_c()
+    top, transmitter, sink = Flowgraph("gr_ros2_measure", f"phy {phy.name}"), phy.transmitter(), blocks.vector_sink_c()
     top.connect(transmitter, sink)
     outlet = _PacketPort()
     top.msg_connect(outlet, "pdus", transmitter, "pdus")
     wanted = sum(phy.airtime_samples(len(packet)) for packet in packets)
     try:
-        start_flowgraph(top.start)
+        top.start()
         for packet in packets:
             outlet.message_port_pub(PDUS, pdu_of(packet))
         came, deadline = 0, time.monotonic() + _PATIENCE_S
@@ -88,14 +89,13 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
             time.sleep(_POLL_S)
     finally:
         top.stop()
-        wait_for_end(top)
         transmitter.release()
     return SampleRecording(list(packets), np.array(sink.data(), np.complex64))
 
 
 def deliver(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> list[bytes]:
     """The packets that a receiver finds in a recording after a channel (``packet_loss`` is not applied)."""
-    top, receiver, log = gr.top_block(), phy.receiver(), blocks.message_debug()
+    top, receiver, log = Flowgraph("gr_ros2_measure", f"phy {phy.name}"), phy.receiver(), blocks.message_debug()
     samples = np.concatenate((np.zeros(_TAIL, np.complex64), recording.samples, np.zeros(_TAIL, np.complex64)))
     top.connect(blocks.vector_source_c(samples), Channel(channel, phy), receiver)
     top.msg_connect(receiver, "pdus", log, "store")

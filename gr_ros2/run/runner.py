@@ -28,7 +28,6 @@ from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
-from gr_ros2.run.direction import Direction, ReportDirection, live_ends, open_graph
 from gr_ros2.run.ends import halves_of_ends
 from gr_ros2.run.load import make_phys, recording
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
@@ -167,6 +166,9 @@ def run_repetitions(
 
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
+        # Only a run in real time needs GNU Radio.
+        from gr_ros2.run.direction import Direction, ReportDirection, live_ends
+
         self.scenario = scenario
         self.registry = scenario.load_registry()
         ways = scenario.directions()
@@ -232,6 +234,8 @@ class _Run:
 
     def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
         """The graph of every simulated robot: that of its source, or else the graph at the other end of the link."""
+        from gr_ros2.run.direction import open_graph
+
         ids = range(1, self.scenario.sim.robots + 1)
         robots = dict.fromkeys(ids, self.directions[0].output)
         for way in self.directions:
@@ -241,6 +245,8 @@ class _Run:
         return robots
 
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
+        from gr_ros2.run.direction import open_graph
+
         graphs = {
             stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
             for way in self.directions

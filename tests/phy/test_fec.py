@@ -12,7 +12,7 @@ import numpy as np
 
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import BackendMissingError
-from gr_ros2.phy import PHY, fec
+from gr_ros2.phy import PHY
 from gr_ros2.phy.fec import Codes
 from gr_ros2.phy.measure import deliver, pdr, record
 from gr_ros2.phy.theory import coded_success, half_point
@@ -101,6 +101,6 @@ def test_the_bound_is_that_of_the_literature() -> None:
 
 
 def test_missing_matrices_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fec.gr, "prefix", lambda: "/nowhere")
+    monkeypatch.setattr("gnuradio.gr.prefix", lambda: "/nowhere")
     with pytest.raises(BackendMissingError, match=r"/nowhere/share/gnuradio/fec/ldpc"):
         Codes("ldpc").of(544)
