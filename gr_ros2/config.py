@@ -174,7 +174,8 @@ class TopicOptions(Queued):
     :param qos: class of its packets, the two QoS bits of the header
     :param reliability: auto adapts the subscription to the publishers found
     :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
-    :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``
+    :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``; of a
+        transient-local topic also how many messages late robots and late subscribers get, auto 1
     :param publish_as: topic name at the sink, ``{src_id}`` allowed; auto takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the

@@ -465,7 +465,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _advertise(self, key: tuple[int, int], output: _Output) -> Publisher:
         topic = output.topic
-        depth = self.config.publisher_depth if topic.options.depth == AUTO else topic.options.depth
+        depth = topic.options.depth
+        if depth == AUTO:
+            depth = 1 if topic.latched else self.config.publisher_depth
         asked = topic.options.reliability
         qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
         publisher = output.publisher = self.middleware.advertise(self._name(key), topic.type_name, qos)

@@ -32,11 +32,19 @@ _NODES_ON_LOCALHOST = f'<Peer Address="127.0.0.1" {_NEVER_FORGET}/>'
 """A node of this machine on LOCALHOST does not receive multicast on another interface, and Cyclone DDS 11 ignores its
 packets to 127.0.0.1 there. So it is asked."""
 
+_COMPATIBILITY = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+"""1.15 is Fast DDS. Its nodes exchange type objects over endpoints that every participant shares. Cyclone DDS 11 cannot
+read these objects, asks for them and answers with what it has; then other nodes of Fast DDS, which get that answer too,
+do not match any more (``invalid type object``, ``Inconsistent TypeObject``). Opaque topics need no type information."""
+
 
 def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
-    """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence; '' = the library's default."""
-    if options.range == "SYSTEM_DEFAULT":
-        return ""
+    """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence."""
+    content = _COMPATIBILITY + ("" if options.range == "SYSTEM_DEFAULT" else _discovery(options))
+    return f'<CycloneDDS><Domain Id="any">{content}</Domain></CycloneDDS>,{environment.get("CYCLONEDDS_URI", "")}'
+
+
+def _discovery(options: DiscoveryOptions) -> str:
     peers = "".join(f"<Peer Address={quoteattr(peer)} {_NEVER_FORGET}/>" for peer in options.peers)
     interval = _ASK_AGAIN if peers else ""
     if options.range == "OFF":
@@ -54,8 +62,7 @@ def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os
         discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # sets the ports at which peers look for us
         interval, peers = _ASK_AGAIN, f"{_NODES_ON_LOCALHOST}{peers}"
     discovery += f"{interval}<Peers>{peers}</Peers>"
-    domain = f'<Domain Id="any"><General>{general}</General><Discovery>{discovery}</Discovery></Domain>'
-    return f"<CycloneDDS>{domain}</CycloneDDS>,{environment.get('CYCLONEDDS_URI', '')}"
+    return f"<General>{general}</General><Discovery>{discovery}</Discovery>"
 
 
 @dataclass
@@ -102,16 +109,14 @@ class DomainPool:
             self._close_unused(domain_id)
 
     def _open(self, domain_id: int, options: DiscoveryOptions) -> _Domain:
-        xml = configuration(options)
         others = cdr_dds.participants_in(domain_id)
         if others and options.range in ("LOCALHOST", "OFF"):
             raise ConfigError(
                 f"domain {domain_id}: other code of this process has it open; "
                 f"{options} needs it opened here first, or another domain"
             )
-        if others or not xml:
-            return _Domain(options, None)  # open already, or opened by the first participant
-        return _Domain(options, cdr_dds.create_domain(domain_id, xml))
+        entity = None if others else cdr_dds.create_domain(domain_id, configuration(options))
+        return _Domain(options, entity)
 
     def _close_unused(self, domain_id: int) -> None:
         domain = self._domains[domain_id]

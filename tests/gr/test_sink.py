@@ -107,15 +107,17 @@ def test_each_sender_has_its_topics(rig: Rig) -> None:
     wait_for(lambda: set(sink.stats()["topics"]) == {"/from_7/x/cmd_vel", "/from_8/x/odom"})
 
 
-def test_a_latched_topic_reaches_a_late_joiner(rig: Rig) -> None:
+def test_the_newest_message_of_a_latched_topic_reaches_a_late_joiner(rig: Rig) -> None:
     sink = rig.make()
     rig.start()
-    for data in packets((1, b"\0\1\0\0" + bytes(200))):
+    maps = [b"\0\1\0\0" + bytes([number]) * 200 for number in range(3)]
+    for data in packets(*((1, payload) for payload in maps)):
         rig.probe.post(data)
-    wait_for(lambda: "/rx_robot_1/map" in sink.stats()["topics"])
+    wait_for(lambda: sink.stats()["topics"].get("/rx_robot_1/map", {}).get("delivered") == len(maps))
     late: list[bytes] = []
     rig.listener.subscribe("/rx_robot_1/map", "nav_msgs/OccupancyGrid", Qos(), late.append)
     wait_for(lambda: late)
+    assert late == maps[-1:]
 
 
 def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:

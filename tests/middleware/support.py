@@ -32,7 +32,7 @@ def same(received: bytes, sent: bytes, padding: int) -> bool:
 class Peer:
     """A publisher or subscriber in another process: ``ready``, ``matched N``, ``data HEX`` out, hex lines in.
 
-    Ours also says ``counters JSON``, and a server ``asked`` for each request.
+    Ours also says ``counters JSON``, a server ``asked`` for each request, and a node ``heard TOPIC``.
     """
 
     def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
@@ -41,6 +41,7 @@ class Peer:
         self.counters: dict[str, int] = {}
         self.ready = False
         self.asked = 0
+        self.heard: set[str] = set()
         self._process = subprocess.Popen(
             list(command),
             stdin=subprocess.PIPE,
@@ -66,6 +67,8 @@ class Peer:
                 self.received.append(bytes.fromhex(rest))
             elif word == "asked":
                 self.asked += 1
+            elif word == "heard":
+                self.heard.add(rest)
 
     def publish(self, payloads: Iterable[bytes]) -> None:
         assert self._process.stdin is not None

@@ -22,7 +22,7 @@ from gr_ros2.middleware import Qos, cdr_dds, ros_graph
 from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.middleware.dds_domains import POOL
+from gr_ros2.middleware.dds_domains import POOL, configuration
 from gr_ros2.race.namespaces import Namespace, inside
 from tests.domains import domain
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, Peer, message, same
@@ -402,6 +402,14 @@ with DdsMiddleware(domain_id=7):
 """
 SPDP, ELSEWHERE = "0100FFEF", "0200FFEF"
 RANGE, PEERS, URI = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"
+
+
+@pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"])
+def test_type_objects_of_fast_dds_are_left_alone(reach: str) -> None:
+    options = ros_graph.discovery_options("auto", {RANGE: reach})
+    assert "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>" in configuration(options, {})
+
+
 OTHER_DEVICE = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='eth9'/></Interfaces></General></Domain>"
     "</CycloneDDS>"

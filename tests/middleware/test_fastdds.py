@@ -247,3 +247,25 @@ def test_clients_and_servers_of_fast_dds_are_refused_by_name(
     wait_for(refused, "both to be refused")
     assert not taken
     assert not there
+
+
+def test_nodes_of_fast_dds_find_each_other_beside_a_link(
+    middleware: DdsMiddleware, peer: Callable[..., Peer], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each later listener hears what the native publishers and ours send, while the earlier ones run."""
+    taken: list[bytes] = []
+    ours = [middleware.advertise(f"/rx_robot_2/{name}", CUSTOM, RELIABLE) for name in "ab"]
+    middleware.subscribe("/native", CUSTOM, ADAPT, taken.append)
+    native = peer("pub", "/native", RELIABLE)
+    for number in range(3):
+        listeners = [peer("sub", topic, RELIABLE) for topic in ("/rx_robot_2/a", "/rx_robot_2/b", "/native")]
+        sent = message(number)
+
+        def all_heard(sent: bytes = sent, listeners: list[Peer] = listeners) -> bool:
+            for publisher in ours:
+                publisher.publish(sent)
+            native.publish([sent])
+            return all(sent in listener.received for listener in listeners) and sent in taken
+
+        wait_for(all_heard, "every listener")
+    assert "invalid type object" not in capfd.readouterr().err

@@ -130,7 +130,7 @@ class Endpoint:
         self._observer = observer
         self._decoder_for = decoder_for
         self._rows = rows
-        self._marks: dict[int, dict[int, int]] = {}
+        self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
         self._sealed, self._encrypts = self.keys.sealed, self.keys.encrypts
         addressed = settings.dst_id != BROADCAST

@@ -94,7 +94,7 @@ class Inbox:
         *,
         rows: tuple[TableRow, ...],
         decoder_for: Callable[[tuple[TableRow, ...]], MessageCodec] | None,
-        marks: dict[int, int],
+        marks: dict[int, tuple[int, ...]],
         stats: ReceiverStats,
         control: Callable[[Control], None],
     ) -> None:
@@ -140,7 +140,8 @@ class Inbox:
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
         self.marks = marks
-        """CRC-32 of the newest message of each latched topic, in the form in which it was transmitted."""
+        """CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as many as
+        its depth."""
         self._events: Events = []
         self._now = 0.0
         self.unreported = 0
@@ -243,7 +244,7 @@ class Inbox:
     def lacks(self, mark: tuple[int, int], now: float) -> bool:
         """Whether a latched message is not here and is not arriving either."""
         topic_id, value = mark
-        return self.marks.get(topic_id) != value and not self._reassembly.growing(topic_id, now - 1.0)
+        return value not in self.marks.get(topic_id, ()) and not self._reassembly.growing(topic_id, now - 1.0)
 
     def report_due(self, now: float) -> float:
         """When the next report is due, as long as there are packets since the last one."""
@@ -448,11 +449,11 @@ class Inbox:
             self._lose(partial, _passed_over(row))
         payload = ready.payload
         if row.latched:
-            mark = crc32(payload)
-            if self.marks.get(topic_id) == mark:
+            mark, marks = crc32(payload), self.marks.get(topic_id, ())
+            if mark in marks:
                 self._stats.repeats += 1
                 return
-            self.marks[topic_id] = mark
+            self.marks[topic_id] = (*marks, mark)[-max(row.depth, 1) :]
         if ready.coded:
             try:
                 if self._codec is None:

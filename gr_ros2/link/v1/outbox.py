@@ -118,6 +118,16 @@ class _Line:
     lives: deque[tuple[Life, int, float]] = field(default_factory=deque)
     packets: int = 0
 
+    @property
+    def kept_depth(self) -> int:
+        """How many messages late robots and late subscribers get.
+
+        One, unless the topic's options say otherwise: where the graph does not tell the depth of a map's publisher, an
+        earlier map would come out after the newest one.
+        """
+        depth = self.topic.options.depth
+        return 1 if depth == AUTO else depth
+
 
 @dataclass(slots=True)
 class Filling:
@@ -224,7 +234,7 @@ class Outbox:
             self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         if line.kept:
-            kept = self._kept.setdefault(topic_id, deque(maxlen=max(line.depth, 1)))
+            kept = self._kept.setdefault(topic_id, deque(maxlen=max(line.kept_depth, 1)))
             kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
         self._admit(
             line,
@@ -364,7 +374,7 @@ class Outbox:
             topic, options = line.topic, line.topic.options
             ordered = line.ordered if options.reliability == AUTO else options.reliability == "reliable"
             ordered = ordered and line.queue.policy != "latest"
-            depth = min(line.depth if options.depth == AUTO else options.depth, 255)
+            depth = min(line.kept_depth if line.kept else line.depth if options.depth == AUTO else options.depth, 255)
             codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
             rows.append(
                 TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec)

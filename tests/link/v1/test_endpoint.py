@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from gr_ros2.config import TopicOptions
@@ -188,25 +190,49 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips(delay: 
     assert two.delivered() == [text(1, 700)]
 
 
-def test_several_messages_kept_of_one_topic_are_sent_to_a_late_robot_once() -> None:
-    """As a publisher of depth 10 has them, whose depth its graph did not tell."""
-    topics = registry(odom=TopicOptions(), map=LATCHED)
-    one, two, late = Robot(1, topics), Robot(2), Robot(3)
+@pytest.mark.parametrize("hears", [True, False])
+def test_several_messages_are_kept_of_a_topic_whose_depth_is_set(hears: bool) -> None:
+    topics = registry(odom=TopicOptions(), map=replace(LATCHED, depth=10))
+    settings = {"hears": hears, "repeat_s": 0.0 if hears else 3.0}
+    one, two, late = Robot(1, topics, **settings), Robot(2, hears=hears), Robot(3, hears=hears)
     air = Air(one, two)
-    one.end.follow(1, reliable=True, latched=True, depth=10)
     sent = [text(number) for number in range(5)]
     for payload in sent:
         one.end.submit(1, payload, air.now)
         air.run(1.0)
     air.run(20.0)
     assert two.delivered() == sent
-    assert one.end.sent.repeats == 1  # the table
     air.robots.append(late)
     air.run(20.0)
     assert late.delivered() == sent
     repeats = one.end.sent.repeats
     air.run(60.0)
-    assert one.end.sent.repeats == repeats and late.delivered() == sent
+    assert (one.end.sent.repeats == repeats) == hears
+    assert two.delivered() == late.delivered() == sent
+
+
+@pytest.mark.parametrize("hears", [True, False])
+def test_an_earlier_map_never_comes_after_a_later_one(hears: bool) -> None:
+    """A mapper whose depth its graph does not tell (Fast DDS) starts three times; then the robots' links do."""
+    topics = registry(odom=TopicOptions(), map=LATCHED)
+    settings = {"hears": hears, "repeat_s": 0.0 if hears else 3.0}
+    one, two = Robot(1, topics, **settings), Robot(2, hears=hears)
+    air = Air(one, two, loss=0.2)
+    for number in range(3):
+        one.end.follow(1, reliable=True, latched=True, depth=10)
+        one.end.submit(1, text(number, 300), air.now)
+        air.run(20.0)
+    assert two.delivered() == [text(number, 300) for number in range(3)]
+    rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
+    assert [row.depth for row in rows if row.latched] == [1]
+    before = len(two.delivered())
+    two.start()
+    air.run(20.0)
+    assert two.delivered()[before:] == [text(2, 300)]
+    one.start()
+    one.end.submit(1, text(2, 300), air.now)  # the mapper is still there
+    air.run(20.0)
+    assert two.delivered()[before:] == [text(2, 300)]
 
 
 def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_keep() -> None:
