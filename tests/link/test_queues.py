@@ -63,6 +63,8 @@ def test_a_queue_follows_the_depth_of_its_topic() -> None:
         ({}, 10, 0.0, 0.1, ("latest", 0.0)),
         ({}, 0, 0.0, 0.0, ("fifo", 0.0)),
         ({"depth": 5}, 1, 0.0, 0.1, ("fifo", 0.0)),
+        ({"max_rate": 5.0}, 10, 0.0, 0.0, ("latest", 0.0)),
+        ({"max_rate": 5.0, "queue": "fifo"}, 10, 0.0, 0.0, ("fifo", 0.0)),
         ({"queue": "fifo"}, 1, 0.2, 0.1, ("fifo", 0.0)),
         ({"deadline_s": 0.05}, 10, 0.2, 0.0, ("deadline", 0.05)),
         ({"queue": "latest", "deadline_s": 0.05}, 10, 0.2, 0.0, ("latest", 0.05)),
@@ -165,7 +167,7 @@ def test_a_rate_cap_spaces_the_messages_of_a_topic() -> None:
 
 
 def test_a_capped_message_says_when_it_may_go() -> None:
-    source = engine(max_rate=10)
+    source = engine(queue="fifo", max_rate=10)
     source.submit(0, b"a", 0.0)
     source.submit(0, b"b", 0.0)
     assert len(drain(source, 0.0)) == 1

@@ -210,7 +210,7 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now - self._settings.reassembly_timeout_s):
+        for partial in self._reassembly.expired(now, self._settings.reassembly_timeout_s):
             self._lose(partial, LedgerRow.EXPIRED)
         return self._given()
 

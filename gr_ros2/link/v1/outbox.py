@@ -301,6 +301,8 @@ class Outbox:
         :param room: bytes that its body may have
         :return: None if nothing may be sent
         """
+        if self._waits_until(now) > now:
+            return None
         heap = self._heap(now)
         if not heap:
             return None
@@ -323,21 +325,31 @@ class Outbox:
                 heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
         if not picks:
             return None
-        wait = self._settings.flush_timeout_s
-        if wait and room - used >= self._settings.min_fragment + _ENTRY:
-            since = min(min(message.submitted, self._lines[message.topic_id].queue.since) for message, _ in picks)
-            if now < since + wait:
-                return None
         return self._take(picks, number, used, now)
 
     def next_timeout(self, now: float) -> float | None:
         """When ``fill`` may have something; None if nothing waits."""
-        times = [
-            max(opens if (opens := line.queue.opens(now)) < inf else now, self._flush(line.queue, now))
-            for line in self._lines.values()
-            if line.queue
-        ]
-        return min(times) if times else None
+        at = self._waits_until(now)
+        return at if at < inf else None
+
+    def _waits_until(self, now: float) -> float:
+        """Time in s until which nothing leaves: no topic may send, or what may leave fills no packet and waits for more
+        (``flush_timeout_s``); infinite if nothing waits."""
+        wait = self._settings.flush_timeout_s
+        until, free = inf, self._room - self._settings.min_fragment - _ENTRY
+        for line in self._lines.values():
+            queue = line.queue
+            if not queue:
+                continue
+            opens = queue.opens(now)
+            if opens < inf:
+                until = min(until, opens)
+            elif not wait:
+                return now
+            else:
+                free -= sum(message.remaining + _ENTRY for message in queue.open(now))
+                until = min(until, max(now, min(queue[0].submitted, queue.since) + wait))
+        return until if free >= 0 else now
 
     @property
     def urgent(self) -> bool:
@@ -384,9 +396,6 @@ class Outbox:
 
     def _find_deadlines(self) -> None:
         self.deadlines = [line.queue for line in self._lines.values() if line.queue.deadline_s]
-
-    def _flush(self, queue: TopicQueue, now: float) -> float:
-        return queue.since + self._settings.flush_timeout_s if self._settings.flush_timeout_s else now
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
