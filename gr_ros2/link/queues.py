@@ -133,8 +133,9 @@ def queue_for(
     publishers' QoS.
 
     A configured ``queue`` is used as it is. A history of one message (which the registry may set too) or a promise of
-    one message per period means that only the newest message matters: ``latest``. A lifespan says when a message
-    becomes useless.
+    one message per period means that only the newest message matters: ``latest``. So does ``max_rate``: messages that
+    come faster are thinned out, the newest at each turn, and do not queue up. A lifespan says when a message becomes
+    useless.
 
     :param depth: depth of the publishers' history, 0 for unbounded or unknown
     :param lifespan_s: s, 0 without limit
@@ -143,6 +144,6 @@ def queue_for(
     if options.queue != AUTO:
         return options.queue, 0.0 if options.deadline_s == AUTO else options.deadline_s
     deadline_s = lifespan_s if options.deadline_s == AUTO else options.deadline_s
-    if options.depth == 1 or (options.depth == AUTO and (depth == 1 or period_s)):
+    if options.max_rate or options.depth == 1 or (options.depth == AUTO and (depth == 1 or period_s)):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

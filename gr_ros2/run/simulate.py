@@ -20,7 +20,7 @@ from functools import lru_cache
 from math import inf
 from typing import Any, NamedTuple
 
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.errors import BagError, ConfigError, RunError
 from gr_ros2.gr.ends import Start, make_endpoint
 from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
@@ -44,6 +44,8 @@ from gr_ros2.sim.sim_settings import SimSettings
 _LONGEST_GAP_S = 30 * 86400.0
 """s between two consecutive messages of a recording. A longer gap means that a stamp was never set. The link would be
 simulated for all of the gap: decades where the first stamp is 0."""
+_IN_VAIN = 1000
+"""Steps in a row without an event at one time after which a simulation is said to stand still."""
 _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
@@ -434,12 +436,35 @@ class EventLoop:
     def run(self) -> Iterator[TimedEvent]:
         """Everything that happens, in the order of time, until nothing is left or the time to drain is over. To be
         called only once."""
+        in_vain = 0
         while not all(way.over for way in self._ways) and (due := min(way.due for way in self._ways)) < inf:
-            self.now = min([due, *self._timers()])
-            yield from self._expire()
-            for way in self._ways:
-                if way.due <= self.now:
-                    yield from self._handled(way.step(self.now))
+            before, self.now = self.now, min([due, *self._timers()])
+            happened = False
+            for timed_event in self._step():
+                happened = True
+                yield timed_event
+            in_vain = 0 if happened or self.now > before else in_vain + 1
+            if in_vain == _IN_VAIN:
+                raise self._stalled()
+
+    def _step(self) -> Iterator[TimedEvent]:
+        yield from self._expire()
+        for way in self._ways:
+            if way.due <= self.now:
+                yield from self._handled(way.step(self.now))
+
+    def _stalled(self) -> RunError:
+        """The error that names the ends whose timers are due without effect."""
+        timers = [
+            f"{name} of robot {end.src_id} is due at {at:.6f} s"
+            for end in {id(end): end for way in self._ways for end in (way.sender, way.receiver)}.values()
+            for name, at in (("departure", end.endpoint.next_departure()), ("timeout", end.endpoint.next_timeout()))
+            if at is not None and at <= self.now
+        ]
+        return RunError(
+            f"the simulation stands still at {self.now:.6f} s: {', '.join(timers) or 'no timer'}, and nothing is done "
+            "about it; this is a defect of gr-ros2, please report it with the scenario"
+        )
 
     def _timers(self) -> Iterator[float]:
         """When the ends that receive their packets immediately have something to do other than to send."""

@@ -171,7 +171,7 @@ def test_a_rate_cap_spaces_the_messages_of_a_topic() -> None:
 
 
 def test_a_capped_message_says_when_it_may_go() -> None:
-    source = robot(max_rate=10)
+    source = robot(queue="fifo", max_rate=10)
     source.end.submit(0, b"a", 0.0)
     source.end.submit(0, b"b", 0.0)
     assert leave(source, 0.0) == [b"a"]

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.errors import ConfigError, RunError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
@@ -220,3 +220,23 @@ def test_an_end_may_answer_what_it_hears() -> None:
     assert [int.from_bytes(answer, "big") for answer in answers] == [51, 300]
     assert times == sorted(times)
     assert times[1] - times[0] == pytest.approx(0.01), "the answer is on the air as soon as the message has landed"
+
+
+class Stuck(EndpointV0):
+    """Says at all times that it has something to do at once, and does nothing."""
+
+    answers = True
+
+    def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002
+        return 0.0
+
+
+def test_a_simulation_that_stands_still_says_which_end_and_which_timer() -> None:
+    settings = scenario("paper-ofdm", "time=packets", duration=2.0)
+    registry = settings.load_registry()
+    (_, receiver) = make_ends([settings], registry)
+    stuck = End(Stuck(registry, settings.ros_source, None), [], 1)
+    way = LinkDirection(settings, (stuck, receiver), lambda *_: 0.0, iter([Offered(0.5, 0, bytes(51))]))
+    way.air = lambda packet, now: [Arrival(packet.data)]  # noqa: ARG005
+    with pytest.raises(RunError, match=r"stands still at 0.0.* s: departure of robot 1 is due at 0\.0"):
+        list(EventLoop([way]).run())

@@ -12,7 +12,7 @@ from gr_ros2.link.ledger_rows import ARRIVED
 from gr_ros2.record.result import Result, TopicResult, read_result, write_result
 from gr_ros2.report.table import ledger_grid, summary_grid
 from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import Scenario, dump, scenario_from
+from gr_ros2.run.scenario import Scenario, dump, load_scenario, scenario_from
 from gr_ros2.settings_file import find_registry
 
 LOSS = 0.2
@@ -158,3 +158,10 @@ def test_channels_take_over_what_is_not_set_but_the_seed() -> None:
 def test_what_does_not_go_together_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         scenario(**settings)
+
+
+def test_a_run_in_which_messages_wait_for_their_turn_comes_to_its_end() -> None:
+    setting = "ros_source.topic_options={odom: {max_rate: 5}}"
+    values = load_scenario("demo", [setting], time="packets", duration_s=1.0)
+    result = run_scenario(values).result
+    assert all(topic.delivered for topic in result.topics if topic.topic in ("odom", "scan"))

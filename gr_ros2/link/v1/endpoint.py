@@ -347,7 +347,7 @@ class Endpoint:
         for neighbour in self.neighbours:
             self._report_all(neighbour.inbox.handle_timeout(now))
         self.neighbours.settle(now)
-        for gone in self.neighbours.silent(now - GIVE_UP_S):
+        for gone in self.neighbours.silent(now, GIVE_UP_S):
             self._forget(gone.src_id)
             self._report_all([Gone(gone.src_id, gone.boot)])
         self.outbox.reported = self.window.reported
@@ -391,8 +391,11 @@ class Endpoint:
         if not self._started:
             self._start(now)
         outbox, talk = self.outbox, self._talk
-        if now >= talk.due and talk.urgent(now, idle=outbox.idle, latency=outbox.urgent, heard=self.window.reported):
-            return self._hello(now)
+        if now >= talk.due:
+            waiting = outbox.next_timeout(now)
+            idle = waiting is None or waiting > now
+            if talk.urgent(now, idle=idle, latency=outbox.urgent, heard=self.window.reported):
+                return self._hello(now)
         if now >= self._repeat_at:
             self._repeat_at = now + self.settings.repeat_s
             if not self.window.reported:

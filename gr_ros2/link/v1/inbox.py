@@ -215,7 +215,7 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now - _INCOMPLETE_S):
+        for partial in self._reassembly.expired(now, _INCOMPLETE_S):
             self._lose(partial, LedgerRow.EXPIRED)
         return self._given()
 

@@ -162,9 +162,11 @@ class Neighbours:
         """Packets of a robot that could not be opened before; they are returned once."""
         return list(self._early.pop(src_id, ()))
 
-    def silent(self, before: float) -> list[Neighbour]:
-        """Robots not heard since a time. Their state is kept until another robot needs the room."""
-        silent = [neighbour for neighbour in self._known.values() if neighbour.heard < before and not neighbour.gone]
+    def silent(self, now: float, after: float) -> list[Neighbour]:
+        """Robots not heard for so many s. Their state is kept until another robot needs the room."""
+        silent = [
+            neighbour for neighbour in self._known.values() if neighbour.heard + after <= now and not neighbour.gone
+        ]
         for neighbour in silent:
             neighbour.gone = True
         return silent

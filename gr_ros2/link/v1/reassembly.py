@@ -102,11 +102,11 @@ class Reassembly:
             ended.append(self._release(next(iter(self._partials.values()))))
         return ended
 
-    def expired(self, before: float) -> list[Partial]:
-        """Give up messages without a new fragment since a time."""
+    def expired(self, now: float, after: float) -> list[Partial]:
+        """Give up messages without a new fragment for so many s."""
         ended = []
         for partial in list(self._partials.values()):
-            if partial.last > before:
+            if partial.last + after > now:
                 break
             ended.append(self._release(partial))
         return ended
