@@ -325,3 +325,12 @@ def messages(bodies: dict[int, bytes], room: int) -> dict[tuple[int, int, int], 
         if last:
             whole[topic, begin, place] = payload
     return whole
+
+
+def delivered(received: list[bytes]) -> list[bytes]:
+    """Of the messages of a topic with kept messages, as they are on the air, those that are not a repeat."""
+    new: list[bytes] = []
+    for message in received:
+        if not new or crc32(message) != crc32(new[-1]):
+            new.append(message)
+    return new

@@ -12,12 +12,15 @@ import pytest
 
 from gr_ros2.errors import WireError
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import coefficient
+from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.table import Row, read_table
-from tests.link.v1.air import KEY, Robot, registry
+from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
 
 VECTORS: dict[str, Any] = json.loads((Path(__file__).parent.parent / "vectors" / "v1.json").read_text())
@@ -39,6 +42,17 @@ def test_packets(case: dict[str, Any]) -> None:
     assert read.get("row") == case.get("row")
 
 
+@named("bodies")
+def test_bodies(case: dict[str, Any]) -> None:
+    body, room = bytes.fromhex(case["hex"]), case["room"]
+    assert second.read_body(body, room) == case["entries"]
+    found = [entry for entry in v1.read_body(body, room) if isinstance(entry, v1.Part)]
+    assert [{**part._asdict(), "payload": part.payload.hex()} for part in found] == case["entries"]
+    if len(body) < room:  # as a repair brings it back
+        assert second.read_body(body.ljust(room, b"\0"), room) == case["entries"]
+        assert [part for part in v1.read_body(body.ljust(room, b"\0"), room) if isinstance(part, v1.Part)] == found
+
+
 @named("refused_bodies")
 def test_bodies_to_refuse(case: dict[str, Any]) -> None:
     body = bytes.fromhex(case["hex"])
@@ -47,6 +61,45 @@ def test_bodies_to_refuse(case: dict[str, Any]) -> None:
     with pytest.raises(second.Refused) as theirs:
         second.read_body(body, case["room"])
     assert ours.value.kind == str(theirs.value) == case["error"]
+
+
+def test_kept_messages() -> None:
+    received, wanted = ([bytes.fromhex(text) for text in VECTORS["kept"][name]] for name in ("received", "delivered"))
+    assert second.delivered(received) == wanted
+    inbox = Inbox(
+        1,
+        1,
+        1,
+        40,
+        Settings(2, packet_len=64),
+        rows=(Row(0, "map", "std_msgs/msg/String", latched=True),),
+        decoder_for=None,
+        marks={},
+        stats=ReceiverStats(),
+        control=lambda _: None,
+    )
+    found = []
+    for number, payload in enumerate(received, 1):
+        part = v1.Part(0, payload)
+        found += inbox.source(number, v1.write_body([part], 40), [part], 0, 0.0)
+    assert [event.payload for event in found if isinstance(event, Delivered)] == wanted
+
+
+def test_a_hello_that_is_not_first_in_the_clear_and_a_message_in_a_control_packet_have_no_effect() -> None:
+    one, two = Robot(1, registry()), Robot(2)
+    boot = VECTORS["packets"][0]["boot"]
+    one.start(boot)
+    Air(one, two).run(1.0)
+    known = two.end.neighbours.get(1)
+    assert known is not None
+    before = (known.boot, known.hello, len(two.delivered()))
+    cases = {case["name"]: bytes.fromhex(case["hex"]) for case in VECTORS["packets"]}
+    two.receive(cases["a message in a control packet, which has no effect there"], 1.1)
+    assert (known.boot, known.hello, len(two.delivered())) == before
+    two.receive(cases["a hello in a source packet, which has no effect there"], 1.1)
+    assert two.end.neighbours.get(1) is known and 6 in known.inbox.decoder
+    assert (known.boot, known.hello) == before[:2]
+    assert two.end.received.rejected.total() == 0
 
 
 def test_coefficients() -> None:

@@ -249,10 +249,10 @@ class Endpoint:
         """
         check_live(changes)
         settings = replace(self.settings, **changes)
-        if (settings.dst_id == BROADCAST) != (self.settings.dst_id == BROADCAST):
+        if settings.dst_id != self.settings.dst_id:
             raise ConfigError(
-                f"dst_id = {settings.dst_id}: a change between one robot and all robots (255) needs a restart of the "
-                "link: packets to one robot have a longer header, and repairs combine packets with equal room"
+                f"dst_id = {settings.dst_id}: another destination needs a restart of the link: repairs combine packets "
+                f"to {self.settings.dst_id}, and nobody else may recover these"
             )
         self.settings = settings
         self.outbox.reconfigure(settings)

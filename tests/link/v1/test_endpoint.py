@@ -513,12 +513,14 @@ def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) 
     assert len(delivered) >= 15
 
 
-def test_the_destination_changes_between_robots_and_not_to_all_of_them() -> None:
+def test_the_destination_does_not_change_while_the_link_runs() -> None:
+    """A repair to robot 2 would combine packets to robot 3, and robot 2 recover and deliver them."""
     one = Robot(1, registry(), dst_id=3).end
-    one.reconfigure(dst_id=2)
-    with pytest.raises(ConfigError, match=r"dst_id = 255: a change between .* needs a restart"):
-        one.reconfigure(dst_id=255)
-    assert one.settings.dst_id == 2
+    for other in (2, 255):
+        with pytest.raises(ConfigError, match=rf"dst_id = {other}: another destination needs a restart"):
+            one.reconfigure(dst_id=other, hop=9)
+    one.reconfigure(dst_id=3, hop=1)
+    assert (one.settings.dst_id, one.settings.hop) == (3, 1)
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.2, 0.4])
