@@ -15,6 +15,7 @@ from hypothesis import settings
 
 from gr_ros2.record.result import Result
 from tests import domains
+from tests.outcomes import pytest_addoption, pytest_configure, pytest_xdist_make_scheduler  # noqa: F401
 from tests.record.results import RESULT
 
 # Helpers that assert say what they saw, as tests do.
