@@ -1,5 +1,10 @@
-"""Package metadata; it stands here and not in pyproject.toml because colcon reads it from here."""
+"""Package metadata; it stands here and not in pyproject.toml because colcon reads it from here.
 
+``GR_ROS2_WHEEL=x86_64`` or ``aarch64`` builds for every Python at once, with a compiler for that architecture: see
+tools/make-wheels.
+"""
+
+import os
 import platform
 import re
 import shutil
@@ -12,11 +17,15 @@ from zipfile import ZipFile
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
+WHEEL_FOR = os.environ.get("GR_ROS2_WHEEL", "")
+
 CYCLONEDDS = "cyclonedds==11.0.1"
 NEWEST_CYCLONEDDS = (3, 13)
 """The last Python that its wheels are for. Their C library, which is all that is used, needs none: for a newer Python
 the build takes it out of the last wheel, and it becomes a part of ours."""
-LIBDDSC = Extension("gr_ros2.middleware.libddsc", sources=[])
+LIBDDSC = Extension("gr_ros2.middleware.libddsc", sources=[], py_limited_api=bool(WHEEL_FOR))
+
+MACHINE = WHEEL_FOR or platform.machine()
 
 KERNELS = "gr_ros2/phy/kernels"
 COMPILE = [
@@ -30,7 +39,7 @@ COMPILE = [
     "-fno-signed-zeros",
     "-fassociative-math",
 ]
-VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if platform.machine() in ("x86_64", "AMD64") else {})
+VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if MACHINE in ("x86_64", "AMD64") else {})
 """Libraries of compiled kernels: for every processor of the architecture (64-bit ARM has NEON), and for newer ones."""
 
 (version,) = re.findall(r'^__version__ = "(.+)"$', Path("gr_ros2/__init__.py").read_text(encoding="utf-8"), re.M)
@@ -47,8 +56,10 @@ def kernels(variant: str, flags: list[str]) -> Extension:
         sources=files(f"{KERNELS}/*.cpp"),
         depends=files(f"{KERNELS}/*.h"),
         extra_compile_args=[*COMPILE, *flags],
+        py_limited_api=bool(WHEEL_FOR),  # the kernels do not use Python, so one file is for every version of it
+        extra_link_args=["-s"] if WHEEL_FOR else [],
         language="c++",
-        optional=True,
+        optional=not WHEEL_FOR,
     )
 
 
@@ -106,9 +117,11 @@ setup(
     },
     ext_modules=[
         *(kernels(variant, flags) for variant, flags in VARIANTS.items()),
-        *([LIBDDSC] if sys.version_info[:2] > NEWEST_CYCLONEDDS else []),
+        # PyPI has no wheel of cyclonedds for Linux on ARM.
+        *([LIBDDSC] if WHEEL_FOR == "x86_64" or (not WHEEL_FOR and sys.version_info[:2] > NEWEST_CYCLONEDDS) else []),
     ],
     cmdclass={"build_ext": BuildLibraries},
+    options={"bdist_wheel": {"py_limited_api": "cp310", "plat_name": f"linux_{WHEEL_FOR}"}} if WHEEL_FOR else {},
     # What a ROS 2 workspace looks for; GRC finds the blocks in share by the hook of colcon.pkg.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gr_ros2"]),
