@@ -20,12 +20,16 @@ from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.wire import Format
 
+_LEAST_PACKETS_S = 1.0
+"""Packets/s that a link carries at least. At the average load of a recording with a message per hour, a packet would
+take the better part of an hour, and the last ones would never arrive."""
 _SAMPLE_S = 2.0
 """Simulated seconds that are generated to find out message sizes. Sizes hardly vary."""
 
 
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
-    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
+    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs (one packet
+    per second at least).
 
     :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when nothing is offered
     """
@@ -33,7 +37,8 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
     rate = 0.0 if chosen == AUTO else chosen
     if not rate and PHY.load(scenario.phy.name).has_samples:
         at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
-        rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
+        offered = max(offered_packets(scenario, registry), _LEAST_PACKETS_S)
+        rate = scenario.phy.headroom * offered * at_1_hz.airtime_samples()
     phy = configured(scenario.phy, scenario.packet_len, rate)
     phy.check_channel(scenario.channel)
     return phy
