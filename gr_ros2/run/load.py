@@ -20,16 +20,12 @@ from gr_ros2.setting import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.wire import Format
 
-_LEAST_PACKETS_S = 1.0
-"""Packets/s that a link carries at least. At the average load of a recording with a message per hour, a packet would
-take the better part of an hour, and the last ones would never arrive."""
 _SAMPLE_S = 2.0
 """Simulated seconds that are generated to find out message sizes. Sizes hardly vary."""
 
 
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
-    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs (one packet
-    per second at least).
+    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
 
     :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when nothing is offered
     """
@@ -37,8 +33,7 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
     rate = 0.0 if chosen == AUTO else chosen
     if not rate and PHY.load(scenario.phy.name).has_samples:
         at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
-        offered = max(offered_packets(scenario, registry), _LEAST_PACKETS_S)
-        rate = scenario.phy.headroom * offered * at_1_hz.airtime_samples()
+        rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
     phy = configured(scenario.phy, scenario.packet_len, rate)
     phy.check_channel(scenario.channel)
     return phy
@@ -59,6 +54,9 @@ def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
 
 def offered_packets(scenario: Scenario, registry: Registry) -> float:
     """Packets/s that the source needs if no packet carries more than one message.
+
+    A recording counts with one message per second at least: at the average load of one with a message per hour, a
+    packet would take the better part of an hour, and the last ones would never arrive.
 
     :raises ConfigError: when the source offers nothing on the registered topics
     """
@@ -118,15 +116,16 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
 
 def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
-    packets, first, last = 0, 0, 0
+    packets, messages, first, last = 0, 0, 0, 0
     for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
         packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
+        messages += 1
         first = first or message.stamp_ns
         last = message.stamp_ns
         if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
             break
     seconds = (last - first) * 1e-9 / (scenario.bag_speed or 1)
-    return packets, seconds or 1.0
+    return packets, min(seconds or 1.0, max(messages, 1))
 
 
 def _packets_alone(size: int, packet_len: int, wire: Format) -> int:

@@ -139,12 +139,13 @@ def test_compression_clears_alignment_gaps_and_nothing_else(tmp_path: Path, *, c
     assert [one.payload for one in read_bag(tmp_path / "out.mcap")] == [one[compression] for one in messages]
 
 
-def test_a_sparse_recording_arrives_at_the_rate_that_is_chosen_for_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [40, 1000])
+def test_a_sparse_recording_arrives_at_the_rate_that_is_chosen_for_it(tmp_path: Path, size: int) -> None:
     """Two messages in a quarter of an hour: at their average rate a packet takes minutes, the last for ever."""
     recorder = BagRecorder(tmp_path / "in", "mcap", {"my_msgs/msg/Blob": CUSTOM}, lambda *_: None)
     channel = recorder.channel("/blob", "my_msgs/msg/Blob", OFFERED)
     for number in range(2):
-        recorder.write(channel, START_NS + number * 900 * 10**9, b"\0\1\0\0" + bytes(36))
+        recorder.write(channel, START_NS + number * 900 * 10**9, b"\0\1\0\0" + (36).to_bytes(4, "little") + bytes(size))
     recorder.close()
     settings = load_scenario("paper-ofdm", ["phy.sample_rate=auto", "drain_s=2"], duration_s=0.0, source="bag:none")
     done = replay(tmp_path / "in", tmp_path / "out.mcap", settings, ("/blob",))
