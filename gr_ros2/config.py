@@ -473,7 +473,8 @@ class PhyConfig(Sampled, Named):
     """Which physical layer, and how fast.
 
     :param name: a name of ``gr_ros2.phy.PHY``
-    :param headroom: capacity over offered load where sample_rate is auto
+    :param headroom: capacity over offered load where sample_rate is auto; a recording counts with one message per
+        second at least
     :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
         numpy = the reference, several times slower
     :param options: settings of that PHY

@@ -1,7 +1,6 @@
 """Describes errors in settings in one line: key, value, what is allowed, and what the key is for.
 
-Invariants: a value that a union refuses gives one complaint, however many members the union has; for an old name or
-value, the complaint gives the new one.
+Invariant: a value that a union refuses gives one complaint, however many members the union has.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
-from gr_ros2.old_names import new_name
 from gr_ros2.setting import AUTO, members, settings_of
 
 _KINDS = {
@@ -26,8 +24,8 @@ _KINDS = {
     "tuple": "a list",
 }
 """The expected kind of value in words, by pydantic's name of the error."""
-_DERIVED_ONCE: tuple[Any, ...] = (None, -1, 0, "", [])
-"""Values that meant ``auto`` in earlier versions, for at least one setting."""
+_LIKE_AUTO: tuple[Any, ...] = (None, -1, 0, "", [])
+"""Values that elsewhere often mean what ``auto`` means here."""
 
 
 def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
@@ -78,8 +76,6 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
         return str(item["msg"]).removeprefix("Value error, ")
     known = () if owner is None else tuple(field.name for field in fields(owner))
     if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        if new := new_name(keys[-1], known):
-            return f"unknown key {key}: write {new}"
         return f"unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
     setting = next((found for found in settings_of(owner) if found.name == keys[-1]), None) if owner else None
     purpose = re.split(r"[.;](?: |$)", setting.meaning.replace("``", ""))[0] if setting else ""  # its first sentence
@@ -87,12 +83,7 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
     if item["type"] in ("missing", "missing_argument"):
         return f"{key} is missing{purpose}"
     value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
-    if (
-        setting is not None
-        and setting.derives
-        and not isinstance(item["input"], bool)
-        and item["input"] in _DERIVED_ONCE
-    ):
+    if setting is not None and setting.derives and not isinstance(item["input"], bool) and item["input"] in _LIKE_AUTO:
         return f"{key}{value}: write {AUTO}{purpose}"
     ranges = [_asked(one, purpose) for one in group if one["type"] != "literal_error"][:1]
     choices = [f"must be {_either(setting.choices)}"] if setting is not None and setting.choices else []

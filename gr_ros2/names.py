@@ -9,6 +9,7 @@ A form has one field, ``{src_id}``, and nothing else in braces.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from gr_ros2.errors import ConfigError
 
@@ -25,9 +26,16 @@ INFRASTRUCTURE = ("/rosout", "/parameter_events")
 OWN_NODES = "/gr_ros2_"
 """Beginning of the names of this package's nodes, which publish what a link says of itself."""
 
+_SHOWN = 10
 _FIELD = "{src_id}"
 _LONGEST_ID = 255
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
+
+
+def first(names: Iterable[str]) -> list[str]:
+    """The first names of many, for a message; then how many more there are."""
+    found = list(names)
+    return found if len(found) <= _SHOWN else [*found[:_SHOWN], f"and {len(found) - _SHOWN} more"]
 
 
 def topic_fault(name: str, longest: int = MAX_TOPIC_LEN) -> str:

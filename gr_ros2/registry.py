@@ -19,7 +19,6 @@ from typing import overload
 from gr_ros2.config import SinkConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError, RegistryError
 from gr_ros2.names import filled, topic_fault
-from gr_ros2.old_names import new_name
 from gr_ros2.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
 from gr_ros2.setting import AUTO
 from gr_ros2.topic_choice import TopicChoice
@@ -341,9 +340,7 @@ def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
     known = [field.name for field in fields(TopicOptions)]
     for column in columns[2:]:
         if column not in known:
-            new = new_name(column, known)
-            remedy = f"write {new}" if new else f"known are {', '.join(known)}"
-            raise RegistryError(f"unknown column {column!r}; {remedy}", path, line)
+            raise RegistryError(f"unknown column {column!r}; known are {', '.join(known)}", path, line)
         if columns.count(column) > 1:
             raise RegistryError(f"column {column!r} stands twice", path, line)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,8 @@ from gr_ros2.config import (
     read_yaml,
 )
 from gr_ros2.errors import ConfigError
+from gr_ros2.radio.config import link_from
+from gr_ros2.run.scenario import scenario_from
 
 CONFIGS = (TopicOptions, SourceConfig, SinkConfig, ChannelConfig, PhyConfig)
 
@@ -246,3 +251,22 @@ def test_a_key_that_stands_twice_is_named_with_its_lines(tmp_path: Path) -> None
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         read_yaml(tmp_path / "nowhere.yaml")
+
+
+SCENARIO = {"name": "one", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}}
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "key"),
+    [
+        (partial(build, SourceConfig), {"robot_id": -1}, "robot_id = -1"),
+        (partial(build, SinkConfig), {"domain_id": -1}, "domain_id = -1"),
+        (partial(build, TopicOptions), {"queue": None}, "queue = None"),
+        (partial(build, TopicOptions), {"publish_as": ""}, "publish_as = ''"),
+        (scenario_from, {**SCENARIO, "phy": {"sample_rate": 0}}, "phy.sample_rate = 0"),
+        (link_from, {**SCENARIO, "phy": {"name": "direct"}, "localhost_only": None}, "localhost_only = None"),
+    ],
+)
+def test_what_looks_like_auto_is_answered_with_auto(make: Callable[[Any], Any], values: Any, key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{re.escape(key)}: write auto.*\Z"):
+        make(values)

@@ -19,7 +19,7 @@ MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py
 
 LAYERS = (
     {"errors"},
-    {"wire", "names", "yaml_bounds", "old_names", "setting", "files", "service_rows"},
+    {"wire", "names", "yaml_bounds", "setting", "files", "service_rows"},
     {"yaml_text", "config_errors", "topic_choice"},
     {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
     {"registry", "settings_file"},

@@ -8,6 +8,7 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
+from gr_ros2.names import first
 from gr_ros2.report.explain import repair_lines
 from gr_ros2.report.table import ledger_table, notes, summary_table
 from gr_ros2.run.replay import replay as replay_bag
@@ -34,8 +35,9 @@ def replay(
 ) -> None:
     """Send the bag IN through a scenario's link and write what arrives as the bag OUT, without ROS and radio.
 
-    IN and OUT are .mcap or .db3 files or bag folders. Payloads and names stay as they are; in OUT a message's time is
-    that of its arrival (log_time), and in MCAP its original time is the publish_time.
+    IN and OUT are .mcap or .db3 files or bag folders. Names and payloads stay as they are. Only where the
+    scenario compresses, alignment gaps, which have no meaning, become zero, and fields named in quantize are rounded.
+    In OUT a message's time is that of its arrival (log_time), and in MCAP its original time is the publish_time.
     """
     scenario = load_scenario(name, overrides, seed=seed, duration_s=duration, source=f"bag:{recording}")
     chosen = [f"/{topic.strip().strip('/')}" for topic in (topics or "").split(",") if topic.strip()]
@@ -43,7 +45,7 @@ def replay(
     with console.status(f"{recording} through {scenario.name}"):
         done = replay_bag(recording, target, scenario, chosen)
     result = done.outcome.result
-    left_out = f"; left out: {', '.join(done.left_out)}" if done.left_out else ""
+    left_out = f"; left out: {', '.join(first(done.left_out))}" if done.left_out else ""
     console.print(f"Carried: {', '.join(done.carried)}{left_out}", soft_wrap=True)
     for line in done.remarks:
         console.print(line, soft_wrap=True, markup=False, highlight=False)

@@ -46,6 +46,10 @@ class Table:
             self.slots += [(symbol, start, share)] * share
 
     def push(self, x: int, symbol: int) -> int:
+        """The number with a symbol on top of it.
+
+        :param symbol: with a share; its index in ``weights``
+        """
         start, share = self.codes[symbol]
         quotient, rest = divmod(x, share)
         return (quotient << SCALE_BITS) + rest + start
@@ -72,6 +76,7 @@ def push_natural(x: int, value: int) -> int:
 
 
 def pop_natural(x: int) -> tuple[int, int]:
+    """(x, value), of what :func:`push_natural` has pushed."""
     x, bits = _LENGTHS.pop(x)
     if bits < 2:
         return x, bits
@@ -87,6 +92,7 @@ def push_rank(x: int, rank: int) -> int:
 
 
 def pop_rank(x: int) -> tuple[int, int]:
+    """(x, rank), of what :func:`push_rank` has pushed."""
     x, bits = _RANKS.pop(x)
     return x >> bits, (x & ((1 << bits) - 1) | 1 << bits) - 1
 
@@ -97,4 +103,5 @@ def to_bytes(x: int) -> bytes:
 
 
 def from_bytes(data: bytes) -> int:
+    """The number of big-endian bytes; zeros before it change nothing."""
     return int.from_bytes(data, "big")

@@ -53,6 +53,7 @@ class FloatClass:
     square: int = 0
 
     def table(self) -> Table:
+        """The model of this class, of EXPONENTS + 2 * 64 symbols."""
         weights = [self.zero, self.constant, self.single, self.short, self.square, 2]
         exponents = [
             max(1, 4096 >> (2 * abs(e - self.centre) // (self.below if e < self.centre else self.above)))

@@ -92,6 +92,7 @@ class Outline:
 
     @property
     def bulk(self) -> list[Slot]:
+        """The long arrays, which go into the second part."""
         return [slot for slot in self.live if slot.kind == BULK]
 
 

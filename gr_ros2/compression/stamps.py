@@ -16,6 +16,10 @@ _SECOND, _MS = 1_000_000_000, 1_000_000
 
 
 def push_stamp(x: int, sec: int, nanosec: int) -> int:
+    """Push a stamp or a duration.
+
+    :param sec, nanosec: 0..2**32 - 1, the bits of the fields whatever their sign
+    """
     if not sec and not nanosec:
         return _STAMPS.push(x, _ZERO_STAMP)
     if nanosec < _SECOND:
@@ -32,6 +36,7 @@ def push_stamp(x: int, sec: int, nanosec: int) -> int:
 
 
 def pop_stamp(x: int) -> tuple[int, int, int]:
+    """(x, sec, nanosec)"""
     x, symbol = _STAMPS.pop(x)
     if symbol == _ZERO_STAMP:
         return x, 0, 0

@@ -14,8 +14,9 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import (
     Connection,
@@ -28,8 +29,9 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.interfaces import Qos as Profile
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, metadata
 from rosbags.rosbag2.reader import DirectoryReader
+from ruamel.yaml import YAML
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware.bag_mcap import McapStorage
@@ -37,6 +39,7 @@ from gr_ros2.middleware.bag_sqlite import SqliteStorage
 from gr_ros2.middleware.base import Qos, TopicInfo, finite
 from gr_ros2.middleware.ros_graph import check_topic
 from gr_ros2.middleware.type_definitions import same_type
+from gr_ros2.names import first
 from gr_ros2.registry import normalize_type
 
 _CDR = "cdr"
@@ -90,8 +93,9 @@ class BagContents:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings for the user of this bag, one line each; often none."""
-        return [*(f"{topic} is left out: {why}" for topic, why in self.left_out.items()), *self.differences]
+        """Warnings for the user of this bag, one line each; often none. Of many of a kind, there are the first."""
+        left_out = first(f"{topic} is left out: {why}" for topic, why in self.left_out.items())
+        return [*left_out, *first(self.differences)]
 
     @property
     def texts(self) -> dict[str, str]:
@@ -121,6 +125,25 @@ def explained(path: Path, doing: str) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BagError(f"bag {path}: cannot be {doing} ({reason})") from error
+
+
+class _QosTexts(YAML):
+    """In place of ruamel's YAML where rosbags parses the QoS of a topic, twice per topic of a bag and in 5 ms each.
+
+    The topics of a bag have few different texts, and each is parsed once.
+    """
+
+    def load(self, stream: Any) -> Any:
+        """What a text contains; rosbags does not change it."""
+        return _loaded(stream)
+
+
+@lru_cache(maxsize=256)
+def _loaded(text: str) -> Any:
+    return YAML(typ="safe").load(text)
+
+
+metadata.YAML = _QosTexts  # type: ignore[attr-defined]
 
 
 class _Folder(DirectoryReader):

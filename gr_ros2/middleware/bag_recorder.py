@@ -101,6 +101,7 @@ class BagRecorder:
 
     @property
     def closed(self) -> bool:
+        """Whether nothing more can be written."""
         return self._closed
 
     def channel(self, topic: str, type_name: str, qos: Qos) -> BagChannel:

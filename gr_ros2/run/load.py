@@ -55,6 +55,9 @@ def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
 def offered_packets(scenario: Scenario, registry: Registry) -> float:
     """Packets/s that the source needs if no packet carries more than one message.
 
+    A recording counts with one message per second at least: at the average load of one with a message per hour, a
+    packet would take the better part of an hour, and the last ones would never arrive.
+
     :raises ConfigError: when the source offers nothing on the registered topics
     """
     packets, seconds = _bag_load(scenario, registry) if scenario.bag_path is not None else _sim_load(scenario, registry)
@@ -113,15 +116,16 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
 
 def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
-    packets, first, last = 0, 0, 0
+    packets, messages, first, last = 0, 0, 0, 0
     for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
         packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
+        messages += 1
         first = first or message.stamp_ns
         last = message.stamp_ns
         if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
             break
     seconds = (last - first) * 1e-9 / (scenario.bag_speed or 1)
-    return packets, seconds or 1.0
+    return packets, min(seconds or 1.0, max(messages, 1))
 
 
 def _packets_alone(size: int, packet_len: int, wire: Format) -> int:

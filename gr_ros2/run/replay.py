@@ -1,8 +1,9 @@
 """Sends a recording through a simulated link and channel, and writes what arrives as a second recording.
 
 Invariants: no ROS, no radio and no waiting; equal recordings and scenarios give equal messages and times; names, types,
-type definitions, the QoS of every publisher and payloads (including header stamps) are those of the original; a topic
-that a link cannot carry is left out and reported; the file appears whole or not at all.
+type definitions, the QoS of every publisher and payloads (including header stamps) are those of the original, in their
+canonical form where they are compressed; a topic that a link cannot carry is left out and reported; the file appears
+whole or not at all.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Literal
 from gr_ros2.config import TopicOptions, replaced
 from gr_ros2.errors import BagError, ConfigError
 from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
+from gr_ros2.names import first
 from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
@@ -98,7 +100,7 @@ def _made_for(
                 f"topics = {name!r}: {source} has it, and it cannot be carried: {contents.left_out[name]}"
             )
         if name not in recorded:
-            raise ConfigError(f"topics = {name!r}: {source} has {', '.join(recorded) or 'no topics'}")
+            raise ConfigError(f"topics = {name!r}: {source} has {', '.join(first(recorded)) or 'no topics'}")
     rows = {name: recorded[name].info.type_name for name in topics or recorded}
     if not rows:
         raise ConfigError("; ".join([f"{source}: has no topics that a link can carry", *contents.remarks]))
@@ -106,7 +108,7 @@ def _made_for(
     if len(rows) > most:
         raise ConfigError(
             f"{source}: has {len(rows)} topics, and a link carries {most}; choose with --topics from "
-            f"{', '.join(recorded)}"
+            f"{', '.join(first(recorded))}"
         )
     names = {name: registry[topic_id].name for name, topic_id in source_names(scenario, registry).items()}
 

@@ -41,33 +41,47 @@ class Entry(Protocol):
 
 
 class Packet(Protocol):
-    """A packet as a value: the fields that tools can read in every version.
-
-    ``seq`` is the packet's number on the wire, ``Format.number_bits`` wide.
-    """
+    """A packet as a value: the fields that tools can read in every version."""
 
     @property
-    def version(self) -> int: ...
+    def version(self) -> int:
+        """Value of the first four bits, 0 or 1."""
+
     @property
-    def src_id(self) -> int: ...
+    def src_id(self) -> int:
+        """Id of the sender, 0..254."""
+
     @property
-    def dst_id(self) -> int: ...
+    def dst_id(self) -> int:
+        """Id of the robot that it is for, BROADCAST = everybody."""
+
     @property
-    def seq(self) -> int: ...
+    def seq(self) -> int:
+        """Number on the wire, ``Format.number_bits`` wide."""
+
     @property
     def numbered(self) -> bool:
         """Whether it has a number of its own; otherwise it has that of the newest packet of its source."""
 
     @property
-    def qos(self) -> int: ...
+    def qos(self) -> int:
+        """QoS class of its messages, a place in QOS_NAMES."""
+
     @property
-    def hop(self) -> int: ...
+    def hop(self) -> int:
+        """Hop count, 0..15 in version 0, 0..255 in version 1."""
+
     @property
-    def compressed(self) -> bool: ...
+    def compressed(self) -> bool:
+        """Whether a message in it is coded."""
+
     @property
-    def encrypted(self) -> bool: ...
+    def encrypted(self) -> bool:
+        """Whether its body is encrypted."""
+
     @property
-    def entries(self) -> Sequence[Entry]: ...
+    def entries(self) -> Sequence[Entry]:
+        """Messages and fragments, in their order."""
 
 
 class Span(NamedTuple):

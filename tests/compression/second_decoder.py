@@ -14,6 +14,7 @@ import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -217,13 +218,12 @@ def by_structure(text: str) -> Node | None:
 
 
 class Set:
-    """Words, constants and what is known about one type."""
+    """Words, constants and what is known about one type ('' = none)."""
 
-    def __init__(self, number: int | None, type_name: str) -> None:
-        data = json.loads((SETS / f"shipped-{number or 1}.json").read_text())
+    def __init__(self, data: Mapping[str, Any], type_name: str) -> None:
         self.words = [word.encode() + b"\0" for word in data["words"]]
         self.constants = [int(bits, 16) for bits in data["constants"]]
-        entry = data["types"].get(type_name, {}) if number else {}
+        entry = data["types"].get(type_name, {})
         self.classes: dict[str, str] = entry.get("classes", {})
         self.templates = [(counts, int(text, 16)) for counts, text in entry.get("templates", [])[:15]]
         self.zstd = base64.b64decode(entry.get("zstd", ""))
@@ -234,7 +234,15 @@ class Set:
             self.type = None
 
 
-shipped = cache(Set)
+@cache
+def shipped(number: int, type_name: str) -> Set:
+    return Set(json.loads((SETS / f"shipped-{number}.json").read_text()), type_name)
+
+
+def own_id(data: Mapping[str, Any]) -> bytes:
+    """The two bytes that name a user's own dictionary."""
+    content = {key: value for key, value in data.items() if key != "name"}
+    return sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).digest()[:2]
 
 
 # zstd
@@ -628,10 +636,17 @@ def crc16(data: bytes) -> int:
     return value
 
 
-def decode(coded: bytes, type_name: str, announced: str = "", max_size: int = 1 << 24) -> bytes:
+def decode(
+    coded: bytes,
+    type_name: str,
+    announced: str = "",
+    max_size: int = 1 << 24,
+    own: Mapping[str, Any] | None = None,
+) -> bytes:
     """The message.
 
     :param announced: what the table of topics says about its coding
+    :param own: the content of a user's own dictionary
     """
     if not coded:
         raise Refused("damaged")
@@ -650,11 +665,14 @@ def decode(coded: bytes, type_name: str, announced: str = "", max_size: int = 1 
         text = announced.partition(" ")[2]
         node: Node | None
         if number == 14:
-            node, known = by_structure(text), shipped(None, "")
+            node, known = by_structure(text), shipped(1, "")
             if node is None or coded[1:3] != crc16(text.encode()).to_bytes(2, "big"):
                 raise Refused("unknown_dictionary")
         elif number in (1, 2):
             known = shipped(number, type_name)
+            node, dictionary = known.type, known.zstd
+        elif number == 15 and own is not None and coded[1:3] == own_id(own):
+            known = Set(own, type_name)
             node, dictionary = known.type, known.zstd
         else:
             raise Refused("unknown_dictionary")

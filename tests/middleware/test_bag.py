@@ -11,10 +11,12 @@ from typing import Literal
 
 import pytest
 from rosbags.highlevel import AnyReader
+from ruamel.yaml import YAML
 
 from gr_ros2.errors import BagError, ConfigError, MiddlewareError
-from gr_ros2.middleware import Qos, TopicInfo, bag_recorder
+from gr_ros2.middleware import Qos, TopicInfo, bag_files, bag_recorder
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
+from gr_ros2.middleware.bag_recorder import BagRecorder
 from tests.middleware.support import BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -269,3 +271,30 @@ def test_one_that_may_lose_messages_never_waits_for_the_disk(tmp_path: Path, mon
     missing = bag.counters["not_recorded:/chat"]
     assert missing >= 6
     assert len(list(read_bag(tmp_path / "out"))) == 10 - missing
+
+
+def test_equal_qos_is_parsed_once_whatever_the_number_of_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = BagRecorder(tmp_path / "in", "mcap", {}, lambda *_: None)
+    for number in range(60):
+        recorder.channel(f"/t{number}", "std_msgs/msg/String", Qos("reliable", "volatile", 1 + number % 2))
+    recorder.close()
+    parsed: list[object] = []
+    load = YAML.load
+
+    def counted(self: YAML, stream: object) -> object:
+        parsed.append(stream)
+        return load(self, stream)
+
+    monkeypatch.setattr(YAML, "load", counted)
+    bag_files._loaded.cache_clear()
+    contents = bag_files.bag_contents(tmp_path / "in")
+    assert [len(topic.profiles) for topic in contents.topics.values()] == [1] * 60
+    assert len(parsed) == 3, "metadata.yaml and two texts"
+
+
+def test_remarks_about_many_topics_are_few() -> None:
+    left_out = {f"/t{number}": "it is serialized as 'ros1'" for number in range(3000)}
+    remarks = bag_files.BagContents(Path("in"), {}, left_out, ()).remarks
+    assert (len(remarks), remarks[-1]) == (11, "and 2990 more")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import struct
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from gr_ros2.middleware.base import Qos
 from gr_ros2.run import loss_table
 from gr_ros2.run.replay import Replayed, replay
 from gr_ros2.run.scenario import Scenario, load_scenario
+from tests.compression.support import Writer
 from tests.e2e.support import check_books
 from tests.recordings import Drive, every_drive
 
@@ -119,6 +121,45 @@ def test_more_topics_than_a_link_carries_have_to_be_chosen(tmp_path: Path) -> No
     with pytest.raises(ConfigError, match=r"has 17 topics, and a link carries 16; choose with --topics"):
         run(source, tmp_path / "out.mcap")
     assert len(run(source, tmp_path / "out.mcap", topics=("/t3", "/t16")).carried) == 2
+
+
+@pytest.mark.parametrize("compression", [False, True])
+def test_compression_clears_alignment_gaps_and_nothing_else(tmp_path: Path, *, compression: bool) -> None:
+    kind = "geometry_msgs/msg/PointStamped"
+    messages = [Writer(random.Random(seed)).message(kind) for seed in range(COUNT)]
+    messages = [one for one in messages if len(one[0]) < 100]
+    assert any(payload != clean for payload, clean in messages)
+    recorder = BagRecorder(tmp_path / "in", "mcap", {}, lambda *_: None)
+    channel = recorder.channel("/point", kind, OFFERED)
+    for number, (payload, _) in enumerate(messages):
+        recorder.write(channel, START_NS + number * 10 * STEP_NS, payload)
+    recorder.close()
+    overrides = [f"{side}.compression={str(compression).lower()}" for side in ("ros_source", "ros_sink")]
+    run(tmp_path / "in", tmp_path / "out.mcap", *overrides)
+    assert [one.payload for one in read_bag(tmp_path / "out.mcap")] == [one[compression] for one in messages]
+
+
+@pytest.mark.parametrize("size", [40, 1000])
+def test_a_sparse_recording_arrives_at_the_rate_that_is_chosen_for_it(tmp_path: Path, size: int) -> None:
+    """Two messages in a quarter of an hour: at their average rate a packet takes minutes, the last for ever."""
+    recorder = BagRecorder(tmp_path / "in", "mcap", {"my_msgs/msg/Blob": CUSTOM}, lambda *_: None)
+    channel = recorder.channel("/blob", "my_msgs/msg/Blob", OFFERED)
+    for number in range(2):
+        recorder.write(channel, START_NS + number * 900 * 10**9, b"\0\1\0\0" + (36).to_bytes(4, "little") + bytes(size))
+    recorder.close()
+    settings = load_scenario("paper-ofdm", ["phy.sample_rate=auto", "drain_s=2"], duration_s=0.0, source="bag:none")
+    done = replay(tmp_path / "in", tmp_path / "out.mcap", settings, ("/blob",))
+    check_books(done.outcome.result)
+    sent, received = list(read_bag(tmp_path / "in")), list(read_bag(tmp_path / "out.mcap"))
+    assert len(received) == 2
+    assert all(after.stamp_ns - before.stamp_ns < 1e9 for before, after in zip(sent, received, strict=True))
+
+
+def test_an_error_about_many_topics_is_short(tmp_path: Path) -> None:
+    source = make_bag(tmp_path / "in", {f"/t{number}": "my_msgs/msg/Blob" for number in range(17)})
+    for topics in (("/nope",), ()):
+        with pytest.raises(ConfigError, match=r"/t0, /t1, /t10, .*, and 7 more$"):
+            run(source, tmp_path / "out.mcap", topics=topics)
 
 
 def test_what_cannot_be_is_said_and_leaves_nothing(tmp_path: Path, blobs: Path) -> None:
