@@ -54,7 +54,7 @@ def _paper(inputs: dict[str, list[str]]) -> Iterator[Row]:
         yield Row(f"{what}: PDR", topic.pdr or 0.0, "", "≥", 0.99, "{:.3f}", _latency(topic))
         yield Row(f"{what}: latency p99", _ms(topic.latency_s.p99), "ms", "≤", 60)
         yield Row(f"{what}: goodput", topic.goodput_Bps or 0.0, "B/s", "≥", 25_000)
-        yield Row(f"{what}: on the air per message", air_bytes(outcome.result) or inf, "B", "≤", 130)
+        yield Row(f"{what}: on the air per message", air_bytes(outcome.result) or inf, "B", "≤", 140)
         yield Row(f"{what}: altered messages", topic.corrupt, "", "=", 0)
 
 
@@ -116,9 +116,10 @@ def _carries_everything() -> Iterator[Row]:
 
 
 def _fitting() -> Iterator[Row]:
-    advice = Planner(_scenario("paper-ofdm-paced", PLAIN_S)).advice()
+    alone = ["ros_source.repair='off'"]
+    advice = Planner(_scenario("paper-ofdm-paced", PLAIN_S, alone)).advice()
     fitting = min(advice, key=lambda one: one.forecast.air_bytes_per_message or inf)
-    outcome = _run("paper-ofdm-paced", PLAIN_S, fitting.setting.split())
+    outcome = _run("paper-ofdm-paced", PLAIN_S, [*alone, *fitting.setting.split()])
     pdr = outcome.result.topics[0].pdr or 0.0
     note = f"{fitting.setting}, as planned; PDR {pdr:.3f}"
     yield Row(

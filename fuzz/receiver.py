@@ -19,7 +19,7 @@ BASE, PER_BYTE = 500, 20
 _STEP = 1 + _BODY_LEN
 _WAITS_S = (0.0, 0.0, 0.001, 0.03, 0.6, 2.0, 70.0, 1e6)
 _REGISTRY = Registry.from_rows({"a": "std_msgs/String", "map": "std_msgs/String", "c": "std_msgs/String"})
-_CONFIG = SinkConfig(packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096, max_bytes=8192, robot_id=9)
+_CONFIG = SinkConfig(version=0, packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096, max_bytes=8192, robot_id=9)
 
 
 def receiver(data: bytes) -> None:

@@ -70,7 +70,7 @@ def lossy(**settings: Any) -> Scenario:
                 "subscriber_depth": 1000,
                 "queue_depth": 0,
             },
-            "ros_sink": {"domain_id": receiving, "compression": True, "publisher_depth": 1000, "hold_s": 60},
+            "ros_sink": {"domain_id": receiving, "publisher_depth": 1000, "hold_s": 60},
             "phy": {"name": "ofdm", "sample_rate": 100000, "options": {"detection_threshold": "stock"}},
             "channel": {"packet_loss": 0.2},
             "duration_s": 2.0,
@@ -140,10 +140,9 @@ def test_further_receivers_publish_apart() -> None:
     names = ["/rx_robot_1/odom", "/receiver_2/rx_robot_1/odom", "/receiver_3/rx_robot_1/odom"]
     for name in names:
         graph.subscribe(name, "nav_msgs/msg/Odometry", Qos(), lambda _payload, name=name: heard.append(name))
-    memory = {"middleware": "memory", "compression": True}
     ends = {
-        "ros_source": {"namespace": "/robot_1", "domain_id": sending, **memory},
-        "ros_sink": {"domain_id": receiving, **memory},
+        "ros_source": {"namespace": "/robot_1", "domain_id": sending, "middleware": "memory", "compression": True},
+        "ros_sink": {"domain_id": receiving, "middleware": "memory"},
     }
     result = run_scenario(lossy(version=0, receivers=[{}, {}], drain_s=1.0, **ends)).result
     topics = [result.topics[0], *(receiver.topics[0] for receiver in result.receivers)]

@@ -283,7 +283,7 @@ def test_merged_transforms_may_not_come_back() -> None:
 
 
 def packets(src_id: int, *messages: tuple[int, bytes]) -> list[bytes]:
-    sender = Sender(REGISTRY, SourceConfig(robot_id=src_id, repeat_s=0), rng=random.Random(1))
+    sender = Sender(REGISTRY, SourceConfig(version=0, robot_id=src_id, repeat_s=0), rng=random.Random(1))
     made = []
     for topic_id, payload in messages:
         sender.submit(topic_id, payload, 0.0)
@@ -297,7 +297,7 @@ def test_two_robots_on_one_graph_of_a_real_dds(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     (domain,) = free_domains(1)
     odometry = encode("nav_msgs/msg/Odometry", message("nav_msgs/msg/Odometry", "odom", 1))
-    sink = RosSink(REGISTRY, domain_id=domain, frame_prefix=PREFIX, merge_tf="/tf")
+    sink = RosSink(REGISTRY, version=0, domain_id=domain, frame_prefix=PREFIX, merge_tf="/tf")
     sink.announce(1, [0])
     try:
         with DdsMiddleware(domain_id=domain) as listener:

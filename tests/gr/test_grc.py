@@ -29,7 +29,6 @@ from gr_ros2.errors import ConfigError, RadioError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ros_link import make_link
 from gr_ros2.grc_path import example, grc_path
-from gr_ros2.link import SCHEDULER
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio import FRONT_ENDS
@@ -112,7 +111,7 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
     assert len(offered) == len(set(offered))
     assert set(offered) == wanted | {"half_duplex", "any_length"}
     values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
-    assert (values["version"], values["compression"], values["repair"]) == ("1", "True", '"auto"')
+    assert (values["version"], values["compression"], values["repair"]) == ("1", '"auto"', '"auto"')
     for name in offered:
         assert f"{name}=${{{name}}}" in loaded["templates"]["make"]
     assert len(loaded["templates"]["callbacks"]) > 5
@@ -216,8 +215,6 @@ def test_options_are_the_tables() -> None:
         assert [ast.literal_eval(option) for option in options["middleware"]] == [
             name for name, row in MIDDLEWARE.own.items() if row.scope != "none"
         ]
-    options = {item["id"]: item.get("options") for item in description("ros2_source")["parameters"]}
-    assert [ast.literal_eval(option) for option in options["scheduler"]] == list(SCHEDULER.own)
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +343,8 @@ def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path:
 def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     copy = tmp_path / "file_radio.grc"
-    copy.write_text(example("file_radio.grc").read_text().replace("'\"dds\"'", "'\"memory\"'"))
+    text = example("file_radio.grc").read_text().replace("'\"dds\"'", "'\"memory\"'")
+    copy.write_text(text.replace("queue_depth: '100'", "queue_depth: '100'\n    repair: '\"off\"'"))
     top = compiled(copy, tmp_path).file_radio()
     sent = [b"\0\1\0\0" + bytes([number]) * 720 for number in range(10)]
     try:
@@ -359,7 +357,7 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
             wait_for(lambda: taken() == len(sent), "every message")
             wait_for(lambda: top.ros2_source_0.idle and top.radio.counts().backlog == 0, "every packet to leave")
             packets = top.ros2_source_0.stats()["packets"]
-            wait_for(lambda: top.radio.counts().transmitted == packets, "every sample")
+            wait_for(lambda: top.radio.counts().transmitted >= packets, "every sample")
     finally:
         top.stop()
         top.wait()
@@ -371,7 +369,7 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
     again.msg_connect(radio, "pdus", sink, "pdus")
     again.start()
     try:
-        wait_for(lambda: sink.handled == packets, "every packet of the recording")
+        wait_for(lambda: sink.handled >= packets, "every packet of the recording")
     finally:
         again.stop()
         again.wait()

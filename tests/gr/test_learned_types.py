@@ -40,14 +40,13 @@ class Link:
         graphs = [stack.enter_context(DdsMiddleware(domain_id=domain, localhost_only=True)) for domain in domains]
         state = str(folder / "state")
         self.source = RosSource(
-            REGISTRY, middleware=graphs[0], version=1, namespace="/robot_1", robot_id=1, compression=True, state=state
+            REGISTRY, middleware=graphs[0], version=1, namespace="/robot_1", robot_id=1, state=state
         )
         self.told: list[Any] = []
         self.sink = RosSink(
             "",
             middleware=graphs[1],
             version=1,
-            compression=True,
             frame_prefix="robot_{src_id}/",
             observer=Hears(self.told.append),
         )

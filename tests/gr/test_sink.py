@@ -63,7 +63,7 @@ class Rig:
         self.sink: RosSink | None = None
 
     def make(self, **settings: Any) -> RosSink:
-        values = {"middleware": "memory", "domain_id": DOMAIN, "packet_len": PACKET_LEN, **settings}
+        values = {"version": 0, "middleware": "memory", "domain_id": DOMAIN, "packet_len": PACKET_LEN, **settings}
         self.sink = RosSink(REGISTRY, **values)
         return self.sink
 
@@ -253,6 +253,7 @@ def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
     with NoMerging(domain_id=DOMAIN) as middleware:
         rig.sink = RosSink(
             rows,
+            version=0,
             middleware=middleware,
             packet_len=PACKET_LEN,
             frame_prefix="r{src_id}/",
@@ -375,15 +376,12 @@ def test_latency_by_simulated_clock(rig: Rig) -> None:
 def test_settings_change_while_running(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     sink = rig.make()
     rig.start()
-    sink.set_reassembly_timeout_s(0.05)
     with caplog.at_level(logging.DEBUG, "gr_ros2.gr.sink"):
         sink.set_debug(True)
         rig.probe.post(packets((0, stamped(5) + bytes(600)))[0])
         wait_for(lambda: sink.stats()["topics"])
         assert "rx v0 qos=default" in caplog.text
     sink.set_debug(False)
-    with pytest.raises(ConfigError, match="reassembly_timeout_s"):
-        sink.set_reassembly_timeout_s(0.0)
 
 
 def test_stopped_started_and_closed_twice(rig: Rig) -> None:

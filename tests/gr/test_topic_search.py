@@ -135,6 +135,6 @@ def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) 
         wait_for(lambda: waiting.look() == "every topic has a publisher: /robot_1/odom", "the line")
 
 
-def test_version_0_needs_a_registry(tmp_path: Path) -> None:
+def test_version_0_needs_a_registry() -> None:
     with pytest.raises(ConfigError, match="registry is missing"):
-        Running(tmp_path, version=0, topics="auto", middleware="memory", domain_id=free_domains(1)[0])
+        RosSource(version=0, robot_id=1, topics="auto", middleware="memory", domain_id=free_domains(1)[0])

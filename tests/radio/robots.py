@@ -40,7 +40,7 @@ def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
             **values.pop("ros_source", {}),
         },
         # A busy machine may take longer than the default between two packets of a message.
-        "ros_sink": {"publisher_depth": 0, "reassembly_timeout_s": 60.0, **graph, **values.pop("ros_sink", {})},
+        "ros_sink": {"publisher_depth": 0, **graph, **values.pop("ros_sink", {})},
     }
     return link_from({**defaults, **values})
 

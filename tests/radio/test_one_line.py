@@ -58,7 +58,7 @@ def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypat
 def test_a_number_and_a_radio_are_enough() -> None:
     settings = link_from(settled(one_line(1, "sim", None, {}), Path()))
     assert (settings.version, settings.registry, settings.ros_source.topics) == (1, "", ("auto",))
-    assert settings.ros_source.compression
+    assert settings.ros_source.compresses
     assert not link_from(settled(one_line(1, "sim", "table4", {}), Path())).ros_source.topics
     with pytest.raises(ConfigError, match="registry is missing, and version 0 needs the same one at every robot"):
         link_from(settled(one_line(1, "sim", None, {}), Path(), ["version=0"]))

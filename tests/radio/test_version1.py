@@ -168,7 +168,7 @@ def test_a_link_speaks_version_1_unless_told_otherwise(tmp_path: Path) -> None:
     path.write_text("ros_source: {robot_id: 1}\nphy: {name: psk, sample_rate: 1e6}\nkey: fleet.key\n")
     config = load_link(path)
     assert config.version == config.ros_source.version == config.ros_sink.version == 1
-    assert config.ros_source.compression
+    assert config.ros_source.compresses
     assert config.ros_source.key == config.key == str(tmp_path / "fleet.key")
     old = load_link(path, ["version=0", "registry=table4"])
-    assert (old.ros_source.version, old.ros_source.compression) == (0, False)
+    assert (old.ros_source.version, old.ros_source.compresses) == (0, False)

@@ -321,7 +321,7 @@ def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decode
     ledger = Ledger()
     config = SourceConfig(robot_id=SRC, packet_len=220, compression=True)
     sender = Sender(registry, config, codec=LinkCodec(registry), observer=lambda event: ledger.sender_event(SRC, event))
-    receiver = Receiver(registry, SinkConfig(packet_len=220, compression=True), codec=decoder(registry))
+    receiver = Receiver(registry, SinkConfig(packet_len=220), codec=decoder(registry))
     delivered: list[bytes] = []
     written = [Writer(random.Random(seed)).message("nav_msgs/msg/Odometry")[0] for seed in range(60)]
     for now, payload in enumerate(written):
@@ -355,7 +355,7 @@ def test_the_engines_over_a_bad_link(
     ledger = Ledger()
     source = SourceConfig(robot_id=SRC, packet_len=64, queue_depth=queue_depth, repeat_s=0.5)
     sender = Sender(registry, source, rng=rng, observer=lambda event: ledger.sender_event(SRC, event))
-    receiver = Receiver(registry, SinkConfig(packet_len=64, reassembly_timeout_s=0.2))
+    receiver = Receiver(registry, SinkConfig(version=0, packet_len=64, reassembly_timeout_s=0.2))
     air: list[bytes] = []
     submitted = [0, 0]
     outcome = [0, 0]

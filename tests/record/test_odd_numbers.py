@@ -65,7 +65,7 @@ def as_run(recording: Path, out: Path, *overrides: str) -> tuple[Result, Path]:
     [
         (replayed, ("time=packets",)),
         (replayed, ("time=samples",)),
-        (replayed, ("time=packets", "ros_source.compression=true", "ros_sink.compression=true")),
+        (replayed, ("time=packets", "ros_source.compression=true")),
         (as_run, ("time=packets",)),
         (as_run, ("time=real",)),
     ],

@@ -52,22 +52,23 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) -> None:
-    given = ["-p", f"config:={config}", "-p", "ros_source.hop:=3", "-p", "diagnostics.period_s:=0.2"]
+    given = ["-p", f"config:={config}", "-p", "ros_source.dst_id:=3", "-p", "diagnostics.period_s:=0.2"]
     process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy(), stderr=subprocess.PIPE, text=True)
     try:
-        names = ["ros_source.hop", "packet_len", "ros_source.flush_timeout_s"]
+        names = ["ros_source.dst_id", "packet_len", "ros_source.repeat_s"]
         values = graph.ask(GetParameters, "get_parameters", GetParameters.Request(names=names)).values
         assert [value.integer_value for value in values[:2]] == [3, 220]
         described = graph.ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
-        hop, packet_len, _ = described.descriptors
-        assert (hop.integer_range[0].from_value, hop.integer_range[0].to_value, hop.read_only) == (0, 15, False)
+        dst_id, packet_len, _ = described.descriptors
+        assert (dst_id.integer_range[0].from_value, dst_id.integer_range[0].to_value) == (0, 255)
+        assert not dst_id.read_only
         assert packet_len.read_only
         assert packet_len.description.startswith("bytes on the wire")
-        assert graph.set("ros_source.hop", 5) == (True, "")
-        assert graph.set("ros_source.flush_timeout_s", 0) == (True, "")
-        assert not graph.set("ros_source.hop", 50)[0]
+        assert graph.set("ros_source.dst_id", 5) == (True, "")
+        assert graph.set("ros_source.repeat_s", 0) == (True, "")
+        assert "less than or equal to 255" in graph.set("ros_source.dst_id", 500)[1]
+        assert not graph.set("ros_source.hop", 5)[0]
         assert not graph.set("packet_len", 64)[0]
-        assert "greater than 0" in graph.set("ros_sink.reassembly_timeout_s", 0.0)[1]
 
         heard: list[Header] = []
         counters: list[dict[str, Any]] = []

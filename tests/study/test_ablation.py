@@ -21,11 +21,11 @@ def named(name: str, *overrides: str) -> list[str]:
 
 
 def test_each_part_that_is_on_has_a_variant() -> None:
-    assert named("six-topics-paced") == ["whole", "no-compression", "no-pull", "no-freshness", "no-latest"]
-    assert named("paper-ofdm-paced") == ["whole", "no-compression", "no-pull", "no-freshness"]
-    version_0 = ("version=0", "reports=null", "ros_source.compression=false", "ros_source.scheduler=paper")
-    depth_1 = "ros_source.topic_options.odom.depth=1"
-    assert named("demo", *version_0, "ros_source.packet_rate=0", depth_1) == ["whole", "no-latest"]
+    assert named("six-topics-paced") == ["whole", "no-compression", "no-pull", "no-repair", "no-latest"]
+    assert named("paper-ofdm-paced") == ["whole", "no-compression", "no-pull", "no-repair"]
+    plain = ("reports=null", "ros_source.compression=false", "ros_source.repair='off'", "ros_source.packet_rate=0")
+    assert named("demo", *plain, "ros_source.topic_options.odom.depth=1") == ["whole", "no-latest"]
+    assert named("demo", "version=0", "reports=null") == ["whole", "no-pull"]
     assert named("demo") == ["whole", "no-compression", "no-pull", "no-repair", "no-reports"]
     with pytest.raises(ConfigError, match="scenario paper-ofdm: nothing to switch off"):
         named("paper-ofdm")
@@ -52,9 +52,9 @@ def test_every_run_differs_in_its_part_alone(tmp_path: Path) -> None:
     differing = [{key for key in whole.keys() | other.keys() if whole.get(key) != other.get(key)} for other in others]
     queues = {f"ros_source.topic_options.{topic}.queue" for topic in ("scan", "odom", "imu", "cmd_vel", "map", "clock")}
     assert differing == [
-        {"ros_source.compression", "ros_sink.compression"},
+        {"ros_source.compression"},
         {"ros_source.packet_rate"},
-        {"ros_source.scheduler"},
+        {"ros_source.repair"},
         queues,
     ]
 
