@@ -174,7 +174,7 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
         phy.prefer_latency()
         single = _latency(lambda: robot.callback(message), lambda: base.counter.published, few)
         begin = time.perf_counter()
-        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)])
+        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)], daemon=True)
         feeder.start()
         _wait(lambda: base.counter.published, few + many)
         rate = many / (time.perf_counter() - begin)

@@ -137,7 +137,7 @@ def blocks_rate(size: int) -> float:
     payloads = [b"\0\1\0\0" + number.to_bytes(4, "little") + bytes(size - 8) for number in range(messages)]
     graph.start()
     begin = time.perf_counter()
-    feeder = threading.Thread(target=lambda: [robot.callback(payload) for payload in payloads])
+    feeder = threading.Thread(target=lambda: [robot.callback(payload) for payload in payloads], daemon=True)
     feeder.start()
     _wait(lambda: base.counter.published, messages)
     elapsed = time.perf_counter() - begin
