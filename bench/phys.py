@@ -35,6 +35,8 @@ from gr_ros2.registry import Registry
 SNR_DB = 20.0
 LEAST = 0.95
 """Share of the bare flowgraph's packets/s that is left with source and sink."""
+SHORT, DENSE = 4, 2
+"""Packets/s on compiled kernels over those with numpy: 64 B, and 1,500 B in 64-QAM."""
 BATCH_SAMPLES = 2_000_000
 REPEATS = 3
 _HEADERS = 16
@@ -123,10 +125,10 @@ def rates() -> list[Row]:
     speed = f"{rate[ours]:,.0f} instead of {rate[plain]:,.0f}; GNU Radio's blocks {rate[stock]:,.0f}"
     times = f"{wait[ours] * 1e3:.2f} instead of {wait[plain] * 1e3:.2f} ms; GNU Radio's blocks {wait[stock] * 1e3:.2f}"
     return [
-        Row("ofdm, 64 B: packets/s over those with numpy", rate[ours] / rate[plain], "", "≥", 4, "{:.1f}", speed),
+        Row("ofdm, 64 B: packets/s over those with numpy", rate[ours] / rate[plain], "", "≥", SHORT, "{:.1f}", speed),
         Row("ofdm, 64 B: latency of one over that with numpy", wait[ours] / wait[plain], "", "≤", 0.5, "{:.2f}", times),
-        Row("ofdm 64qam, 1,500 B: messages", bits * rate[dense[0]], "Mbit/s", "≥", 40, "{:.1f}",
-            f"numpy {bits * rate[dense[1]]:.1f}"),
+        Row("ofdm 64qam, 1,500 B: packets/s over those with numpy", rate[dense[0]] / rate[dense[1]], "", "≥", DENSE,
+            "{:.1f}", f"{bits * rate[dense[0]]:.1f} Mbit/s instead of {bits * rate[dense[1]]:.1f}"),
     ]  # fmt: skip
 
 
@@ -172,7 +174,7 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
         phy.prefer_latency()
         single = _latency(lambda: robot.callback(message), lambda: base.counter.published, few)
         begin = time.perf_counter()
-        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)])
+        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)], daemon=True)
         feeder.start()
         _wait(lambda: base.counter.published, few + many)
         rate = many / (time.perf_counter() - begin)

@@ -24,7 +24,8 @@ from gr_ros2.registry import Registry
 PACKET_LEN, REPEATS = 64, 5
 PACKETS = 45_000
 ODOMETRY_BYTES, SMALL_BYTES = 724, 48
-TARGET = 20_000
+LEAST = 0.3
+"""Packets/s over those of the bare port."""
 PATIENCE_S = 60.0
 
 _IN, _OUT = pmt.intern("in"), pmt.intern("out")
@@ -97,10 +98,12 @@ class _Taker(gr.basic_block):  # type: ignore[misc]
 
 
 def _wait(what: Any, until: int) -> None:
-    deadline = time.perf_counter() + PATIENCE_S
-    while what() < until:
+    came, deadline = what(), time.perf_counter() + PATIENCE_S
+    while (now := what()) < until:
+        if now > came:
+            came, deadline = now, time.perf_counter() + PATIENCE_S
         if time.perf_counter() > deadline:
-            raise SystemExit(f"bench port: {what()} of {until} after {PATIENCE_S:g} s")
+            raise SystemExit(f"bench port: {now} of {until}, and no more for {PATIENCE_S:g} s")
         time.sleep(0.001)
 
 
@@ -134,7 +137,7 @@ def blocks_rate(size: int) -> float:
     payloads = [b"\0\1\0\0" + number.to_bytes(4, "little") + bytes(size - 8) for number in range(messages)]
     graph.start()
     begin = time.perf_counter()
-    feeder = threading.Thread(target=lambda: [robot.callback(payload) for payload in payloads])
+    feeder = threading.Thread(target=lambda: [robot.callback(payload) for payload in payloads], daemon=True)
     feeder.start()
     _wait(lambda: base.counter.published, messages)
     elapsed = time.perf_counter() - begin
@@ -157,8 +160,9 @@ def port() -> list[Row]:
     reference = median(bare)
 
     def row(what: str, rates: list[float]) -> Row:
-        ratio = f"{median(rates) / reference:.2f} of the bare port"
-        return Row(what, median(rates), "packets/s", "≥", TARGET, note=ratio)
+        ratio = median(ours / alone for ours, alone in zip(rates, bare, strict=True))
+        note = f"{median(rates):,.0f} packets/s"
+        return Row(f"{what}: packets/s over the bare port's", ratio, "", "≥", LEAST, "{:.2f}", note)
 
     return [
         Row("bare port, Python to Python, 64 B", reference, "PDUs/s"),

@@ -18,11 +18,13 @@ from tests.gr.probe import Probe
 from tests.waiting import PATIENCE_S, wait_for
 
 RATE = 5e6
+QUICK: dict[str, dict[str, float]] = {"modem": {"bit_rate": 1e6}}
+"""Options of PHYs that are slow by default."""
 
 
 def make(name: str, packet_len: int = 64, sample_rate: float = RATE) -> Phy:
     try:
-        phy: Phy = PHY.load(name)(packet_len, sample_rate)
+        phy: Phy = PHY.load(name)(packet_len, sample_rate, **QUICK.get(name, {}))
     except BackendMissingError as error:
         pytest.skip(str(error))
     return phy
