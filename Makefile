@@ -1,10 +1,11 @@
-# Everything a person needs: make demo, make test, make quick, make bench, make lint, make grc.
+# Everything a person needs: make demo, make test, make quick, make bench, make lint, make grc;
+# for who publishes it: make wheel, make deb, make release (docs/how-to/release.md).
 # Set-up happens by itself: tools/set-up.
 
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test quick bench lint format examples grc setup setup-dev clean
+.PHONY: demo test quick bench lint format examples grc wheel deb release setup setup-dev clean
 
 demo: setup
 	$(BIN)/gr-ros2 demo
@@ -34,6 +35,17 @@ grc: setup
 	tools/install-system window
 	$(BIN)/gr-ros2 grc-path --install
 	gnuradio-companion gr_ros2/examples/ofdm_loopback.grc
+
+wheel: setup
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-release.txt
+	@$(BIN)/python tools/make-wheels
+
+deb:
+	@tools/make-deb
+
+release: setup
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-release.txt
+	@$(BIN)/python tools/release
 
 setup:
 	@tools/set-up run

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
+import shutil
 import subprocess
 import sys
+from functools import partial
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOL = ROOT / "tools" / "try-distributions"
+CONTROL = "Package: keys\nVersion: 1\nArchitecture: all\nMaintainer: Test <test@test.example>\nDescription: keys\n"
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +70,27 @@ def test_a_table_says_what_passed_failed_and_was_not_run(tool: ModuleType, tmp_p
         "| debian-13 | 3.13.5, 3.10.12.0, 2.3.5 | passed, 61 s | not run | "
         "failed (2), 3 s: 2 failed, 7 passed, 1 skipped in 3.21s |"
     ]
+
+
+def test_a_keyring_that_this_machine_lacks_comes_from_the_archive_by_its_checksum(
+    tool: ModuleType, tmp_path: Path
+) -> None:
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("needs dpkg-deb")
+    keyring = Path("/usr/share/keyrings/of-the-test.gpg")
+    tree = tmp_path / "tree"
+    for name, text in ((str(keyring)[1:], "keys"), ("DEBIAN/control", CONTROL)):
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        (tree / name).write_text(text)
+    package = tmp_path / "keyring.deb"
+    subprocess.run(["dpkg-deb", "--build", str(tree), str(package)], check=True, capture_output=True)
+    family = partial(tool.Family, "sid", "main", str(keyring), package.as_uri())
+    good = family(hashlib.sha256(package.read_bytes()).hexdigest())
+    assert Path(tool.keyring_of(good, tmp_path / "kept")).read_text() == "keys"
+    package.unlink()  # it is kept
+    assert Path(tool.keyring_of(good, tmp_path / "kept")).read_text() == "keys"
+    package.write_bytes(b"other bytes")
+    with pytest.raises(SystemExit, match=r"has the SHA-256 .*, not "):
+        tool.keyring_of(good, tmp_path / "other")
+    with pytest.raises(SystemExit, match=r"is missing; apt install of-the-test"):
+        tool.keyring_of(tool.Family("sid", "main", str(keyring)), tmp_path / "third")

@@ -11,6 +11,7 @@ from rich.markup import escape
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.doctor.checks import examine
+from gr_ros2.doctor.self_test import SELF_TEST
 
 _MARKS = {
     "ok": "[green]ok     [/]",
@@ -22,14 +23,15 @@ _MARKS = {
 
 @click.command()
 @click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
-def doctor(as_json: bool) -> int:
+@click.option("--self-test", is_flag=True, help="Instead: every PHY's loopback, the examples; some seconds.")
+def doctor(as_json: bool, self_test: bool) -> int:
     """Look at what is installed, at radios, ROS, clock and limits, and say what mends what is missing.
 
-    Exit status 1 where a link would not run, 0 where it would, warnings or not.
+    Exit status 1 where a link would not run or the self-test failed, else 0, warnings or not.
     """
     findings, heading = [], ""
     console = make_console()
-    for group, finding in examine():
+    for group, finding in examine(SELF_TEST if self_test else None):
         findings.append((group, finding))
         if as_json:
             continue
@@ -45,8 +47,12 @@ def doctor(as_json: bool) -> int:
         rows = [{"group": group, **asdict(finding)} for group, finding in findings]
         click.echo(json.dumps({"ok": not failed, "findings": rows}, indent=2))
     else:
-        console.print(f"\n{_summary(failed, warned)}", soft_wrap=True)
+        console.print(f"\n{_passed(failed) if self_test else _summary(failed, warned)}", soft_wrap=True)
     return FAILED if failed else 0
+
+
+def _passed(failed: list[str]) -> str:
+    return f"The self-test failed: {', '.join(failed)}." if failed else "The self-test passed."
 
 
 def _summary(failed: list[str], warned: list[str]) -> str:

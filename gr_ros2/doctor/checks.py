@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from gr_ros2.doctor import computer, installed, radios, ros
 from gr_ros2.doctor.finding import Check, Finding
@@ -34,8 +34,11 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def examine() -> Iterator[tuple[str, Finding]]:
-    """Run the checks. Yield each finding with its heading as soon as it is made."""
-    for check in CHECKS:
+def examine(checks: Sequence[Check] | None = None) -> Iterator[tuple[str, Finding]]:
+    """Run checks. Yield each finding with its heading as soon as it is made.
+
+    :param checks: None = those of the computer
+    """
+    for check in CHECKS if checks is None else checks:
         for finding in check.findings():
             yield check.group, finding

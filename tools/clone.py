@@ -1,0 +1,30 @@
+"""What the tools that make packages have in common: the files of this clone, and where packages are put."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DIST = ROOT / "dist"
+
+
+def version() -> str:
+    """The version, from where it stands."""
+    (found,) = re.findall(r'^__version__ = "(.+)"$', (ROOT / "gr_ros2" / "__init__.py").read_text("utf-8"), re.M)
+    return str(found)
+
+
+def copy_of_clone(target: Path) -> None:
+    """Copy what git knows or does not ignore; without git everything but what is hidden or was built."""
+    git = ["git", "-c", f"safe.directory={ROOT}", "-C", str(ROOT), "ls-files", "--cached", "--others"]
+    listed = subprocess.run([*git, "--exclude-standard"], capture_output=True, text=True)
+    if listed.returncode:
+        shutil.copytree(ROOT, target, ignore=shutil.ignore_patterns(".*", "build", "dist", "*.so", "__pycache__"))
+        return
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target / name)
