@@ -175,6 +175,25 @@ class Registry(Sequence[Topic]):
             raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
         return cls(list(_topics(rows, path)), path)
 
+    def extended(self, rows: Sequence[NewRow]) -> Registry:
+        """These rows too, with the next numbers. A name may come again with another type, which it has from then on.
+
+        :raises RegistryError: too many, or a row that is there already
+        """
+        topics = [Topic(number, *row) for number, row in enumerate(rows, len(self))]
+        if len(self) + len(topics) > MAX_TOPICS:
+            raise RegistryError(f"{len(self) + len(topics)} topics; a link carries at most {MAX_TOPICS}")
+        known = {(topic.name.lstrip("/"), topic.type_name) for topic in self}
+        for topic in topics:
+            key = topic.name.lstrip("/"), topic.type_name
+            if key in known:
+                raise RegistryError(f"duplicate topic {topic.name!r}")
+            known.add(key)
+        together = Registry.empty()
+        together._topics = (*self, *topics)
+        together._by_name = {**self._by_name, **{topic.name.lstrip("/"): topic for topic in topics}}
+        return together
+
     def __len__(self) -> int:
         return len(self._topics)
 

@@ -199,6 +199,7 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
     if stats["phy"]["snr_db"] is not None:
         parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
+    parts += [f"{name} is {t['type']} now" for name, t in source["topics"].items() if t["types"] > 1]
     if lost := sum(topic["lost_on_graph"] for topic in source["topics"].values()):
         parts.append(f"{lost} messages lost on the ROS graph before they were sent")
     if sink["publish_failed"]:

@@ -13,13 +13,15 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import inf
 from typing import Any, Protocol
 
 from gnuradio import gr
 
 from gr_ros2.config import SinkConfig, replaced
 from gr_ros2.errors import ConfigError, DescriptionError, GrRos2Error, SealError
+from gr_ros2.gr.early import LOOK_S, EarlyMessages
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
@@ -64,14 +66,20 @@ class _Output:
     """A topic of one sender, as this block publishes it.
 
     :param stamped: whether its messages begin with a header
+    :param name: absolute name on the graph, of the newest publisher
     :param publisher: None until the first message, and after the topic has changed
+    :param early: what waits for the subscribers of a new publisher; None where nothing does
+    :param opening: held while ``early`` is used
     :param published: number of messages
     :param delivered_at: time of the newest one, s
     """
 
     topic: Topic
     stamped: bool
+    name: str = ""
     publisher: Publisher | None = None
+    early: EarlyMessages | None = None
+    opening: threading.RLock = field(default_factory=threading.RLock)
     published: int = 0
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
@@ -134,6 +142,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         # Publishers are kept when a robot has gone. Late subscribers still get its map, and a robot that comes back
         # needs no new discovery. There are at most as many as source ids times topics of the registry.
         self._outputs: dict[tuple[int, int], _Output] = {}
+        self._opening: set[_Output] = set()
+        """The outputs in which something may wait for subscribers."""
         self._stamped: dict[str, bool] = {}
         """Whether messages of a type begin with a header."""
         self._types: TypeSearch | None = None
@@ -202,11 +212,13 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._running = False
             self._timer_due.notify_all()
         self._thread.stop()
+        self._release(self._opening)
         return True
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
         self._stop_search()
+        self._release(self._opening)
         if self._clock_subscription is not None:
             self._clock_subscription.close()
             self._clock_subscription = None
@@ -245,7 +257,13 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         for key, window in windows.items():
             summaries = {"latency_s": window.summary(), "recent_latency_s": window.summary(RECENT)}
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
-        return {**counted, "topics": {self._name(key): topic for key, topic in topics.items()}}
+        named: dict[str, dict[str, Any]] = {}
+        for key, topic in topics.items():  # of a topic that has changed its type, the newest row has the figures
+            name = self._name(key)
+            if name in named:
+                topic["delivered"] += named[name]["delivered"]
+            named[name] = topic
+        return {**counted, "topics": named}
 
     def set_debug(self, debug: bool) -> None:
         """Turn the readable log of headers, topic ids and entries on or off."""
@@ -328,6 +346,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return {
             "src_id": key[0],
             "topic_id": key[1],
+            "type": self._topic(key).type_name,
             "delivered": 0 if output is None else output.published,
             "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
             "latency_s": None,
@@ -375,7 +394,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:
         """Handle each event, then call the observer."""
-        debug, calls, observer = self.config.debug, self._calls, self._observer
+        debug, calls = self.config.debug, self._calls
         for event in events:
             try:
                 if debug and isinstance(event, Received | Rejected):
@@ -385,11 +404,52 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 elif isinstance(event, Rejected):
                     self._warn(event)
                 taken = calls is not None and calls.takes(event)
-                result = self._publish(event) if isinstance(event, Delivered) and not taken else event
-                if observer is not None:
-                    self._guard(observer.receiver_event, result, self._clock())
+                if isinstance(event, Delivered) and not taken:
+                    self._deliver(event)
+                else:
+                    self._tell(event)
             except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
                 self._failed(error)
+
+    def _tell(self, event: ReceiverEvent) -> None:
+        if self._observer is not None:
+            self._guard(self._observer.receiver_event, event, self._clock())
+
+    def _deliver(self, event: Delivered) -> None:
+        """Publish a message, now or when the subscribers of its publisher have found it."""
+        output = self._outputs.get((event.src_id, event.topic_id))
+        if output is None or output.publisher is None or output.early is not None:
+            output = self._opened(event)
+        if output is None or output.early is None:
+            self._tell(self._publish(event))
+            return
+        with output.opening:
+            if output.early is not None:
+                output.early.add(event)
+            else:
+                self._tell(self._publish(event))
+
+    def _opened(self, event: Delivered) -> _Output | None:
+        """The output of a message, with a publisher; None if it cannot have one, which publishing then says."""
+        key = (event.src_id, event.topic_id)
+        try:
+            output = self._output(key)
+            if output.publisher is None:
+                self._advertise(key, output)
+        except Exception:  # noqa: BLE001 - publishing fails for the same reason, and counts it
+            return None
+        return output
+
+    def _release(self, outputs: Iterable[_Output]) -> None:
+        """Publish what waits for subscribers."""
+        for output in list(outputs):
+            with output.opening:
+                if output.early is not None:
+                    for event in output.early.waiting:
+                        self._tell(self._publish(event))
+                output.early = None
+            with self._lock:
+                self._opening.discard(output)
 
     def _publish(self, event: Delivered) -> ReceiverEvent:
         key = (event.src_id, event.topic_id)
@@ -447,12 +507,14 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _change(self, output: _Output, topic: Topic) -> None:
         """A topic id means this topic now. A publisher of another name or type is closed."""
-        before, output.topic = output.topic, topic
+        before = output.topic
         if (before.name, before.type_name) != (topic.name, topic.type_name):
+            self._release([output])
             output.stamped = self._is_stamped(topic.type_name)
             if output.publisher is not None:
                 output.publisher.close()
                 output.publisher = None
+        output.topic = topic
 
     def _is_stamped(self, type_name: str) -> bool:
         stamped = self._stamped.get(type_name)
@@ -470,7 +532,19 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             depth = 1 if topic.latched else self.config.publisher_depth
         asked = topic.options.reliability
         qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
-        publisher = output.publisher = self.middleware.advertise(self._name(key), topic.type_name, qos)
+        name = self._name(key)
+        for (src_id, _), other in list(self._outputs.items()):
+            if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
+                self._release([other])  # the same topic with its type before
+                other.publisher.close()
+                other.publisher = None
+        output.name = name
+        publisher = output.publisher = self.middleware.advertise(name, topic.type_name, qos)
+        if self._running and self.middleware.settling_s and not topic.latched:
+            output.early = EarlyMessages(publisher, self.middleware.settling_s, self._clock())
+            with self._lock:
+                self._opening.add(output)
+                self._timer_due.notify_all()
         return publisher
 
     def _measure(self, output: _Output, payload: bytes) -> None:
@@ -494,12 +568,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
 
     def _watch_timeouts(self) -> None:
         while True:
+            self._release([o for o in list(self._opening) if o.early is None or o.early.over(self._clock())])
             with self._lock:
                 if not self._running:
                     return
                 events = self._end.handle_timeout(self._clock())
                 if not events:
                     at = self._end.next_timeout()
+                    if self._opening:
+                        at = min(self._clock() + LOOK_S, inf if at is None else at)
                     self._timer_idle = at is None
                     self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
                     self._timer_idle = False

@@ -234,17 +234,24 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._take_losses()
             stats = self._end.sent
             queued = self._end.queued()
+            rows: dict[str, list[int]] = {}
+            for topic in self.registry:
+                if topic.is_topic:
+                    rows.setdefault(topic.name, []).append(topic.topic_id)
             topics = {
                 name: {
                     "topic_id": topic.topic_id,
-                    "submitted": stats.submitted[topic.topic_id],
-                    LedgerRow.LOST_ON_GRAPH.value: stats.missed[topic.topic_id],
-                    "sent": stats.sent[topic.topic_id],
-                    "queued": queued[topic.topic_id],
+                    "type": topic.type_name,
+                    "types": len(rows[topic.name]),
+                    "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
+                    LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
+                    "sent": sum(stats.sent[row] for row in rows[topic.name]),
+                    "queued": sum(queued[row] for row in rows[topic.name]),
                     "queue": self._end.queue(topic.topic_id)[0],
                     "queue_depth": self._end.depth(topic.topic_id),
                     "refused": {
-                        reason: count for (number, reason), count in stats.refused.items() if number == topic.topic_id
+                        reason: sum(stats.refused[row, reason] for row in rows[topic.name])
+                        for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
                     },
                 }
                 for name, topic in self.subscribed.items()
@@ -331,11 +338,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
-        """Send the topics of the graph that are chosen and not sent yet; likewise the services."""
+        """Send the topics of the graph that are chosen and not sent yet, or have another type now; likewise the
+        services."""
+        published = {(info.topic, info.type_name) for info in infos if info.publishers}
         for info in infos:
-            row_name = (
-                self.choice.row_name(info.topic) if info.publishers and info.topic not in self.subscribed else None
-            )
+            sent = self.subscribed.get(info.topic)
+            if not info.publishers or (sent is not None and (info.topic, sent.type_name) in published):
+                continue
+            row_name = self.choice.row_name(info.topic)
             if row_name is None or info.topic in self._left_out or LOOP_GUARD.returns(self._graph, info.topic):
                 continue
             try:
@@ -393,14 +403,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._subscribe_to(name, topic)
 
     def _add(self, row_name: str, info: TopicInfo) -> None:
-        """Announce a topic of the graph, and subscribe it.
+        """Announce a topic of the graph, and subscribe it. It may be sent already, with a type that has no publisher
+        any more; each type of a topic has its own row.
 
         :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
         """
-        options = options_of(row_name, self.config.topic_options)
+        options, type_name = options_of(row_name, self.config.topic_options), normalize_type(info.type_name)
         with self._lock:
-            self.registry = self._end.add([(row_name, normalize_type(info.type_name), options)])
-            topic = self.registry[-1]
+            before = self.subscribed.get(info.topic)
+            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
+            if not rows:
+                self.registry = self._end.add([(row_name, type_name, options)])
+                rows = [self.registry[-1]]
+            (topic,) = rows
             subscribed = {**self.subscribed, info.topic: topic}
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
@@ -408,8 +423,21 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self.subscribed = subscribed
             self._work.notify()
         LOOP_GUARD.add_source(self, self._graph, [*subscribed, *self.services])
-        self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
+        if before is None:
+            self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
+        else:
+            self._log.warning("topic %s is %s now, was %s", info.topic, topic.type_name, before.type_name)
+            self._unsubscribe(before)
         self._subscribe_to(info.topic, topic)
+
+    def _unsubscribe(self, topic: Topic) -> None:
+        """Take no further messages of a row, and keep none for robots that join late."""
+        subscriptions = dict(self._subscriptions)
+        subscriptions.pop(topic.topic_id).close()
+        with self._lock:
+            self._take_losses()
+            self._subscriptions = subscriptions
+            self._end.forget_kept(topic.topic_id)
 
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""

@@ -83,9 +83,14 @@ class Endpoint(Protocol):
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 
+        A name may come again with another type: both rows stay, and the messages of each keep their type.
+
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
         """
+
+    def forget_kept(self, topic_id: int) -> None:
+        """Send no message of a topic so far to robots that join late, because its publisher has changed its type."""
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """Code messages of a type by its definition, which was not known before, or another one.
@@ -239,6 +244,9 @@ class EndpointV0:
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """See :class:`Endpoint`."""
         raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+
+    def forget_kept(self, topic_id: int) -> None:
+        """Do nothing: the types of version 0 never change."""
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """Do nothing: both ends of version 0 code by the same dictionaries."""

@@ -156,6 +156,8 @@ class Middleware(ABC):
     """
 
     name: ClassVar[str]
+    settling_s: ClassVar[float] = 0.0
+    """s from the moment when a new publisher has found a subscriber until that subscriber surely hears it."""
     domain_id: int | None = None
 
     def __init__(self) -> None:

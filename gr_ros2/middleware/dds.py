@@ -63,6 +63,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     """
 
     name = "dds"
+    settling_s = 0.1
 
     def __init__(
         self,

@@ -150,6 +150,7 @@ class RclpyMiddleware(RclpyParticipant):
     """
 
     name = "rclpy"
+    settling_s = 0.1
 
     def __init__(
         self,

@@ -96,6 +96,7 @@ class ZenohMiddleware(Middleware):
     """
 
     name = "zenoh"
+    settling_s = 0.1
 
     def __init__(self, *, domain_id: int | Auto = AUTO, node_name: str = "gr_ros2", namespace: str = "/") -> None:
         super().__init__()

@@ -32,7 +32,10 @@ def stats(
         "uptime_s": 12.4,
         "source": {
             "unmatched": [],
-            "topics": {"/odom": {"submitted": 7, "lost_on_graph": lost}, "/scan": {"submitted": 1, "lost_on_graph": 0}},
+            "topics": {
+                "/odom": {"submitted": 7, "lost_on_graph": lost, "types": 1},
+                "/scan": {"submitted": 1, "lost_on_graph": 0, "types": 1},
+            },
         },
         "sink": {
             "topics": {"/rx_robot_2/odom": {"delivered": 5}},
@@ -47,7 +50,7 @@ def stats(
 
 def test_a_link_that_sends_nothing_says_what_it_waits_for() -> None:
     silent = stats(None)
-    silent["source"]["topics"] = {"/odom": {"submitted": 0, "lost_on_graph": 0}}
+    silent["source"]["topics"] = {"/odom": {"submitted": 0, "lost_on_graph": 0, "types": 1}}
     silent["source"]["unmatched"] = ["/odom", "/scan"]
     silent["packets"] |= {"out": 0, "in": 0}
     assert status_line(silent) == "12 s; nothing sent, no publisher on /odom and 1 more; nobody heard"

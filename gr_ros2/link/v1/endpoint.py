@@ -47,7 +47,7 @@ from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import NewRow, Registry, Topic
+from gr_ros2.registry import NewRow, Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -195,9 +195,8 @@ class Endpoint:
     def add(self, rows: Sequence[NewRow]) -> Registry:
         """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one learn of them from the next
         hello."""
-        before = self.topics or ()
-        topics = [Topic(number, *row) for number, row in enumerate(rows, len(before))]
-        together = Registry([*before, *topics])
+        together = (Registry.empty() if self.topics is None else self.topics).extended(rows)
+        topics = together[-len(rows) :] if rows else ()
         if self._codec is not None:
             for topic in topics:
                 self._codec.add(topic)
@@ -208,6 +207,10 @@ class Endpoint:
         if self._started and self._repeat_at == inf and self.settings.repeat_s:
             self._repeat_at = self._now + self.settings.repeat_s
         return together
+
+    def forget_kept(self, topic_id: int) -> None:
+        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
+        self.outbox.forget_kept(topic_id)
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """See :class:`gr_ros2.link.endpoint.Endpoint`. The robots that hear this one are told."""

@@ -241,6 +241,10 @@ class Outbox:
             Message(serial, topic_id, payload, line.qos, now, line.weight, lifespan_s, coded=codec is not None),
         )
 
+    def forget_kept(self, topic_id: int) -> None:
+        """Keep none of the messages of a topic so far for robots that join late."""
+        self._kept.pop(topic_id, None)
+
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
         self._starting_until = min(self._starting_until, now + STARTING_S)
