@@ -9,14 +9,18 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.medium import Path as Way
+from gr_ros2.medium.packets import PacketMedium
+from gr_ros2.phy.direct import DirectPhy
 from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import Arrival, End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
+from gr_ros2.run.simulate import EventLoop, Offered, Robot, Simulated, simulate
 
 
 class Sized:
@@ -197,23 +201,22 @@ class Answering(EndpointV0):
         return events
 
 
-def test_an_end_may_answer_what_it_hears() -> None:
+def test_a_robot_may_answer_what_it_hears() -> None:
     settings = scenario("two-way", "time=packets", duration=2.0)
     there, back = settings.directions()
     registry = there.load_registry()
-    (one, _) = make_ends((there, back), registry)
-    told: list[SenderEvent] = []
-    codecs = message_codec(back.ros_source, registry), message_codec(there.ros_sink, registry)
-    other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
-    ways = [
-        LinkDirection(
-            there, (one, other), lambda *_: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
-        ),
-        LinkDirection(back, (other, one), lambda *_: 0.01, iter(())),
-    ]
-    for way in ways:
-        way.air = lambda packet, now: [Arrival(packet.data)]  # noqa: ARG005
-    heard = [(now, event) for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
+    coming = [Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))]
+    robots = []
+    for number, (source, sink) in enumerate(((there.ros_source, back.ros_sink), (back.ros_source, there.ros_sink))):
+        told: list[SenderEvent] = []
+        codecs = message_codec(source, registry), message_codec(sink, registry)
+        endpoint = (Answering if number else EndpointV0)(registry, source, sink, codecs=codecs, observer=told.append)
+        messages = iter(() if number else coming)
+        common: dict[str, Any] = {"src_id": source.src_id(), "airtime": lambda *_: 0.01}
+        robots.append(Robot(there, number, endpoint, events=told, messages=messages, **common))
+    paths = [[Way(1, ChannelConfig())], [Way(0, ChannelConfig())]]
+    medium = PacketMedium(lambda _: paths, [DirectPhy(220)] * 2)
+    heard = [(now, event) for now, _, event in EventLoop(robots, medium).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]
     assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]
     answers = [event.payload for _, event in heard if event.src_id == back.ros_source.src_id()]
