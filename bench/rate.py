@@ -13,10 +13,9 @@ from pathlib import Path
 from bench.rows import Row
 from gr_ros2.link.events import Delivered
 from gr_ros2.phy.ofdm_rate import RUNGS
-from gr_ros2.run.ladder_air import LadderAir
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import scenario_from
-from gr_ros2.run.simulate import EventLoop, LinkDirection, Medium, Offered, make_ends, report_ways
+from gr_ros2.run.simulate import Offered, Simulation
 from gr_ros2.settings_file import find_registry
 
 PACKET_LEN, MESSAGE_LEN = 220, 205
@@ -58,13 +57,8 @@ def carried(rungs: tuple[str, ...], channel: dict[str, float], load: float, seco
         }
     )
     registry = scenario.load_registry()
-    phy = make_phy(scenario, registry)
-    ends = make_ends([scenario], registry, any_length=phy.any_length, ladder=phy.ladder)
-    way = LinkDirection(scenario, (ends[0], ends[1]), phy.airtime, messages(load, seconds))
-    way.air = passing(LadderAir(phy, scenario.channel, samples=False))
-    back = LadderAir(phy, scenario.channel, samples=False)
-    ways = [way, *report_ways(scenario, ends, phy.airtime, [passing(back)])]
-    whole = [(now, event.payload) for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
+    run = Simulation(scenario, registry, [make_phy(scenario, registry)], messages=[messages(load, seconds)])
+    whole = [(now, event.payload) for now, _, event in run.events() if isinstance(event, Delivered)]
     settled = sum(WARM_UP_S <= now < seconds for now, _ in whole)
     in_time = sum(now - int.from_bytes(payload[:4], "big") / load <= LATE_S for now, payload in whole)
     return settled / (seconds - WARM_UP_S), in_time / int(load * seconds)
@@ -76,11 +70,6 @@ def messages(load: float, seconds: float) -> Iterator[Offered]:
         if (at := number / load) >= seconds:
             return
         yield Offered(at, 0, number.to_bytes(4, "big") + bytes(MESSAGE_LEN - 4))
-
-
-def passing(air: LadderAir) -> Medium:
-    """The channel as a direction takes it."""
-    return lambda packet, now: air.through(packet.data, packet.rung, now)
 
 
 def constant() -> list[tuple[int, float, dict[str, float]]]:

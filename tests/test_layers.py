@@ -26,6 +26,7 @@ LAYERS = (
     {"link", "calls"},
     {"middleware", "compression"},
     {"phy", "sim", "grc_path", "grc_python"},
+    {"medium"},
     {"gr"},
     {"radio"},
     {"record"},

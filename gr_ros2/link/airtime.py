@@ -46,15 +46,17 @@ class AirtimeClock(Generic[T]):
         self._queue: deque[tuple[float, T]] = deque()
         self._unused = 0
 
-    def offer(self, packet: T, now: float, airtime: float | None = None) -> None:
+    def offer(self, packet: T, now: float, airtime: float | None = None) -> float:
         """A packet arrives; it uses a credit if one is open.
 
         :param airtime: s that it occupies, None for the airtime of the longest packet
+        :return: when its airtime begins
         """
         begin = max(now, self._free)
         self._free = begin + (self._airtime if airtime is None else airtime)
         self._queue.append((self._free if self._ahead is None else begin - self._ahead, packet))
         self._unused = max(0, self._unused - 1)
+        return begin
 
     def due(self, now: float) -> list[T]:
         """The packets that may leave, in order of arrival."""

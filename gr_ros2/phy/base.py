@@ -8,7 +8,7 @@ packets cross as messages. Invariant: the airtime of a packet depends on its len
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Protocol, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,9 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.config import ChannelConfig, Kernels, build
 from gr_ros2.errors import ConfigError, PhyError
 from gr_ros2.link.rate import Rung
+
+if TYPE_CHECKING:
+    from gr_ros2.phy.burst import BurstModem  # with GNU Radio
 
 Samples = npt.NDArray[np.complex64]
 LENGTH_TAG = "burst_len"
@@ -180,6 +183,16 @@ class Phy(ABC):
                 f"channel.doppler_hz = {channel.doppler_hz:g}: phy {self.name} has {self.sample_rate:g} samples/s; "
                 f"at most {self.sample_rate / 2:g}"
             )
+
+    @property
+    def burst_modem(self) -> BurstModem | None:
+        """What turns packets into samples and back without a flowgraph; None where GNU Radio's blocks do."""
+        return None
+
+    @property
+    def receiver_taps(self) -> Any:
+        """The filter in front of the modem; None = no filter."""
+        return None
 
     def runs_on(self) -> str:
         """What processes the samples, in a few words; '' for a PHY without samples."""

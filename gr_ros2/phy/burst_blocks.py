@@ -106,13 +106,12 @@ class BurstPhy(Phy):
         """The modem that runs here: compiled or numpy."""
         return fastest(self.modem, self.kernels)
 
+    @property
+    def burst_modem(self) -> BurstModem | None:
+        return self.running_modem if hasattr(self, "modem") else None
+
     def runs_on(self) -> str:
         return which(self.kernels)
-
-    @property
-    def receiver_taps(self) -> Any:
-        """The filter in front of the modem; None = no filter."""
-        return None
 
     def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ import numpy.typing as npt
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig, replaced
+from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
@@ -28,9 +27,6 @@ from gr_ros2.phy.threads import run_flowgraph
 _PATIENCE_S = 60.0
 _POLL_S = 0.002
 _BATCH_SAMPLES = 1 << 22
-_BATCH_SEEDS = 7919
-"""Distance between the seeds of two batches, so that no batch has the noise of a scenario with a neighbouring seed."""
-_SEEDS = 2**31 - 1
 _TAIL = 2048
 """Zero samples after the last packet, so that channel and receiver release everything."""
 
@@ -111,47 +107,6 @@ def pdr(phy: Phy, recording: SampleRecording, channel: ChannelConfig) -> float:
     return sum(packet in arrived for packet in recording.packets) / len(recording.packets)
 
 
-class BatchChannel:
-    """Packets through a PHY's own transmitter, a channel and its own receiver, batch by batch.
-
-    The batches do not overlap in time; each has its own noise and fading.
-
-    :param phy: a PHY with samples
-    :param channel: its settings that act on samples are used
-    :raises ConfigError: for a channel that this PHY does not support
-    """
-
-    def __init__(self, phy: Phy, channel: ChannelConfig) -> None:
-        phy.check_channel(channel)
-        self._phy = phy
-        self._channel = channel
-        self._batches = 0
-        self.batch = max(1, _BATCH_SAMPLES // phy.airtime_samples())
-        """Most packets at a time, so that their samples fit in memory."""
-
-    def send(self, packets: Sequence[bytes]) -> list[tuple[int, bytes]]:
-        """Send a batch; returns, for each packet that arrived, its index among the packets sent and its bytes, in
-        order."""
-        seed = (self._channel.seed + self._batches * _BATCH_SEEDS) % _SEEDS
-        self._batches += 1
-        arrived = deliver(self._phy, modulated(self._phy, packets), replaced(self._channel, seed=seed))
-        return list(zip(_places(packets, arrived), arrived, strict=True))
-
-
-def _places(packets: Sequence[bytes], arrived: Sequence[bytes]) -> list[int]:
-    """For each packet that arrived, in order, its index among the packets sent.
-
-    A packet that does not equal any sent one was altered on the way: it gets the index after that of the previous
-    arrival.
-    """
-    sent: dict[bytes, deque[int]] = {}
-    for place, packet in enumerate(packets):
-        sent.setdefault(packet, deque()).append(place)
-    found, last = [], -1
-    for packet in arrived:
-        copies = sent.get(packet, deque())
-        while copies and copies[0] <= last:
-            copies.popleft()
-        last = copies.popleft() if copies else min(last + 1, len(packets) - 1)
-        found.append(last)
-    return found
+def batch_of(phy: Phy) -> int:
+    """Most packets that go through a flowgraph at a time, so that their samples fit in memory."""
+    return max(1, _BATCH_SAMPLES // phy.airtime_samples())

@@ -27,8 +27,8 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.registry import Registry
-from gr_ros2.run.ends import Halves, halves_of_ends, start_of_run
 from gr_ros2.run.load import recorded_names, source_names
+from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.setting import AUTO
 
@@ -52,7 +52,7 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
 def live_ends(
     ways: Sequence[Scenario], registry: Registry, *, any_length: bool, ladder: Sequence[Rung] = ()
 ) -> list[LiveEnd]:
-    """The ends of a link that speaks version 1, see :func:`gr_ros2.run.ends.halves_of_ends`.
+    """The ends of a link that speaks version 1, see :func:`gr_ros2.run.robots.halves_of_robots`.
 
     :param any_length: whether the PHY carries shorter packets in less time
     :param ladder: the rungs of an adaptive rate; () for a fixed rate
@@ -60,7 +60,7 @@ def live_ends(
     start = start_of_run(ways, any_length=any_length, ladder=ladder)
     return [
         LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
-        for halves in halves_of_ends(ways)
+        for halves in halves_of_robots(ways)
     ]
 
 

@@ -28,13 +28,13 @@ from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
-from gr_ros2.run.ends import halves_of_ends
 from gr_ros2.run.load import make_phys, recording
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
 from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.recorders import FurtherRecorders, make_recorder
 from gr_ros2.run.repeat import repetitions
+from gr_ros2.run.robots import halves_of_robots
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.sim.fleet import Fleet
@@ -206,7 +206,7 @@ class _Run:
             self.links = [direction.link for direction in self.directions]
             if scenario.reports is not None:
                 common["delay_s"] = scenario.reports.delay_s
-                receivers = zip(live[1:], halves_of_ends(ways)[1:], scenario.report_channels(), strict=True)
+                receivers = zip(live[1:], halves_of_robots(ways)[1:], scenario.report_channels(), strict=True)
                 for end, halves, channel in receivers:
                     pair, src_id = (live[0], end), robot_of(*halves)
                     reporting = ReportDirection(there, self.phy, pair, src_id, channel=channel, **common)

@@ -9,14 +9,18 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError, RunError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.medium import Path as Way
+from gr_ros2.medium.packets import PacketMedium
+from gr_ros2.phy.direct import DirectPhy
 from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import Arrival, End, EventLoop, LinkDirection, Offered, Simulated, make_ends, simulate
+from gr_ros2.run.simulate import EventLoop, Offered, Robot, Simulated, simulate
 
 
 class Sized:
@@ -25,6 +29,12 @@ class Sized:
     def __init__(self, *sizes: int) -> None:
         self._sizes = sizes
         self._messages: list[bytes] = []
+
+    def announcement(self, topic_id: int) -> str:  # noqa: ARG002
+        return "codec=sized"
+
+    def lacks(self, topic_id: int, coded: bytes) -> bool:  # noqa: ARG002
+        return False
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002
         return payload
@@ -195,23 +205,22 @@ class Answering(EndpointV0):
         return events
 
 
-def test_an_end_may_answer_what_it_hears() -> None:
+def test_a_robot_may_answer_what_it_hears() -> None:
     settings = scenario("two-way", "time=packets", "version=0", "ros_source.topic_options={}", duration=2.0)
     there, back = settings.directions()
     registry = there.load_registry()
-    (one, _) = make_ends((there, back), registry)
-    told: list[SenderEvent] = []
-    codecs = message_codec((), registry), message_codec((), registry)
-    other = End(Answering(registry, back.ros_source, there.ros_sink, codecs=codecs, observer=told.append), told)
-    ways = [
-        LinkDirection(
-            there, (one, other), lambda *_: 0.01, iter([Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))])
-        ),
-        LinkDirection(back, (other, one), lambda *_: 0.01, iter(())),
-    ]
-    for way in ways:
-        way.air = lambda packet, now: [Arrival(packet.data)]  # noqa: ARG005
-    heard = [(now, event) for now, _, event in EventLoop(ways).run() if isinstance(event, Delivered)]
+    coming = [Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))]
+    robots = []
+    for number, (source, sink) in enumerate(((there.ros_source, back.ros_sink), (back.ros_source, there.ros_sink))):
+        told: list[SenderEvent] = []
+        codecs = message_codec((), registry), message_codec((), registry)
+        endpoint = (Answering if number else EndpointV0)(registry, source, sink, codecs=codecs, observer=told.append)
+        messages = iter(() if number else coming)
+        common: dict[str, Any] = {"src_id": source.src_id(), "airtime": lambda *_: 0.01}
+        robots.append(Robot(there, number, endpoint, events=told, messages=messages, **common))
+    paths = [[Way(1, ChannelConfig())], [Way(0, ChannelConfig())]]
+    medium = PacketMedium(lambda _: paths, [DirectPhy(220)] * 2)
+    heard = [(now, event) for now, _, event in EventLoop(robots, medium).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]
     assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]
     answers = [event.payload for _, event in heard if event.src_id == back.ros_source.src_id()]
@@ -232,9 +241,9 @@ class Stuck(EndpointV0):
 def test_a_simulation_that_stands_still_says_which_end_and_which_timer() -> None:
     settings = scenario("paper-ofdm", "time=packets", duration=2.0)
     registry = settings.load_registry()
-    (_, receiver) = make_ends([settings], registry)
-    stuck = End(Stuck(registry, settings.ros_source, None), [], 1)
-    way = LinkDirection(settings, (stuck, receiver), lambda *_: 0.0, iter([Offered(0.5, 0, bytes(51))]))
-    way.air = lambda packet, now: [Arrival(packet.data)]  # noqa: ARG005
+    endpoint = Stuck(registry, settings.ros_source, None)
+    messages = iter([Offered(0.5, 0, bytes(51))])
+    stuck = Robot(settings, 0, endpoint, src_id=1, airtime=lambda *_: 0.0, events=[], messages=messages)
+    medium = PacketMedium(lambda _: [[]], [DirectPhy(220)])
     with pytest.raises(RunError, match=r"stands still at 0.0.* s: departure of robot 1 is due at 0\.0"):
-        list(EventLoop([way]).run())
+        list(EventLoop([stuck], medium).run())

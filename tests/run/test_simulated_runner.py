@@ -21,10 +21,10 @@ from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.errors import ConfigError
 from gr_ros2.link import EndpointV0
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.medium import loss_table
 from gr_ros2.middleware.bag_files import bag_topics, read_bag
 from gr_ros2.phy import measure
 from gr_ros2.record.result import Result, read_result
-from gr_ros2.run import loss_table
 from gr_ros2.run.observers import LiveRun
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.runner import run_scenario

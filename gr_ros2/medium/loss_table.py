@@ -22,6 +22,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gr_ros2 import __version__
 from gr_ros2.config import BurstLoss, ChannelConfig, replaced
 from gr_ros2.errors import ConfigError, RunError
@@ -34,6 +37,12 @@ STEP_DB = 0.5
 PACKETS = 1000
 """Packets sent at each SNR when a point is measured on demand. The standard deviation at a PDR of 0.5 is 0.016."""
 
+CURVE_PACKETS = 300
+"""The same for a curve, which has many points."""
+_LOWEST_DB, _HIGHEST_DB, _CLOSE = -40.0, 60.0, 0.004
+"""Where the search for the ends of a curve stops, and which difference of the PDR counts as none."""
+_BATCH_SEEDS, _SEEDS = 7919, 2**31 - 1
+"""Distance between the seeds of two batches, and the number of seeds."""
 _SEEDS_APART = 2**40
 """Added to the seed, so that the losses of the PHY are independent of the channel's own losses."""
 _log = logging.getLogger(__name__)
@@ -111,6 +120,45 @@ def neighbours(snr_db: float) -> tuple[float, float]:
     return math.floor(steps) * STEP_DB, math.ceil(steps) * STEP_DB
 
 
+class LossCurve:
+    """The PDR at any SNR: nothing below the lowest point of a table, and above the highest as much as there.
+
+    :param channel: its SNR is ignored
+    :param limits: lowest and highest SNR in dB; None finds them: between all packets lost, and as few as without noise
+    """
+
+    def __init__(self, phy: Phy, channel: ChannelConfig, limits: tuple[float, float] | None = None) -> None:
+        self._phy, self._channel = phy, channel
+        if limits is None:
+            limits = self._found()
+        self.low_db, self.high_db = limits
+        first, last = neighbours(self.low_db)[0], neighbours(self.high_db)[1]
+        steps = {first + STEP_DB * step for step in range(round((last - first) / STEP_DB) + 1)}
+        table = self._table({None, *steps})
+        self._clear = table.points[None].pdr
+        self._snrs = sorted(steps)
+        self._odds = [table.points[snr_db].log_odds for snr_db in self._snrs]
+
+    def pdr(self, snrs_db: Any) -> NDArray[np.float64]:
+        """Share of the packets that arrive, at SNRs in dB; infinite = without noise."""
+        odds = np.interp(snrs_db, self._snrs, self._odds)
+        pdr = np.where(snrs_db == math.inf, self._clear, 1 / (1 + np.exp(-odds)))
+        return np.where(snrs_db < self.low_db, 0.0, pdr)
+
+    def _table(self, snrs: set[float | None]) -> LossTable:
+        return table_for(self._phy, self._channel, snrs, packets=CURVE_PACKETS)
+
+    def _found(self) -> tuple[float, float]:
+        clear = self._table({None}).points[None]
+        middle = next(snr_db for snr_db in range(-40, 60) if self._phy.computed_pdr(snr_db) > 0.5)
+        low = high = float(middle)
+        while low > _LOWEST_DB and self._table({low}).points[low].delivered:
+            low -= STEP_DB
+        while high < _HIGHEST_DB and self._table({high}).points[high].pdr < clear.pdr - _CLOSE:
+            high += STEP_DB
+        return low, high
+
+
 def setting_of(phy: Phy, channel: ChannelConfig) -> dict[str, Any]:
     """What the losses of a PHY's packets depend on, apart from the SNR. Options at their default are left out."""
     chosen, default = phy.options, phy.Options()
@@ -129,18 +177,18 @@ def measure(phy: Phy, channel: ChannelConfig, packets: int) -> Point:
     :param channel: its seed and its losses of whole packets are ignored
     :param packets: how many, 1 or more
     """
-    from gr_ros2.phy.measure import BatchChannel  # only here: an existing table needs no flowgraph
+    from gr_ros2.phy.measure import batch_of, deliver, modulated  # only here: an existing table needs no flowgraph
 
-    passage = BatchChannel(phy, replaced(channel, seed=0))
     source = random.Random(0)
     delivered, runs, before = 0, 0, True
-    for first in range(0, packets, passage.batch):
-        batch = [source.randbytes(phy.packet_len) for _ in range(min(passage.batch, packets - first))]
-        arrived = {place for place, packet in passage.send(batch) if packet == batch[place]}
-        delivered += len(arrived)
-        for place in range(len(batch)):
-            runs += before and place not in arrived
-            before = place in arrived
+    size = batch_of(phy)
+    for number, first in enumerate(range(0, packets, size)):
+        batch = [source.randbytes(phy.packet_len) for _ in range(min(size, packets - first))]
+        arrived = set(deliver(phy, modulated(phy, batch), replaced(channel, seed=number * _BATCH_SEEDS % _SEEDS)))
+        delivered += sum(packet in arrived for packet in batch)
+        for packet in batch:
+            runs += before and packet not in arrived
+            before = packet in arrived
     return Point(packets, delivered, runs)
 
 

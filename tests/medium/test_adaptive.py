@@ -1,4 +1,4 @@
-"""The adaptive rate in simulated time: the channel of each rung, and scenarios from the settings to the result."""
+"""The adaptive rate in simulated time: the losses of each rung, and scenarios from the settings to the result."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.config import ChannelConfig
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.medium import Path as Way
+from gr_ros2.medium import make_medium
+from gr_ros2.medium.fading import RayleighFading
+from gr_ros2.medium.packets import PacketMedium, limits_of
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.run.ladder_air import LadderAir, RayleighFading, limits
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.observers import RunObservers
 from gr_ros2.run.scenario import Scenario, scenario_from
@@ -81,24 +84,38 @@ def test_each_rung_takes_less_air_and_needs_more_snr() -> None:
     assert phy.airtime(24, 6) < phy.airtime(24, 0)
 
 
+def arrived(phy: Phy, snr_db: float, rung: int, packets: int) -> int:
+    """How many of some packets arrive."""
+    paths = [[Way(1, ChannelConfig(snr_db=snr_db))], []]
+    medium = PacketMedium(lambda _: paths, [phy, phy])
+    for number in range(packets):
+        medium.send(0, b"x", number, 0.5, rung)
+    count = len(list(medium.receptions(packets)))
+    assert medium.lost[0, 1]["phy"] == packets - count
+    return count
+
+
 @pytest.mark.parametrize(("rung", "name"), list(enumerate(rung.name for rung in ladder_phy().ladder)))
 def test_half_of_the_packets_of_a_rung_arrive_where_its_model_says(rung: int, name: str) -> None:
     phy = ladder_phy()
     model = phy.ladder[rung]
     for snr_db in (model.half_db - 1.5, model.half_db - 0.5, model.half_db + 0.5, model.half_db + 2.5):
-        air = LadderAir(phy, ChannelConfig(snr_db=snr_db), samples=False)
-        pdr = np.mean([bool(air.through(b"x", rung, 0.0)) for _ in range(2000)])
+        pdr = arrived(phy, snr_db, rung, 2000) / 2000
         assert pdr == pytest.approx(model.pdr(snr_db), abs=0.15), name
-        assert air.lost["phy"] == round((1 - pdr) * 2000)
-    low, high = limits(model)
-    assert not LadderAir(phy, ChannelConfig(snr_db=low - 0.1), samples=False).through(b"x", rung, 0.0)
-    assert LadderAir(phy, ChannelConfig(snr_db=high + 30), samples=False).through(b"x", rung, 0.0)
+    low, high = limits_of(model)
+    assert not arrived(phy, low - 0.1, rung, 1)
+    assert arrived(phy, high + 30, rung, 1)
 
 
 def test_packets_may_pass_through_the_modem_of_their_rung() -> None:
-    air = LadderAir(ladder_phy(), ChannelConfig(snr_db=9.0), samples=True)
-    arrived = [bool(air.through(bytes(220), rung, 0.0)) for rung in (0, 2, 5)]
-    assert arrived == [True, True, False]
+    phy = ladder_phy()
+    paths = [[Way(1, ChannelConfig(snr_db=9.0))], []]
+    medium = make_medium(lambda _: paths, [phy, phy], samples=True)
+    for number, rung in enumerate((0, 2, 5)):
+        medium.send(0, bytes(220), number, phy.airtime(220, rung), rung)
+    received = list(medium.receptions(3.0))
+    assert [reception.sent.rung for reception in received] == [0, 2]
+    assert [reception.measured_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
 
 
 def test_fading_is_that_of_rayleigh_and_a_function_of_time() -> None:
@@ -140,7 +157,7 @@ def test_what_an_adaptive_rate_cannot_have_is_said_in_a_line() -> None:
         with pytest.raises(ConfigError, match="rate: adaptive"):
             ladder_phy(**options)
     with pytest.raises(ConfigError, match="has one tap"):
-        LadderAir(ladder_phy(), ChannelConfig(snr_db=9.0, doppler_hz=2.0, taps=(1.0, 0.5)), samples=False)
+        run_simulated(adaptive(9.0, channel={"snr_db": 9.0, "doppler_hz": 2.0, "taps": (1.0, 0.5)}))
     scenario = adaptive(9.0)
     with pytest.raises(ConfigError, match="a forecast has one rate"):
         simulate(scenario, phy=make_phy(scenario, scenario.load_registry()))

@@ -1,0 +1,33 @@
+"""Which medium carries a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.medium.base import Medium, PathsAt
+from gr_ros2.medium.flowgraph import FlowgraphMedium
+from gr_ros2.medium.packets import PacketMedium
+from gr_ros2.medium.samples import SampleMedium
+from gr_ros2.phy import Phy
+
+
+def make_medium(
+    paths: PathsAt, phys: Sequence[Phy], *, samples: bool, shared: bool = False, seed: int = 0, at_once: bool = True
+) -> Medium:
+    """The medium for these robots.
+
+    :param samples: bursts cross as samples, where the PHYs have any; otherwise packets are lost as measured
+    :param at_once: see :class:`FlowgraphMedium`
+    :raises ConfigError: for PHYs of stock or foreign blocks that share one channel
+    """
+    if not samples or not any(phy.has_samples for phy in phys):
+        return PacketMedium(paths, phys, shared=shared, seed=seed)
+    if all(phy.burst_modem is not None for phy in phys):
+        return SampleMedium(paths, phys, shared=shared, seed=seed)
+    if shared:
+        raise ConfigError(
+            f"phy {phys[0].name} runs on {phys[0].runs_on()}, whose bursts cannot be added up on one channel; "
+            "set time to packets, or take a receiver of this package"
+        )
+    return FlowgraphMedium(paths, phys, at_once=at_once)
