@@ -35,7 +35,7 @@ from gr_ros2.registry import Registry
 SNR_DB = 20.0
 LEAST = 0.95
 """Share of the bare flowgraph's packets/s that is left with source and sink."""
-SHORT, DENSE = 4, 2
+SHORT, DENSE = 4, 10
 """Packets/s on compiled kernels over those with numpy: 64 B, and 1,500 B in 64-QAM."""
 BATCH_SAMPLES = 2_000_000
 REPEATS = 3
