@@ -20,8 +20,10 @@ from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import RowName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.config import DEFAULT_MIDDLEWARE
 from gr_ros2.errors import ConfigError
 from gr_ros2.guard import Guard
+from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
@@ -53,6 +55,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )
+@click.option("--middleware", type=RowName(MIDDLEWARE), help=f"Joins the ROS graph; default: {DEFAULT_MIDDLEWARE}.")
 @click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @set_option(LinkConfig)
@@ -65,6 +68,7 @@ def link(
     radio: str | None,
     registry: str | None,
     topics: str | None,
+    middleware: str | None,
     save: Path | None,
     duration: float | None,
     overrides: tuple[str, ...],
@@ -76,6 +80,8 @@ def link(
 
     The YAML file CONFIG describes the link. Without it, --robot and --radio do.
     """
+    if middleware is not None:
+        overrides = (f"ros_source.middleware={middleware}", f"ros_sink.middleware={middleware}", *overrides)
     given = {name.replace("_", "-"): value for name, value in flags.items() if value not in (None, ())}
     if config is not None:
         unused = [

@@ -34,7 +34,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
-from gr_ros2.middleware.services import ServiceGraph
+from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
@@ -135,6 +135,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """Absolute names of the services, actions and nodes that were found and chosen."""
         self._offer: Callable[[str, Topic], None] | None = None
         self._left_out: set[str] = set()
+        self.not_offered: set[str] = set()
+        """Services that cannot be called because of the RMW of their nodes. Only the first one is logged."""
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._search: TopicSearch | None = None
@@ -352,9 +354,17 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._add(row_name, info)
             except GrRos2Error as error:
                 self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
+        uncallable = (
+            self.middleware.uncallable() if services and isinstance(self.middleware, ServiceGraph) else frozenset()
+        )
         for row in rows_of(services):
             row_name = self.choice.row_name(row.name, hidden=row.of_node)
             if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self._left_out:
+                continue
+            if not uncallable.isdisjoint(parts(row.name, row.kind)):
+                if not self.not_offered:
+                    self._log.warning("%s (%s) is not offered: its node %s", row.name, row.kind, OTHER_RMW)
+                self.not_offered.add(row.name)
                 continue
             try:
                 self._add_services(row_name, row)

@@ -157,18 +157,23 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         return grouped(self._foreign(publishers), self._foreign(subscribers))
 
     def discover_services(self) -> dict[str, str]:
-        """See services. A server has a reader of requests and a writer of replies, in one participant."""
+        return {name: type_name for name, type_name, _ in self._servers()}
+
+    def uncallable(self) -> frozenset[str]:
+        return frozenset(name for name, _, callable_here in self._servers() if not callable_here)
+
+    def _servers(self) -> Iterator[tuple[str, str, bool]]:
+        """Name, type, and whether it can be called from here, of each server: a reader of requests and a writer of
+        replies in one participant."""
         with self._lock:
             writers, readers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
         replying = {(writer.participant, writer.topic) for writer in writers if writer.participant != self._guid}
-        found = {}
         for reader in readers:
             service = ros_graph.ros_service(reader.topic, reader.type_name)
             if service is not None:
                 (_, _), (replies, _) = ros_graph.dds_service(*service)
                 if (reader.participant, replies) in replying:
-                    found[service[0]] = service[1]
-        return found
+                    yield (*service, reader.is_cyclone)
 
     def witnesses(self, topic: str, type_name: str) -> list[Witness]:
         name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)

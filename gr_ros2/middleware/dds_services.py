@@ -20,6 +20,7 @@ from collections.abc import Hashable
 from gr_ros2.errors import MiddlewareError
 from gr_ros2.middleware.cdr_dds import DdsError, DiscoveredEndpoint, RawReader, RawWriter
 from gr_ros2.middleware.services import (
+    OTHER_RMW,
     ReplyCallback,
     RequestCallback,
     ServerCallback,
@@ -90,10 +91,8 @@ class _End:
         """User data by which the two endpoints are known to belong together."""
 
     def _refuse(self, other: DiscoveredEndpoint) -> None:
-        text = f"{self.name}: a {'client' if self.role == 'service' else 'server'} has another RMW than rmw_cyclonedds"
-        self._participant.count_once(
-            f"other_rmw:{self.name}", f"{text} (participant {other.participant.hex()}); take middleware rclpy"
-        )
+        text = f"{self.name}: a {'client' if self.role == 'service' else 'server'} {OTHER_RMW}"
+        self._participant.count_once(f"other_rmw:{self.name}", f"{text} (participant {other.participant.hex()})")
 
     def _write(self, writer: RawWriter, header: bytes, payload: bytes, what: str) -> None:
         if self._closed or self._participant.closed:

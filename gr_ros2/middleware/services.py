@@ -26,6 +26,13 @@ DESCRIPTION, DESCRIPTION_TYPE = "get_type_description", "type_description_interf
 """The service with which a node describes types since Iron: its name below that of the node, and its type."""
 
 
+OTHER_RMW = (
+    "has another RMW than rmw_cyclonedds_cpp; for its services, start the link where ROS 2 is sourced, with "
+    "--middleware rclpy"
+)
+"""What is said of a program whose services the embedded DDS cannot carry."""
+
+
 class Witness(NamedTuple):
     """A participant that can say what a type is.
 
@@ -74,6 +81,10 @@ class ServiceGraph(Middleware):
 
         Services that have clients only are left out where the middleware can tell.
         """
+
+    def uncallable(self) -> frozenset[str]:
+        """Those of the services found that cannot be called from here, because of the RMW of their servers."""
+        return frozenset()
 
     @abstractmethod
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> ServiceServer:

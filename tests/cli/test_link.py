@@ -17,6 +17,7 @@ from gr_ros2.cli.link import status_line
 from gr_ros2.cli.main import run
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.radio.config import load_link
 from tests.domains import free_domains
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -67,11 +68,26 @@ def test_a_link_that_sends_nothing_says_what_it_waits_for() -> None:
         (("mine.yaml", "--listen", "1", "--peer", "2"), "--listen, --peer: mine.yaml says"),
         (("--robot", "255", "--radio", "sim"), "--robot"),
         (("--robot", "1", "--radio", "nope"), "no 'nope'; known are sim, zmq"),
+        (
+            ("--robot", "1", "--radio", "sim", "--middleware", "nope"),
+            "ros_source.middleware = 'nope': no such",
+        ),
     ],
 )
 def test_half_a_line_is_refused(arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["link", *arguments]) == BAD_INPUT
     assert said in capsys.readouterr().err
+
+
+def test_the_middleware_is_that_of_both_directions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    saved = tmp_path / "link.yaml"
+    line = ("link", "--robot", "1", "--radio", "sim", "--middleware", "memory", "--save", str(saved))
+    assert run([*line, "--duration", "0.1"]) == 0
+    assert run(["link", str(saved), "--middleware", "nope"]) == BAD_INPUT
+    assert "nope" in capsys.readouterr().err
+    settings = load_link(saved)
+    assert settings.ros_source.middleware == settings.ros_sink.middleware == "memory"
 
 
 @pytest.mark.slow

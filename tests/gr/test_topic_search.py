@@ -138,3 +138,28 @@ def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) 
 def test_version_0_needs_a_registry() -> None:
     with pytest.raises(ConfigError, match="registry is missing"):
         RosSource(version=0, robot_id=1, topics="auto", middleware="memory", domain_id=free_domains(1)[0])
+
+
+class OfFastDds(MemoryMiddleware):
+    """A graph whose services belong to nodes of rmw_fastrtps."""
+
+    def discover_services(self) -> dict[str, str]:
+        return dict.fromkeys(("/robot_1/add", "/robot_1/sum"), "std_srvs/srv/Trigger")
+
+    def uncallable(self) -> frozenset[str]:
+        return frozenset(self.discover_services())
+
+
+def test_of_services_that_cannot_be_called_one_line_says_what_to_set(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    offered: list[str] = []
+    with OfFastDds(domain_id=free_domains(1)[0]) as graph:
+        running = Running(tmp_path, topics=["auto"], middleware=graph)
+        running.source.offer_with(lambda name, _: offered.append(name))
+        with running:
+            wait_for(lambda: len(running.source.not_offered) == 2, "both services to be found")
+    assert not offered and not running.source.offered
+    (line,) = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert line.startswith("/robot_1/add (std_srvs/srv/Trigger) is not offered: its node has another RMW")
+    assert "--middleware rclpy" in line

@@ -8,9 +8,11 @@ from contextlib import closing
 import pytest
 
 from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.cdr_dds import DiscoveredEndpoint
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_services import with_header, without_header
 from gr_ros2.middleware.ros_graph import NodeEntities, dds_service, ros_service
+from gr_ros2.middleware.services import SERVICE_QOS
 from tests.middleware.calling import ADD, Adder, Caller, Program
 from tests.waiting import wait_for
 
@@ -131,3 +133,14 @@ def test_services_are_announced_with_their_node(graph: DdsMiddleware, monkeypatc
     ]
     params.close()
     assert len(told[-1]) == 1
+
+
+def test_services_of_another_rmw_are_found_and_known_to_be_out_of_reach(graph: DdsMiddleware) -> None:
+    (requests, asks), (replies, answers) = dds_service(SERVICE, ADD)
+    fast = bytes((1, 15)) + bytes(14)
+    ends = [DiscoveredEndpoint(fast, fast, *names, SERVICE_QOS) for names in ((replies, answers), (requests, asks))]
+    with graph._lock:
+        for found, end in zip(graph._found.values(), ends, strict=True):  # publications, then subscriptions
+            found[end.key] = end
+    assert graph.discover_services() == {SERVICE: ADD}
+    assert graph.uncallable() == {SERVICE}
