@@ -182,7 +182,7 @@ class TopicOptions(Queued):
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
         publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000 (``scheduler: freshness``)
-    :param max_rate: messages/s sent at most, 0 unlimited
+    :param max_rate: messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
@@ -334,7 +334,8 @@ class SinkConfig(EndConfig):
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept; version 1 keeps it for as long as it may be repaired
-    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired (version 1)
+    :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
+        it does, until that one is repaired or given up by its sender (version 1)
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all

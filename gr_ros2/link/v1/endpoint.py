@@ -43,13 +43,14 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
-from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
+from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow, Sent
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import NewRow, Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
+    REPORTED,
     Ask,
     Control,
     Heard,
@@ -73,6 +74,8 @@ from gr_ros2.wire.v1 import (
     write_standing,
 )
 
+PATIENCE_S = 0.2
+"""s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
 FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 LIVE_SETTINGS = ("packet_rate", "flush_timeout_s", "dst_id", "hop", "repeat_s", "queue_depth")
@@ -349,6 +352,8 @@ class Endpoint:
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self.settings.give_up_s):
             self._forget(gone.src_id)
+            gone.inbox.told = False
+            self._report_all(gone.inbox.handle_timeout(now))
             self._report_all([Gone(gone.src_id, gone.boot)])
         self.outbox.reported = self.window.reported
         events, self._events = self._events, []
@@ -370,7 +375,7 @@ class Endpoint:
         if waiting is not None:
             leaving.append(waiting)
         if self.settings.hears:
-            leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+            leaving += [n.inbox.report_due(now) for n in self.neighbours]
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
@@ -403,9 +408,11 @@ class Endpoint:
             outbox.expire(now, self.interval)
         due: Sequence[Neighbour] = ()
         if self.settings.hears:
-            due = [n for n in self.neighbours if n.inbox.unreported and n.inbox.report_due(now) <= now]
+            due = [n for n in self.neighbours if n.inbox.report_due(now) <= now]
         if due and self._unheard >= FORCED:
             return self._say(due, now)
+        if not outbox.urgent and (first := self._first(now)) is not None:
+            return first
         filling = outbox.fill(self.window.newest + 1, self._room, now)
         if filling is not None:
             return self._new(filling, due, now)
@@ -415,7 +422,8 @@ class Endpoint:
         if asks:
             return self._control(asks, "hello", now)
         self.window.mode = self._mode()
-        repair = self._repair(now)
+        over = self.window.over(now)
+        repair = self._repair(now) if over < 0 else self._tell(over, now)
         if repair is not None:
             return repair
         early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
@@ -473,7 +481,10 @@ class Endpoint:
         if row is None:
             return self._source([], self.window.exhausted(now), 0, (), now)
         body = write_body(entries, self._room)
-        return self._standing(Standing(row, clear=clear), self.window.newest, body, entries, kind=kind, now=now)
+        over = not self.window.unconfirmed(now)
+        return self._standing(
+            Standing(row, oldest=over, clear=clear), self.window.newest, body, entries, kind=kind, now=now
+        )
 
     def _repair(self, now: float) -> bytes | None:
         self._repair_at = -inf
@@ -484,6 +495,24 @@ class Endpoint:
             lives = () if held else self.window.exhausted(now)
             return self._source([], lives, 0, (), now) if lives else None
         self._hold.repaired(waiting=held)
+        return self._repaired(chosen, now)
+
+    def _first(self, now: float) -> bytes | None:
+        """What goes before new messages: what a receiver lacks or waits for in vain, so that later messages wait."""
+        again = self.window.urgent(now)
+        if again is not None:
+            return self._repaired(again, now)
+        over = self.window.over(now, PATIENCE_S)
+        return self._tell(over, now) if over >= 0 else None
+
+    def _tell(self, number: int, now: float) -> bytes | None:
+        """Say that a packet is not repaired any more."""
+        repair = self.window.tell(number, now)
+        if repair is not None:
+            return self._repaired(repair, now)
+        return None if self.window.unconfirmed(now) else self._control([], "repair", now)
+
+    def _repaired(self, chosen: Sent | Repair, now: float) -> bytes:
         if isinstance(chosen, Repair):
             number, mask, row, oldest, combined = chosen
             return self._standing(Standing(row, mask, oldest), number, combined, (), kind="repair", now=now)
@@ -509,7 +538,7 @@ class Endpoint:
         if self._talk.starting and not self.window.reported:
             outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
-        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now)
+        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now, reported=self.window.reported)
         return self._control(entries, "hello", now, clear=True)
 
     def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
@@ -620,9 +649,11 @@ class Endpoint:
             entries = opened.entries if opened.entries is not None else read_body(opened.body, room)
             self._report_all([Received(data, Packet(opened.header, tuple(entries), standing, b"", encrypted))])
             for entry in entries:
-                if isinstance(entry, (Hello, Ask, Report, Heard)):
+                if isinstance(entry, Hello):
+                    inbox.told = self.settings.hears and entry.capabilities & REPORTED != 0
+                elif isinstance(entry, (Ask, Report, Heard)):
                     self._entry(entry)
-            self._report_all(inbox.heard(number, now))
+            self._report_all(inbox.heard(number, now, over=standing.oldest))
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
@@ -665,6 +696,8 @@ class Endpoint:
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
         self.window.forget(src_id)
+        if not self.window.reported:
+            self._talk.hurry(self._now)
         if self._rate is not None:
             self._rate.forget(src_id)
 

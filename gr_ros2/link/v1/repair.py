@@ -81,9 +81,11 @@ class Life:
     """How long a message is worth repairing.
 
     :param expires: time in s at which it is of no more use
+    :param in_order: whether later messages wait for it
     """
 
     expires: float = inf
+    in_order: bool = False
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""
@@ -135,8 +137,10 @@ class Receiver:
     interval: float = 0.0
     prompt: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
-    waits: bool = False
-    """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
+    waits: int = -1
+    """The oldest packet that the last report misses and that the sender does not repair any more; -1 for none."""
+    waits_since: float = inf
+    """Time in s since which reports miss such packets."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     """Times in s from the departure of packets that were sent once to the report that covers them."""
@@ -201,6 +205,8 @@ class RepairWindow:
         """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
         """Negated numbers of the packets that the only receiver lacks."""
+        self._urgent: list[int] = []
+        """Numbers of the packets that some receiver lacks and for which later messages wait."""
         self._rows: dict[int, int] = {}
         """Rows already used, as bits, by number."""
         self._row = 0
@@ -281,20 +287,24 @@ class RepairWindow:
         soon = bool(peer.answers) and peer.longest <= _SOON * self._period
         peer.prompt = loss >= PROMPT and soon
         records, bit, delay = self._records, peer.bit, peer.delay
-        peer.waits = False
+        peer.waits = -1
         for back in range(MAP):
             record = records.get(number - back)
-            if record is None:
-                peer.waits |= number > back and not arrived >> back & 1
-                continue
-            if record.confirmed & bit:
-                continue
             if arrived >> back & 1:
-                record.confirmed |= bit
-                peer.lost.discard(record.number)
-            elif now - record.at >= delay and record.number not in peer.lost and record.lives:
+                if record is not None:
+                    record.confirmed |= bit
+                    peer.lost.discard(record.number)
+            elif record is None or not record.alive(now):
+                if number > back:
+                    peer.waits = number - back
+            elif record.confirmed & bit:
+                continue
+            elif now - record.at >= delay and record.number not in peer.lost:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
+                if any(life.in_order for life in record.lives):
+                    heappush(self._urgent, record.number)
+        peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         if settled:
             for older in range(self._oldest, number - MAP + 1):
                 record = records.get(older)
@@ -369,6 +379,47 @@ class RepairWindow:
             return again
         return self._combination(window, now)
 
+    def urgent(self, now: float) -> Sent | None:
+        """A packet that goes again before new ones: a report names it as lost, and later messages wait for it.
+
+        The oldest one goes first: a message waits for all packets before its own, whatever they carried.
+        """
+        while self._urgent and self.mode != "off":
+            number = heappop(self._urgent)
+            record = self._records.get(number)
+            lacking = [peer for peer in self._receivers.values() if number in peer.lost]
+            if record is None or not lacking or not record.alive(now):
+                continue
+            for peer in lacking:
+                peer.lost.discard(number)
+            return self._again(record, now)
+        return None
+
+    def over(self, now: float, patience_s: float = 0.0) -> int:
+        """The oldest packet that a receiver has waited for longer than so many s in vain: it is not repaired any more.
+        -1 for none."""
+        waits = [p.waits for p in self._receivers.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
+        return min(waits, default=-1)
+
+    def tell(self, number: int, now: float) -> Repair | None:
+        """A repair from which receivers learn that a packet is not repaired any more; None if there is none."""
+        for peer in self._receivers.values():
+            peer.waits, peer.waits_since = -1, inf
+        self._retire(now)
+        if number < self._oldest:
+            window = list(self._live(self._oldest, self._oldest, now))
+        else:
+            half = MAX_WINDOW // 2
+            window = list(self._live(max(number - half, self._oldest), min(number + half, self.newest), now))[::-1]
+        return self._combination(window, now) if window else None
+
+    def _again(self, record: Sent, now: float) -> Sent:
+        record.at = now
+        self.counts["resent"] += 1
+        self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
+        self._once.discard(record.number)
+        return record
+
     def _named(self, window: list[Sent]) -> bool:
         """Whether a report names a packet of this window that is lost."""
         return any(record.number in peer.lost for peer in self._receivers.values() if peer.lost for record in window)
@@ -407,11 +458,7 @@ class RepairWindow:
             if number in peer.lost:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
-                    record.at = now
-                    self.counts["resent"] += 1
-                    self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
-                    self._once.discard(number)
-                    return record
+                    return self._again(record, now)
         return None
 
     def _window(self, now: float) -> list[Sent]:
@@ -503,8 +550,6 @@ class RepairWindow:
         if not self._receivers:
             return len(window) * self._expected > under_way * (1 - self._expected) + _ENOUGH
         for peer in self._receivers.values():
-            if peer.waits and not under_way:
-                return True
             expected = 0.0 if peer.prompt and self._ahead < 1 else peer.loss
             patience, doubt = peer.patience, peer.doubt
             need = 0.0

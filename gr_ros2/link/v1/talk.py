@@ -15,7 +15,18 @@ from math import inf
 
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
-from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, HEARD_LEN, HELLO_LEN, MARK_LEN, Ask, Control, Heard, Hello
+from gr_ros2.wire.control import (
+    CAN_HEAR,
+    ENCRYPTS,
+    HEARD_LEN,
+    HELLO_LEN,
+    MARK_LEN,
+    REPORTED,
+    Ask,
+    Control,
+    Heard,
+    Hello,
+)
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
@@ -85,13 +96,16 @@ class Talk:
             return late >= latency * LATENCY_S
         return late > (SELDOM_S if heard else OFTEN_S / 2) + latency * LATENCY_S
 
-    def hello(self, room: int, turns: int, digest: int, marks: Sequence[tuple[int, int]], now: float) -> list[Control]:
+    def hello(
+        self, room: int, turns: int, digest: int, marks: Sequence[tuple[int, int]], now: float, *, reported: bool
+    ) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
 
         :param room: bytes free for it
         :param turns: how often the packet number has wrapped around
         :param digest: CRC-32 of the table of topics
         :param marks: marks of the kept messages
+        :param reported: whether robots report to this one
         """
         free = room - HELLO_LEN
         answers = [Heard(*answer) for answer in list(self._answers.items())[: free // HEARD_LEN]]
@@ -103,7 +117,7 @@ class Talk:
         named = tuple([*marks, *marks][self._mark : self._mark + count])
         self._mark = (self._mark + count) % max(len(marks), 1)
         self.due = self._starting.popleft() if self._starting else now + self._period
-        return [Hello(self._boot, turns, self._capabilities, digest, named), *answers]
+        return [Hello(self._boot, turns, self._capabilities | reported * REPORTED, digest, named), *answers]
 
     def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
         """Requests for messages that other robots keep and this one lacks."""
