@@ -256,7 +256,7 @@ class SourceConfig(Queued, EndConfig):
         joins fragments of different messages)
     :param scheduler: how packets are filled, a name of ``gr_ros2.link.SCHEDULER``
     :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
-        version 1 only while no robot reports
+        version 1 only while no robot reports, and up to 32 times as long while none is heard that could be
     :param repair: what idle air is spent on with version 1: idle = all of it on what may have been lost, thrifty = as
         much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
     :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)

@@ -74,6 +74,9 @@ from gr_ros2.wire.v1 import (
     write_standing,
 )
 
+MOST_REPEATS = 32
+"""Most ``repeat_s`` from one repeat of the kept messages to the next, while nobody is heard though somebody could be:
+the time doubles with each repeat, as in Trickle (RFC 6206). A robot that comes then asks for them."""
 PATIENCE_S = 0.2
 """s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
 FORCED = 20
@@ -163,6 +166,7 @@ class Endpoint:
         self._started = False
         self._hello_number = -1
         self._repeat_at = inf
+        self._repeats = 1
         self._unheard = 0
         """New packets since a report became due and found no room."""
         self._sender: Neighbour | None = None
@@ -401,7 +405,8 @@ class Endpoint:
             if talk.urgent(now, idle=idle, latency=outbox.urgent, heard=self.window.reported):
                 return self._hello(now)
         if now >= self._repeat_at:
-            self._repeat_at = now + self.settings.repeat_s
+            self._repeats = min(2 * self._repeats, MOST_REPEATS) if self._lone else 1
+            self._repeat_at = now + self.settings.repeat_s * self._repeats
             if not self.window.reported:
                 outbox.announce(now)
         if outbox.deadlines:
@@ -538,7 +543,8 @@ class Endpoint:
         if self._talk.starting and not self.window.reported:
             outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
-        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now, reported=self.window.reported)
+        reported, lone = self.window.reported, self._lone
+        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now, reported=reported, lone=lone)
         return self._control(entries, "hello", now, clear=True)
 
     def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
@@ -667,6 +673,8 @@ class Endpoint:
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
             self.outbox.reported = True
+        if self._repeats > 1:
+            self._repeats, self._repeat_at = 1, now + self.settings.repeat_s
         if self.settings.hears:
             self._talk.met(neighbour.src_id, neighbour.boot, now)
         self._report_all([Met(neighbour.src_id, neighbour.boot, hears)])
@@ -692,6 +700,11 @@ class Endpoint:
         elif isinstance(entry, Ask) and entry.src_id == own:
             for topic_id in entry.topic_ids:
                 self.outbox.ask(topic_id, now)
+
+    @property
+    def _lone(self) -> bool:
+        """Whether no robot is heard, though one could be."""
+        return self.settings.hears and all(neighbour.gone for neighbour in self.neighbours)
 
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""

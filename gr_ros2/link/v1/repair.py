@@ -1,6 +1,7 @@
 """What an idle slot carries: the sender's side of repair.
 
-*The rule.* New packets always go first. In a slot without a new packet:
+*The rule.* New packets go first, except that a packet which a report names as lost, and for which later messages wait,
+goes before them. In a slot without a new packet:
 
 1. if there is one receiver and its reports name a lost packet that is still alive, that packet is sent again unchanged;
    the newest such packet goes first;
@@ -8,9 +9,10 @@
    packets are alive, the combination is taken from windows of 127 numbers, which move over all of them and overlap.
 
 A packet is *alive* until every receiver that reports has confirmed it, or until all messages in it are over: late, or
-replaced by newer ones. With one live packet the rule is repetition, which is age-optimal. Windows that overlap even out
-the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, and after 1.36
-times as many in separate groups of 64.
+replaced by newer ones. Where no receiver reports, it is also over after as many repairs as the expected losses need, so
+that a robot that nobody hears falls silent. With one live packet the rule is repetition, which is age-optimal. Windows
+that overlap even out the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on
+average, and after 1.36 times as many in separate groups of 64.
 
 *Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
 then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
@@ -31,7 +33,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
-from math import inf
+from math import inf, sqrt
 from typing import Literal, NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
@@ -94,7 +96,12 @@ class Life:
 
 @dataclass(slots=True, eq=False)
 class Sent:
-    """A source packet that left. ``confirmed`` has one bit per receiver; ``at``: when it was last sent, s."""
+    """A source packet that left.
+
+    :param at: when it was last sent, s
+    :param confirmed: one bit per receiver
+    :param covered: number of repairs of it while nobody reported, divided by the number that is enough
+    """
 
     number: int
     body: bytes
@@ -102,6 +109,7 @@ class Sent:
     lives: tuple[Life, ...]
     at: float
     confirmed: int = 0
+    covered: float = 0.0
 
     def alive(self, now: float) -> bool:
         for life in self.lives:  # noqa: SIM110 - any() with a generator takes three times as long
@@ -578,6 +586,12 @@ class RepairWindow:
         mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
         row = self.take_row(newest)
         assert row is not None
+        if not self._receivers:
+            share = 1 / self._enough(len(window))
+            for record in window:
+                record.covered += share
+                if record.covered >= 1:
+                    record.lives = ()
         combined = combine([(record.number, record.body) for record in window], row)
         self._fly(now, first, newest)
         self._once.difference_update(range(first, newest + 1))
@@ -585,6 +599,12 @@ class RepairWindow:
         self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
         oldest = first == self._oldest
         return Repair(newest, mask, row, oldest, combined)
+
+    def _enough(self, count: int) -> float:
+        """Number of repairs after which so many packets are complete at a receiver with the expected loss, all but
+        surely (five standard deviations)."""
+        lost = count * self._expected
+        return (lost + 5 * sqrt(lost) + 3) / (1 - min(self._expected, _MOST_LOSS))
 
     def _anchored(self, window: list[Sent]) -> list[Sent]:
         """The window, changed so that a repair can stand at its newest packet.

@@ -169,7 +169,7 @@ def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
 
 
 def test_short_messages_are_repaired_beside_a_long_one() -> None:
-    sender = window()
+    sender = window(expected_loss=0.5)
     long, short = Life(), Life()
     for number in range(1, 301):
         sender.sent(number, body(number), b"", (long,), 0.0)
