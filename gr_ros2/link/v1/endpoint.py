@@ -416,7 +416,7 @@ class Endpoint:
             due = [n for n in self.neighbours if n.inbox.report_due(now) <= now]
         if due and self._unheard >= FORCED:
             return self._say(due, now)
-        if not outbox.urgent and (first := self._first(now)) is not None:
+        if self.window.pressing and not outbox.urgent and (first := self._first(now)) is not None:
             return first
         filling = outbox.fill(self.window.newest + 1, self._room, now)
         if filling is not None:

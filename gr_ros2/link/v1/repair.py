@@ -403,6 +403,11 @@ class RepairWindow:
             return self._again(record, now)
         return None
 
+    @property
+    def pressing(self) -> bool:
+        """Whether ``urgent`` or ``over`` may have something."""
+        return bool(self._urgent) or any(peer.waits >= 0 for peer in self._receivers.values())
+
     def over(self, now: float, patience_s: float = 0.0) -> int:
         """The oldest packet that a receiver has waited for longer than so many s in vain: it is not repaired any more.
         -1 for none."""
