@@ -16,6 +16,7 @@ from bench.rows import Row, table
 BENCHMARKS = {
     "codec": "bench.codec",
     "repair": "bench.repair",
+    "repair_backlog": "bench.repair_backlog",
     "repair_runs": "bench.repair_runs",
     "saturated": "bench.saturated",
     "bound": "bench.bound",

@@ -183,7 +183,7 @@ class TopicOptions(Queued):
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
         publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000
-    :param max_rate: messages/s sent at most, 0 unlimited
+    :param max_rate: messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
@@ -263,7 +263,7 @@ class SourceConfig(Queued, EndConfig):
     :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
         joins fragments of different messages)
     :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
-        version 1 only while no robot reports
+        version 1 only while no robot reports, and up to 32 times as long while none is heard that could be
     :param compression: code every message, which a receiver sees by itself; auto = with version 1, which the paper's
         version 0 leaves off
     :param repair: what idle air is spent on: idle = all of it on what may have been lost, thrifty = as
@@ -348,7 +348,8 @@ class SinkConfig(EndConfig):
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept
-    :param hold_s: s that a message of a reliable topic waits for an earlier one that may yet be repaired
+    :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
+        it does, until that one is repaired or given up by its sender
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all

@@ -31,7 +31,7 @@ class Hello(NamedTuple):
 
     :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
     :param turns: how often the 16-bit packet number has wrapped around, 0..2^32-1
-    :param capabilities: ``CAN_HEAR`` and ``ENCRYPTS``; other bits are ignored
+    :param capabilities: ``CAN_HEAR``, ``ENCRYPTS`` and ``REPORTED``; other bits are ignored
     :param digest: CRC-32 of the robot's table of topics, 0 if it has none
     :param marks: (topic id, CRC-32 of the message as transmitted) of messages kept for robots that join late
     """
@@ -47,6 +47,7 @@ class Hello(NamedTuple):
         words = [f"hello, boot {self.boot}, turns {self.turns}"]
         words += ["hears and reports"] * (self.capabilities & CAN_HEAR != 0)
         words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
+        words += ["is reported to"] * (self.capabilities & REPORTED != 0)
         words += [f"table {self.digest:08x}"] * (self.digest != 0)
         words += [f"keeps topic {topic_id} {mark:08x}" for topic_id, mark in self.marks]
         return ", ".join(words)
@@ -56,6 +57,8 @@ CAN_HEAR = 1
 """The robot receives too, and reports what it hears."""
 ENCRYPTS = 2
 """Bodies of the robot's packets are encrypted; without this bit, sealed packets are only authenticated."""
+REPORTED = 4
+"""Robots report to this one what they hear: it repairs what they lack, or says that it does not."""
 
 
 class Ask(NamedTuple):

@@ -139,7 +139,7 @@ class Standing(NamedTuple):
 
     :param row: 0..127; number and row together identify the packet
     :param mask: bit i says that source packet ``number - i`` is part of the combination; 0 in a control packet
-    :param oldest: no packet older than the window is needed any more
+    :param oldest: no packet older than the window is repaired any more; in a control packet none up to its number
     :param clear: the entries are not encrypted (as in a hello, without which nothing could be decrypted)
     :param size: bytes on the wire
     """
@@ -216,7 +216,7 @@ def write_standing(standing: Standing) -> bytes:
     """
     row, mask, oldest, clear, _ = standing
     window = mask.bit_length()
-    if not 0 <= row < ROWS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)) or oldest > mask:
+    if not 0 <= row < ROWS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)):
         raise EncodeError(f"{standing}: a row is 0..127, a mask has up to 127 bits and the lowest set")
     second = row | oldest * _OLDEST
     if not mask:
@@ -237,9 +237,7 @@ def read_standing(data: bytes, start: int, end: int) -> Standing:
     window, row = data[start] & 127, data[start + 1] & 127
     flag, oldest = data[start] & _MASKED, data[start + 1] & _OLDEST != 0
     if not window:
-        if oldest:
-            raise WindowError("a control packet that says which packets are too old")
-        return Standing(row, 0, False, flag != 0)
+        return Standing(row, 0, oldest, flag != 0)
     if not flag:
         return Standing(row, (1 << window) - 1, oldest)
     size = STANDING_LEN + (window + 7) // 8

@@ -228,8 +228,6 @@ def read_packet(
         members = list(range(window))
         if not window:
             hello = masked
-            if oldest:
-                raise Refused("window")
         elif masked:
             size = (window + 7) // 8
             if start + size > end:

@@ -44,13 +44,14 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
 from gr_ros2.link.v1.outbox import Filling, Outbox
-from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow
+from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow, Sent
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
 from gr_ros2.link.v1.talk import Talk
 from gr_ros2.registry import NewRow, Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
+    REPORTED,
     Ask,
     Control,
     Heard,
@@ -78,6 +79,11 @@ GIVE_UP_S = 10.0
 """s of silence after which a robot is regarded as gone."""
 HOP = 1
 """Hop count of addressed packets: nothing relays them yet."""
+MOST_REPEATS = 32
+"""Most ``repeat_s`` from one repeat of the kept messages to the next, while nobody is heard though somebody could be:
+the time doubles with each repeat, as in Trickle (RFC 6206). A robot that comes then asks for them."""
+PATIENCE_S = 0.2
+"""s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
 FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 _POLL_S, _CALM_POLL_S = 0.02, 0.1
@@ -163,6 +169,7 @@ class Endpoint:
         self._started = False
         self._hello_number = -1
         self._repeat_at = inf
+        self._repeats = 1
         self._unheard = 0
         """New packets since a report became due and found no room."""
         self._sender: Neighbour | None = None
@@ -352,6 +359,8 @@ class Endpoint:
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, GIVE_UP_S):
             self._forget(gone.src_id)
+            gone.inbox.told = False
+            self._report_all(gone.inbox.handle_timeout(now))
             self._report_all([Gone(gone.src_id, gone.boot)])
         self.outbox.reported = self.window.reported
         events, self._events = self._events, []
@@ -373,7 +382,7 @@ class Endpoint:
         if waiting is not None:
             leaving.append(waiting)
         if self.settings.hears:
-            leaving += [n.inbox.report_due(now) for n in self.neighbours if n.inbox.unreported]
+            leaving += [n.inbox.report_due(now) for n in self.neighbours]
             leaving += [now for n in self.neighbours if n.inbox.report_helps]
         if self._repeat_at < inf:
             leaving.append(self._repeat_at)
@@ -400,16 +409,19 @@ class Endpoint:
             if talk.urgent(now, idle=idle, latency=outbox.urgent, heard=self.window.reported):
                 return self._hello(now)
         if now >= self._repeat_at:
-            self._repeat_at = now + self.settings.repeat_s
+            self._repeats = min(2 * self._repeats, MOST_REPEATS) if self._lone else 1
+            self._repeat_at = now + self.settings.repeat_s * self._repeats
             if not self.window.reported:
                 outbox.announce(now)
         if outbox.deadlines:
             outbox.expire(now, self.interval)
         due: Sequence[Neighbour] = ()
         if self.settings.hears:
-            due = [n for n in self.neighbours if n.inbox.unreported and n.inbox.report_due(now) <= now]
+            due = [n for n in self.neighbours if n.inbox.report_due(now) <= now]
         if due and self._unheard >= FORCED:
             return self._say(due, now)
+        if self.window.pressing and not outbox.urgent and (first := self._first(now)) is not None:
+            return first
         filling = outbox.fill(self.window.newest + 1, self._room, now)
         if filling is not None:
             return self._new(filling, due, now)
@@ -419,7 +431,8 @@ class Endpoint:
         if asks:
             return self._control(asks, "hello", now)
         self.window.mode = self._mode()
-        repair = self._repair(now)
+        over = self.window.over(now)
+        repair = self._repair(now) if over < 0 else self._tell(over, now)
         if repair is not None:
             return repair
         early = [n for n in self.neighbours if n.inbox.report_helps] if self.settings.hears else ()
@@ -477,7 +490,10 @@ class Endpoint:
         if row is None:
             return self._source([], self.window.exhausted(now), 0, (), now)
         body = write_body(entries, self._room)
-        return self._standing(Standing(row, clear=clear), self.window.newest, body, entries, kind=kind, now=now)
+        over = not self.window.unconfirmed(now)
+        return self._standing(
+            Standing(row, oldest=over, clear=clear), self.window.newest, body, entries, kind=kind, now=now
+        )
 
     def _repair(self, now: float) -> bytes | None:
         self._repair_at = -inf
@@ -488,6 +504,24 @@ class Endpoint:
             lives = () if held else self.window.exhausted(now)
             return self._source([], lives, 0, (), now) if lives else None
         self._hold.repaired(waiting=held)
+        return self._repaired(chosen, now)
+
+    def _first(self, now: float) -> bytes | None:
+        """What goes before new messages: what a receiver lacks or waits for in vain, so that later messages wait."""
+        again = self.window.urgent(now)
+        if again is not None:
+            return self._repaired(again, now)
+        over = self.window.over(now, PATIENCE_S)
+        return self._tell(over, now) if over >= 0 else None
+
+    def _tell(self, number: int, now: float) -> bytes | None:
+        """Say that a packet is not repaired any more."""
+        repair = self.window.tell(number, now)
+        if repair is not None:
+            return self._repaired(repair, now)
+        return None if self.window.unconfirmed(now) else self._control([], "repair", now)
+
+    def _repaired(self, chosen: Sent | Repair, now: float) -> bytes:
         if isinstance(chosen, Repair):
             number, mask, row, oldest, combined = chosen
             return self._standing(Standing(row, mask, oldest), number, combined, (), kind="repair", now=now)
@@ -513,7 +547,8 @@ class Endpoint:
         if self._talk.starting and not self.window.reported:
             outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
-        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now)
+        reported, lone = self.window.reported, self._lone
+        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now, reported=reported, lone=lone)
         return self._control(entries, "hello", now, clear=True)
 
     def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
@@ -624,9 +659,11 @@ class Endpoint:
             entries = opened.entries if opened.entries is not None else read_body(opened.body, room)
             self._report_all([Received(data, Packet(opened.header, tuple(entries), standing, b"", encrypted))])
             for entry in entries:
-                if isinstance(entry, (Hello, Ask, Report, Heard)):
+                if isinstance(entry, Hello):
+                    inbox.told = self.settings.hears and entry.capabilities & REPORTED != 0
+                elif isinstance(entry, (Ask, Report, Heard)):
                     self._entry(entry)
-            self._report_all(inbox.heard(number, now))
+            self._report_all(inbox.heard(number, now, over=standing.oldest))
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
@@ -640,6 +677,8 @@ class Endpoint:
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
             self.outbox.reported = True
+        if self._repeats > 1:
+            self._repeats, self._repeat_at = 1, now + self.settings.repeat_s
         if self.settings.hears:
             self._talk.met(neighbour.src_id, neighbour.boot, now)
         self._report_all([Met(neighbour.src_id, neighbour.boot, hears)])
@@ -666,9 +705,16 @@ class Endpoint:
             for topic_id in entry.topic_ids:
                 self.outbox.ask(topic_id, now)
 
+    @property
+    def _lone(self) -> bool:
+        """Whether no robot is heard, though one could be."""
+        return self.settings.hears and all(neighbour.gone for neighbour in self.neighbours)
+
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
         self.window.forget(src_id)
+        if not self.window.reported:
+            self._talk.hurry(self._now)
         if self._rate is not None:
             self._rate.forget(src_id)
 

@@ -29,7 +29,7 @@ class Settings:
     :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
-    :param hold_s: s that a complete message of a reliable topic waits for an earlier one that can still be repaired
+    :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time

@@ -1,10 +1,11 @@
 """The receiving side for one robot: it turns packets into messages, in order.
 
 *Order.* A message of a topic with reliable publishers waits until every packet before the one in which it began is here
-or given up, because it is not known which messages those packets carried. A missing packet is given up for this purpose
-in three cases: its sender says that the packet is over; ``hold_s`` have passed since it was missed; or hardly any
-missing packet comes back, in which case it is given up at once. Messages of other topics are delivered as they arrive,
-but never after a later message of the same topic.
+or given up, because it is not known which messages those packets carried. A sender that gets reports repairs a missing
+packet, or says that it does not any more. Only then it is given up, or when the sender is gone, or when the messages
+that wait fill the memory. From a sender without reports a missing packet is also given up ``hold_s`` after it was
+missed, or at once if hardly any missing packet comes back. Messages of other topics are delivered as they arrive, but
+never after a later message of the same topic.
 
 Invariants: no message is delivered twice, or after a later message of its topic; every message of which a part arrived
 ends in one Delivered or Lost; memory is bounded.
@@ -15,6 +16,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from zlib import crc32
 
 from gr_ros2.errors import CodecError, WireError
@@ -129,9 +131,13 @@ class Inbox:
         """Packets that their sender has left out of a repair."""
         self._gaps: deque[tuple[float, int]] = deque()
         """Packets that are missing, and since when (s); only numbers that are still remembered."""
+        self.told = False
+        """Whether the sender gets reports. It then says which packets it does not repair any more."""
         self._hope = 1.0
         """Share of missing packets that are recovered in time."""
         self._reassembly = Reassembly(settings.max_source_bytes)
+        self._kept_back = 0
+        """Bytes of the complete messages that wait for an earlier one."""
         self._ready: dict[int, list[_Ready]] = {}
         """Messages waiting for their turn, by topic."""
         self._unknown: deque[_Ready] = deque()
@@ -205,9 +211,14 @@ class Inbox:
         self._settle()
         return self._given()
 
-    def heard(self, number: int, now: float) -> Events:
-        """Note the number at which a packet stands that is neither a source packet nor a repair."""
+    def heard(self, number: int, now: float, *, over: bool = False) -> Events:
+        """Note the number at which a packet stands that is neither a source packet nor a repair.
+
+        :param over: the sender repairs no packet up to that number
+        """
         self._advance(number, now, here=False)
+        if over:
+            self._dead = max(self._dead, number + 1)
         self._settle()
         return self._given()
 
@@ -222,7 +233,7 @@ class Inbox:
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
         times = []
-        if self._gaps and any(self._ready.values()):
+        if not self.told and self._gaps and any(self._ready.values()):
             times.append(self._gaps[0][0] + self._settings.hold_s)
         waiting = self._reassembly.next_timeout()
         if waiting is not None:
@@ -238,6 +249,7 @@ class Inbox:
         for waiting in self._unknown:
             self._never_known(waiting)
         self._ready.clear()
+        self._kept_back = 0
         self._unknown.clear()
         return self._given()
 
@@ -247,7 +259,12 @@ class Inbox:
         return value not in self.marks.get(topic_id, ()) and not self._reassembly.growing(topic_id, now - 1.0)
 
     def report_due(self, now: float) -> float:
-        """When the next report is due, as long as there are packets since the last one."""
+        """When the next report is due, s; infinite if there is nothing to report.
+
+        While messages wait for an earlier one, reports go on: the last one may be lost, and with it that they wait.
+        """
+        if not self.unreported:
+            return self._reported_at + _CALM_S if self.told and self._kept_back else inf
         half = self._settings.half_duplex
         every = _REPORT_EVERY * (4 if half else 1)
         most = min(every * self._pause / _REPORT_S, max(every, MAP // 2))
@@ -386,6 +403,7 @@ class Inbox:
                 self._waiting -= len(lost.payload)
                 self._never_known(lost)
         elif row.reliable and ready.order[0] > self._low:
+            self._kept_back += len(ready.payload) + _PACKET_COST
             self._ready.setdefault(ready.topic_id, []).append(ready)
         else:
             self._deliver(ready, row)
@@ -403,7 +421,9 @@ class Inbox:
         """Find up to which packet everything is here or given up, and deliver the messages that waited for that."""
         decoder, dead, void = self.decoder, max(self._dead, self.decoder.floor), self._void
         newest, low = decoder.newest, self._low
-        if self._gaps:
+        if self._kept_back > self._settings.max_source_bytes:
+            low = newest + 1
+        elif self._gaps and not self.told:
             low = self._give_up(low, dead)
         while low <= newest and (low in decoder or low < dead or low in void):
             low += 1
@@ -437,7 +457,9 @@ class Inbox:
     def _release(self, row: TableRow, line: list[_Ready]) -> None:
         line.sort(key=lambda ready: ready.order)
         while line and line[0].order[0] <= self._low:
-            self._deliver(line.pop(0), row)
+            ready = line.pop(0)
+            self._kept_back -= len(ready.payload) + _PACKET_COST
+            self._deliver(ready, row)
 
     def _deliver(self, ready: _Ready, row: TableRow) -> None:
         topic_id, key = ready.topic_id, self._key(ready.order)
@@ -485,6 +507,7 @@ class Inbox:
         self.rows = {row.topic_id: row for row in rows}
         for topic_id in [topic_id for topic_id in self._ready if topic_id not in self.rows]:
             for ready in self._ready.pop(topic_id):
+                self._kept_back -= len(ready.payload) + _PACKET_COST
                 self._events.append(Lost(self.src_id, topic_id, LedgerRow.UNKNOWN_TOPIC, self._key(ready.order)))
         if self._decoder_for is not None:
             self._codec = self._decoder_for(rows)

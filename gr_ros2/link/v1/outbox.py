@@ -1,7 +1,8 @@
 """What waits to be sent, and what goes into the next packet.
 
-*Order.* Messages of class latency go first, then default, then bulk. Within a class, the message with the largest value
-per byte sent goes first, ``weight * g^2 / c`` (see ``freshness``). Every ``TURN``-th packet begins with the topic
+*Order.* Messages of class latency go first, then default, then bulk. Within a class, messages of more than ``LONG``
+packets go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 / c`` (see
+``freshness``). Every ``TURN``-th packet begins with the topic
 whose last turn is longest ago, so that no topic starves.
 
 *Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
@@ -10,7 +11,8 @@ the free bytes of the packet; it is not fixed beforehand.
 *Lifetime.* The topic decides how long a message is worth repairing. With ``latest``, it is until a newer message has
 left whole. With a lifespan, it is until that has passed. Otherwise it is until ``depth`` newer messages have left, or
 enough newer ones to fill a repair, and not longer after the next message than a receiver waits for it. Receivers that
-report say when they have a message; then only the publishers' depth limits the lifetime.
+report say when they have a message: then a message that is delivered in order is repaired until they have it, and any
+other until ``depth`` newer ones have left.
 
 Invariants: the messages of a topic begin one after the other, each after the one before has left whole; every message
 ends in being sent or in a Refused with its row.
@@ -49,6 +51,9 @@ SHARE = 2
 lost with any of them. With smaller fragments (3), the scans of ``six-topics-paced`` are 3 % younger without loss, and
 16 % older at 20 % loss. A message of class latency uses any space that is free from ``MIN_FRAGMENT`` bytes on."""
 MIN_FRAGMENT = 16
+LONG = 64
+"""A message of more packets goes after all others of its class, into the room that these leave. Odometry at 35 Hz
+beside 1 MB is then 1.05 times as old as without it; by value alone 1.4 times, because the last 60 kB go before it."""
 TABLE_FIRST = 2
 """Number of packets up to which the table of topics goes before messages."""
 SETTLING_S = 1.0
@@ -60,8 +65,10 @@ WORTH = 0.85
 """Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
 REPORTED_DEPTH = 160
-"""Newer messages after which a message is not repaired any more where receivers report and the publishers' depth is not
-known; but it is repaired for as long as a receiver waits for it (``hold_s``)."""
+"""Newer messages after which a message of a best-effort topic is not repaired any more, where receivers report and the
+publishers' depth is not known."""
+MOST_LIVES = 4096
+"""The same for a topic that is delivered in order: a bound on memory. Its receivers wait for the message."""
 UNREPORTED_DEPTH = 48
 """Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
 to topics without lifespan."""
@@ -102,7 +109,7 @@ class _Line:
     :param ordered: whether all its publishers are reliable
     :param hidden: whether the table leaves it out: a service whose server is not there
     :param newest: when the newest of its messages that have left was submitted, s
-    :param lives: lifetimes of its messages that have left, the packets of each, and when it left in s
+    :param lives: lifetimes of its messages that have left, and the packets of each
     :param packets: the packets of all of them
     """
 
@@ -115,7 +122,7 @@ class _Line:
     depth: int = 0
     ordered: bool = True
     newest: float = -inf
-    lives: deque[tuple[Life, int, float]] = field(default_factory=deque)
+    lives: deque[tuple[Life, int]] = field(default_factory=deque)
     packets: int = 0
 
     @property
@@ -128,6 +135,11 @@ class _Line:
         depth = self.topic.options.depth
         return 1 if depth == AUTO else depth
 
+    @property
+    def in_order(self) -> bool:
+        """Whether its messages are delivered in order, each after all earlier ones."""
+        wanted = self.topic.options.reliability
+        return (self.ordered if wanted == AUTO else wanted == "reliable") and self.queue.policy != "latest"
 
 @dataclass(slots=True)
 class Filling:
@@ -338,7 +350,7 @@ class Outbox:
             if taken == remaining and position + 1 < len(queue):
                 following = queue[position + 1]
                 worth = value(following, message.submitted, _ENTRY)
-                heappush(heap, (RANK[following.qos], -worth, topic_id, position + 1))
+                heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
         if not picks:
             return None
         return self._take(picks, number, used, now)
@@ -354,6 +366,9 @@ class Outbox:
     def urgent(self) -> bool:
         """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
         return any(line.queue and line.queue[0].qos == QOS_LATENCY for line in self._sending())
+
+    def _rank(self, message: Outgoing) -> float:
+        return RANK[message.qos] + 0.5 * (len(message.payload) > LONG * self._room)
 
     @property
     def idle(self) -> bool:
@@ -376,12 +391,10 @@ class Outbox:
             if line.hidden:
                 continue
             topic, options = line.topic, line.topic.options
-            ordered = line.ordered if options.reliability == AUTO else options.reliability == "reliable"
-            ordered = ordered and line.queue.policy != "latest"
             depth = min(line.kept_depth if line.kept else line.depth if options.depth == AUTO else options.depth, 255)
             codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
             rows.append(
-                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec)
+                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, line.in_order, line.kept, depth, codec)
             )
         if not rows and not self.digest:
             return
@@ -408,20 +421,20 @@ class Outbox:
         if dropped := line.queue.admit(message, self._queue_depth(line)):
             self._drop(dropped)
 
-    def _heap(self, now: float) -> list[tuple[int, float, int, int]]:
+    def _heap(self, now: float) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
         self._open = {}
         for topic_id, line in self._lines.items():
             if line.queue and (ready := line.queue.open(now)):
                 self._open[topic_id] = ready
-        heap: list[tuple[int, float, int, int]] = []
+        heap: list[tuple[float, float, int, int]] = []
         if not self._open:
             return heap
         holder = self._holder = self._turns.holder(self._open)
         for topic_id, ready in self._open.items():
             head, before = ready[0], self._lines[topic_id].newest
             worth = value(head, before if before > -inf else head.submitted - FIRST_AGE_S, _ENTRY)
-            rank = RANK[head.qos]
+            rank = self._rank(head)
             heap.append((-1 if rank and topic_id == holder else rank, -worth, topic_id, 0))
         heapify(heap)
         return heap
@@ -445,6 +458,7 @@ class Outbox:
             if not message.index:
                 message.begin, message.place = number, place
                 message.life.expires = message.expires
+                message.life.in_order = line.in_order
                 line.queue.started(now)
             payload = message.take(taken)
             last, begin = message.offset == len(message.payload), message.begin
@@ -469,20 +483,18 @@ class Outbox:
         line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
         lives = line.lives
-        most, least_s = UNREPORTED_DEPTH, 0.0
+        most = UNREPORTED_DEPTH
         if line.queue.policy == "latest":
             most = 1
         elif self.reported:
-            most, least_s = (line.depth, 0.0) if line.depth else (REPORTED_DEPTH, self._settings.hold_s)
+            most = MOST_LIVES if line.in_order else line.depth or REPORTED_DEPTH
         elif lives:
-            before, _, _ = lives[-1]
+            before, _ = lives[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((life, message.index, now))
+        lives.append((life, message.index))
         line.packets += message.index
-        while len(lives) > 1 and (
-            (len(lives) > most and now - lives[0][2] >= least_s) or (line.packets > GROUP and not self.reported)
-        ):
-            replaced, count, _ = lives.popleft()
+        while len(lives) > 1 and (len(lives) > most or (line.packets > GROUP and not self.reported)):
+            replaced, count = lives.popleft()
             replaced.end()
             line.packets -= count
         if topic_id not in self._kept:

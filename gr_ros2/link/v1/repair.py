@@ -1,6 +1,7 @@
 """What an idle slot carries: the sender's side of repair.
 
-*The rule.* New packets always go first. In a slot without a new packet:
+*The rule.* New packets go first, except that a packet which a report names as lost, and for which later messages wait,
+goes before them. In a slot without a new packet:
 
 1. if there is one receiver and its reports name a lost packet that is still alive, that packet is sent again unchanged;
    the newest such packet goes first;
@@ -8,9 +9,10 @@
    packets are alive, the combination is taken from windows of 127 numbers, which move over all of them and overlap.
 
 A packet is *alive* until every receiver that reports has confirmed it, or until all messages in it are over: late, or
-replaced by newer ones. With one live packet the rule is repetition, which is age-optimal. Windows that overlap even out
-the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on average, and after 1.36
-times as many in separate groups of 64.
+replaced by newer ones. Where no receiver reports, it is also over after as many repairs as the expected losses need, so
+that a robot that nobody hears falls silent. With one live packet the rule is repetition, which is age-optimal. Windows
+that overlap even out the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on
+average, and after 1.36 times as many in separate groups of 64.
 
 *Thrifty.* A receiver that loses packets reports every packet at once if that takes no slot from anything. The sender
 then knows when a report is overdue: the packet or its report was lost, and a repair is due. From other receivers, whose
@@ -31,7 +33,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
-from math import inf
+from math import inf, sqrt
 from typing import Literal, NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
@@ -81,9 +83,11 @@ class Life:
     """How long a message is worth repairing.
 
     :param expires: time in s at which it is of no more use
+    :param in_order: whether later messages wait for it
     """
 
     expires: float = inf
+    in_order: bool = False
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""
@@ -92,7 +96,12 @@ class Life:
 
 @dataclass(slots=True, eq=False)
 class Sent:
-    """A source packet that left. ``confirmed`` has one bit per receiver; ``at``: when it was last sent, s."""
+    """A source packet that left.
+
+    :param at: when it was last sent, s
+    :param confirmed: one bit per receiver
+    :param covered: number of repairs of it while nobody reported, divided by the number that is enough
+    """
 
     number: int
     body: bytes
@@ -100,6 +109,7 @@ class Sent:
     lives: tuple[Life, ...]
     at: float
     confirmed: int = 0
+    covered: float = 0.0
 
     def alive(self, now: float) -> bool:
         for life in self.lives:  # noqa: SIM110 - any() with a generator takes three times as long
@@ -135,8 +145,10 @@ class Receiver:
     interval: float = 0.0
     prompt: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
-    waits: bool = False
-    """Whether the receiver waits for a packet that the sender does not repair any more. A repair tells it so."""
+    waits: int = -1
+    """The oldest packet that the last report misses and that the sender does not repair any more; -1 for none."""
+    waits_since: float = inf
+    """Time in s since which reports miss such packets."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     """Times in s from the departure of packets that were sent once to the report that covers them."""
@@ -201,6 +213,8 @@ class RepairWindow:
         """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
         """Negated numbers of the packets that the only receiver lacks."""
+        self._urgent: list[int] = []
+        """Numbers of the packets that some receiver lacks and for which later messages wait."""
         self._rows: dict[int, int] = {}
         """Rows already used, as bits, by number."""
         self._row = 0
@@ -281,20 +295,24 @@ class RepairWindow:
         soon = bool(peer.answers) and peer.longest <= _SOON * self._period
         peer.prompt = loss >= PROMPT and soon
         records, bit, delay = self._records, peer.bit, peer.delay
-        peer.waits = False
+        peer.waits = -1
         for back in range(MAP):
             record = records.get(number - back)
-            if record is None:
-                peer.waits |= number > back and not arrived >> back & 1
-                continue
-            if record.confirmed & bit:
-                continue
             if arrived >> back & 1:
-                record.confirmed |= bit
-                peer.lost.discard(record.number)
-            elif now - record.at >= delay and record.number not in peer.lost and record.lives:
+                if record is not None:
+                    record.confirmed |= bit
+                    peer.lost.discard(record.number)
+            elif record is None or not record.alive(now):
+                if number > back:
+                    peer.waits = number - back
+            elif record.confirmed & bit:
+                continue
+            elif now - record.at >= delay and record.number not in peer.lost:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
+                if any(life.in_order for life in record.lives):
+                    heappush(self._urgent, record.number)
+        peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         if settled:
             for older in range(self._oldest, number - MAP + 1):
                 record = records.get(older)
@@ -369,6 +387,52 @@ class RepairWindow:
             return again
         return self._combination(window, now)
 
+    def urgent(self, now: float) -> Sent | None:
+        """A packet that goes again before new ones: a report names it as lost, and later messages wait for it.
+
+        The oldest one goes first: a message waits for all packets before its own, whatever they carried.
+        """
+        while self._urgent and self.mode != "off":
+            number = heappop(self._urgent)
+            record = self._records.get(number)
+            lacking = [peer for peer in self._receivers.values() if number in peer.lost]
+            if record is None or not lacking or not record.alive(now):
+                continue
+            for peer in lacking:
+                peer.lost.discard(number)
+            return self._again(record, now)
+        return None
+
+    @property
+    def pressing(self) -> bool:
+        """Whether ``urgent`` or ``over`` may have something."""
+        return bool(self._urgent) or any(peer.waits >= 0 for peer in self._receivers.values())
+
+    def over(self, now: float, patience_s: float = 0.0) -> int:
+        """The oldest packet that a receiver has waited for longer than so many s in vain: it is not repaired any more.
+        -1 for none."""
+        waits = [p.waits for p in self._receivers.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
+        return min(waits, default=-1)
+
+    def tell(self, number: int, now: float) -> Repair | None:
+        """A repair from which receivers learn that a packet is not repaired any more; None if there is none."""
+        for peer in self._receivers.values():
+            peer.waits, peer.waits_since = -1, inf
+        self._retire(now)
+        if number < self._oldest:
+            window = list(self._live(self._oldest, self._oldest, now))
+        else:
+            half = MAX_WINDOW // 2
+            window = list(self._live(max(number - half, self._oldest), min(number + half, self.newest), now))[::-1]
+        return self._combination(window, now) if window else None
+
+    def _again(self, record: Sent, now: float) -> Sent:
+        record.at = now
+        self.counts["resent"] += 1
+        self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
+        self._once.discard(record.number)
+        return record
+
     def _named(self, window: list[Sent]) -> bool:
         """Whether a report names a packet of this window that is lost."""
         return any(record.number in peer.lost for peer in self._receivers.values() if peer.lost for record in window)
@@ -407,11 +471,7 @@ class RepairWindow:
             if number in peer.lost:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
-                    record.at = now
-                    self.counts["resent"] += 1
-                    self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
-                    self._once.discard(number)
-                    return record
+                    return self._again(record, now)
         return None
 
     def _window(self, now: float) -> list[Sent]:
@@ -503,8 +563,6 @@ class RepairWindow:
         if not self._receivers:
             return len(window) * self._expected > under_way * (1 - self._expected) + _ENOUGH
         for peer in self._receivers.values():
-            if peer.waits and not under_way:
-                return True
             expected = 0.0 if peer.prompt and self._ahead < 1 else peer.loss
             patience, doubt = peer.patience, peer.doubt
             need = 0.0
@@ -533,6 +591,12 @@ class RepairWindow:
         mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
         row = self.take_row(newest)
         assert row is not None
+        if not self._receivers:
+            share = 1 / self._enough(len(window))
+            for record in window:
+                record.covered += share
+                if record.covered >= 1:
+                    record.lives = ()
         combined = combine([(record.number, record.body) for record in window], row)
         self._fly(now, first, newest)
         self._once.difference_update(range(first, newest + 1))
@@ -540,6 +604,12 @@ class RepairWindow:
         self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
         oldest = first == self._oldest
         return Repair(newest, mask, row, oldest, combined)
+
+    def _enough(self, count: int) -> float:
+        """Number of repairs after which so many packets are complete at a receiver with the expected loss, all but
+        surely (five standard deviations)."""
+        lost = count * self._expected
+        return (lost + 5 * sqrt(lost) + 3) / (1 - min(self._expected, _MOST_LOSS))
 
     def _anchored(self, window: list[Sent]) -> list[Sent]:
         """The window, changed so that a repair can stand at its newest packet.

@@ -2,7 +2,8 @@
 
 Hellos are sent at the start, several in the first second because any of them may be lost; whenever the table of topics
 changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
-50 bytes/s. While messages wait, hellos are delayed: by half a second, or by two seconds if receivers report.
+50 bytes/s, or less and less often while nobody is heard. While messages wait, hellos are delayed: by half a second, or
+by two seconds if receivers report.
 
 Invariant: a hello names a kept message only after the receivers had time to get it when it was first sent.
 """
@@ -15,7 +16,18 @@ from math import inf
 
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
-from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, HEARD_LEN, HELLO_LEN, MARK_LEN, Ask, Control, Heard, Hello
+from gr_ros2.wire.control import (
+    CAN_HEAR,
+    ENCRYPTS,
+    HEARD_LEN,
+    HELLO_LEN,
+    MARK_LEN,
+    REPORTED,
+    Ask,
+    Control,
+    Heard,
+    Hello,
+)
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
@@ -23,6 +35,9 @@ STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 HELLO_BYTES_S = 50.0
 """Bytes/s that hellos take, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
 OFTEN_S, SELDOM_S = 1.0, 2.0
+LONE_S = 10.0
+"""Most s between two hellos of a robot that hears nobody: the time doubles with each hello, as in Trickle (RFC 6206). A
+robot that starts is met at once, by its own hellos."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 ASK_S = 0.5
@@ -42,6 +57,8 @@ class Talk:
         self._boot = boot
         self._capabilities = settings.hears * CAN_HEAR | encrypts * ENCRYPTS
         self._period = min(max(OFTEN_S, settings.packet_len / HELLO_BYTES_S), SELDOM_S)
+        self._pause = self._period
+        """s to the next hello."""
         self._starting: deque[float] = deque()
         self._answers: dict[int, int] = {}
         self._mark = 0
@@ -85,13 +102,25 @@ class Talk:
             return late >= latency * LATENCY_S
         return late > (SELDOM_S if heard else OFTEN_S / 2) + latency * LATENCY_S
 
-    def hello(self, room: int, turns: int, digest: int, marks: Sequence[tuple[int, int]], now: float) -> list[Control]:
+    def hello(
+        self,
+        room: int,
+        turns: int,
+        digest: int,
+        marks: Sequence[tuple[int, int]],
+        now: float,
+        *,
+        reported: bool,
+        lone: bool,
+    ) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
 
         :param room: bytes free for it
         :param turns: how often the packet number has wrapped around
         :param digest: CRC-32 of the table of topics
         :param marks: marks of the kept messages
+        :param reported: whether robots report to this one
+        :param lone: whether nobody is heard, though somebody could be
         """
         free = room - HELLO_LEN
         answers = [Heard(*answer) for answer in list(self._answers.items())[: free // HEARD_LEN]]
@@ -102,8 +131,9 @@ class Talk:
         count = min(len(marks), free // MARK_LEN)
         named = tuple([*marks, *marks][self._mark : self._mark + count])
         self._mark = (self._mark + count) % max(len(marks), 1)
-        self.due = self._starting.popleft() if self._starting else now + self._period
-        return [Hello(self._boot, turns, self._capabilities, digest, named), *answers]
+        self._pause = min(2 * self._pause, LONE_S) if lone and not self._starting else self._period
+        self.due = self._starting.popleft() if self._starting else now + self._pause
+        return [Hello(self._boot, turns, self._capabilities | reported * REPORTED, digest, named), *answers]
 
     def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
         """Requests for messages that other robots keep and this one lacks."""

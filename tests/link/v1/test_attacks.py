@@ -187,7 +187,7 @@ def test_a_report_of_an_earlier_start_confirms_nothing() -> None:
     one.start()
     air.lost = lambda *_: True
     one.end.submit(0, b"new", air.now)
-    air.run(1.0)
+    air.run(0.06)
     for data in recorded:
         one.receive(data, air.now)
     assert one.end.window.unconfirmed(air.now)

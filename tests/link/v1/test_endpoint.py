@@ -259,6 +259,17 @@ def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_kee
     assert late.delivered() == [sent[7]]
 
 
+def test_a_kept_message_with_the_same_bytes_as_the_one_before_comes_out_once() -> None:
+    """As the page on the wire format says: it cannot be told from a repeat for a robot that joins late."""
+    one, two = Robot(1, registry(odom=TopicOptions(), map=LATCHED)), Robot(2)
+    air = Air(one, two)
+    for number in (1, 1, 2, 1):
+        one.end.submit(1, text(number), air.now)
+        air.run(2.0)
+    assert two.delivered() == [text(1), text(2), text(1)]
+    assert two.end.received.repeats >= 1
+
+
 def test_where_nobody_can_ask_what_is_kept_is_repeated() -> None:
     topics = registry(odom=TopicOptions(), map=LATCHED)
     one, late = Robot(1, topics, hears=False, repeat_s=3.0), Robot(3, hears=False)
@@ -269,6 +280,39 @@ def test_where_nobody_can_ask_what_is_kept_is_repeated() -> None:
     air.run(9.0)
     assert late.delivered() == [text(1, 300)]
     assert late.end.received.repeats >= 1
+
+
+def test_a_robot_that_nobody_hears_falls_silent_and_is_there_for_a_newcomer() -> None:
+    one, late = Robot(1, registry(odom=TopicOptions(), map=LATCHED)), Robot(3)
+    air = Air(one)
+    packets = -(-2500 // 46)
+    one.end.submit(1, text(1, 2500), air.now)
+    air.run(20.0)
+    assert len(air.recorded) < 5 * packets
+    air.run(220.0)
+    before = len(air.recorded)
+    air.run(60.0)
+    assert len(air.recorded) - before < 10
+    air.robots.append(late)
+    air.run(5.0, lambda: any(isinstance(event, Met) for event in late.events))
+    waited = air.run(10.0, lambda: bool(late.delivered()))
+    assert late.delivered() == [text(1, 2500)]
+    assert waited <= (packets + 12) * SLOT_S  # two round trips, the map and the table
+
+
+def test_where_nobody_reports_repair_is_bounded_by_the_losses_that_are_expected() -> None:
+    """Though the receiver could be anyone: what it lacks with the loss that is expected, it gets."""
+    missing = 0
+    for seed in range(200):
+        one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
+        air = Air(one, two, loss=0.2, seed=seed)
+        air.run(3.0)
+        before = one.end.sent.air["repair"]
+        one.end.submit(ODOM, text(seed), air.now)
+        air.run(3.0)
+        assert 3 <= one.end.sent.air["repair"] - before <= 12
+        missing += two.delivered() != [text(seed)]
+    assert missing <= 1
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -402,7 +446,7 @@ def test_a_lifespan_ends_repair_and_message() -> None:
 
 
 def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
-    one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
+    one, two = Robot(1, registry(), repair="idle", give_up_s=60), Robot(2, give_up_s=60)
     air = Air(one, two)
     air.run(0.5)
     air.lost = lambda *_: True
@@ -412,7 +456,7 @@ def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
     air.run(1.5)
     assert two.delivered() == [text(1)]
     packets = [data for robot, data in air.recorded if robot is one]
-    assert len({data[:6] if read_header(data, 64).qos == 3 else data[:4] for data in packets}) == len(packets)
+    assert len({data[:6] if read_header(data, 64).qos == 3 else data[:4] for data in packets}) == len(set(packets))
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -169,7 +169,7 @@ def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
 
 
 def test_short_messages_are_repaired_beside_a_long_one() -> None:
-    sender = window()
+    sender = window(expected_loss=0.5)
     long, short = Life(), Life()
     for number in range(1, 301):
         sender.sent(number, body(number), b"", (long,), 0.0)
@@ -296,8 +296,10 @@ def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None
     sender.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
     assert sender.next(0.2) is None  # all that is alive has arrived: there is nothing to combine
     sender.sent(3, b"new", b"packet 3", (Life(),), 0.3)
-    repair = sender.next(0.3)
+    assert sender.over(0.3) == 1
+    repair = sender.tell(1, 0.3)
     assert isinstance(repair, Repair)
+    assert sender.over(0.3) == -1
     assert (window_numbers(repair.number, repair.mask), repair.oldest) == ([3], True)
     sender.report(9, 3, (1 << 64) - 1, settled=True, loss=0.0, now=0.4)
     assert sender.next(0.4) is None
