@@ -66,7 +66,7 @@ def _share(version: int) -> float:
 
 def _link(number: int, version: int, folder: Path) -> RobotLink:
     own, other = (f"ipc://{folder}/{end}" for end in (number, 3 - number))
-    graph: dict[str, Any] = {"middleware": "memory", "domain_id": _DOMAINS[number - 1], "compression": True}
+    graph: dict[str, Any] = {"middleware": "memory", "domain_id": _DOMAINS[number - 1]}
     return RobotLink(
         link_from(
             {
@@ -76,7 +76,7 @@ def _link(number: int, version: int, folder: Path) -> RobotLink:
                 "state": str(folder / f"state-{number}"),
                 "phy": {"name": "ofdm", "sample_rate": 1e5},
                 "front_end": {"name": "zmq", "bind": own, "connect": [other]},
-                "ros_source": {"namespace": f"/robot_{number}", **graph},
+                "ros_source": {"namespace": f"/robot_{number}", "compression": True, **graph},
                 "ros_sink": graph,
             }
         )

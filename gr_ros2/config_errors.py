@@ -47,7 +47,10 @@ def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
     groups = {
         keys: group for keys, group in places.items() if len(keys) == 1 or (keys[-1:], group[0]["input"]) not in top
     }
-    return "; ".join(prefix + _complaint(keys, owners[keys], group) for keys, group in groups.items())
+    complaints = {keys: _complaint(keys, owners[keys], group) for keys, group in groups.items()}
+    # What both ends of a link share is refused at the first one.
+    once = {text.removeprefix(f"{'.'.join(keys)}: "): text for keys, text in reversed(complaints.items())}
+    return "; ".join(prefix + text for text in reversed(once.values()))
 
 
 def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[Any] | None]:

@@ -7,7 +7,9 @@ it does. A row without an entry fails, and so does an entry whose two outcomes a
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,19 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.errors import ConfigError
+from gr_ros2.gr.ends import make_endpoint
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode
+from gr_ros2.radio.ax25 import ui_header
+from gr_ros2.radio.framing import Kiss
+from gr_ros2.registry import Registry, Topic
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import simulate
+from gr_ros2.setting import AUTO, Setting, settings_of
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
+from tests.gr.test_health import make, parts
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "reference" / "parameters.md"
@@ -61,18 +72,39 @@ def drives(**changed: Any) -> Outcomes:
     )  # type: ignore[return-value]
 
 
+def sealed() -> Outcomes:
+    """A packet that is encrypted, and one that is only authenticated."""
+
+    def close() -> tuple[bytes, bytes]:
+        return sealed_as("encrypt"), sealed_as("authenticate")
+
+    def sealed_as(mode: SealMode) -> bytes:
+        return Keys((bytes(32),), mode).own(1, 1).close(b"head", b"body", 1, SOURCE_ROW)
+
+    return close
+
+
 class Elsewhere(str):
-    """File of a test that shows the effect of the setting, and names it."""
+    """File with the test that shows the effect of the setting; it names it."""
+
+
+class Hardware(str):
+    """Why the effect of a setting shows only on a device."""
 
 
 LOSSY, PAPER = "channel.packet_loss=0.2", ("version=0", "ros_source.topic_options={}")
 OPTION = "ros_source.topic_options."
+DRIVE = (
+    f"source=bag:{REPOSITORY}/tests/data/simulated_drive",
+    "ros_source.topics=[odom]",
+    "ros_source.topic_options={}",
+)
 BURSTS = "channel.burst_loss={{p_good_to_bad: 0.1, p_bad_to_good: 0.3{}}}"
 
-EFFECTS: dict[Row, Outcomes | Elsewhere] = {}
+EFFECTS: dict[Row, Outcomes | Elsewhere | Hardware] = {}
 
 
-def effects(section: str, **entries: Outcomes | Elsewhere) -> None:
+def effects(section: str, **entries: Outcomes | Elsewhere | Hardware) -> None:
     """Add the entries of a section."""
     EFFECTS.update({(section, name): entry for name, entry in entries.items()})
 
@@ -98,17 +130,17 @@ effects(
     registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
     version=run("version=0", OPTION[:-1] + "={}"),
     key=Elsewhere("tests/radio/test_version1.py"),
-    seal=Elsewhere("tests/link/v1/test_sealing.py"),
-    state=Elsewhere("tests/gr/test_ends.py"),
+    seal=sealed(),
+    state=Elsewhere("tests/radio/test_version1.py"),
     robot_id=run("ros_source.robot_id=7"),
     middleware=Elsewhere("tests/test_backends.py"),
     domain_id=Elsewhere("tests/gr/test_source.py"),
-    dictionaries=Elsewhere("tests/compression/test_dictionary.py"),
+    dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=run(OPTION + "odom.max_rate=5"),
     debug=Elsewhere("tests/gr/test_source.py"),
     queue_depth=run("ros_source.queue_depth=2", OPTION + "odom={queue: fifo}"),
     topics=run("ros_source.topics=[odom, scan]"),
-    services=Elsewhere("tests/gr/test_topic_search.py"),
+    services=Elsewhere("tests/radio/test_calls.py"),
     namespace=run("ros_source.namespace=/robot_2"),
     dst_id=run("ros_source.dst_id=9"),
     min_fragment=run("ros_source.min_fragment=150", *PAPER),
@@ -130,14 +162,14 @@ effects(
     registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
     version=run("version=0", OPTION[:-1] + "={}"),
     key=Elsewhere("tests/radio/test_version1.py"),
-    seal=Elsewhere("tests/link/v1/test_sealing.py"),
-    state=Elsewhere("tests/gr/test_ends.py"),
+    seal=sealed(),
+    state=Elsewhere("tests/radio/test_version1.py"),
     robot_id=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
     middleware=Elsewhere("tests/test_backends.py"),
     domain_id=Elsewhere("tests/gr/test_sink.py"),
-    dictionaries=Elsewhere("tests/compression/test_dictionary.py"),
+    dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=Elsewhere("tests/gr/test_sink.py"),
-    debug=Elsewhere("tests/gr/test_sink.py"),
+    debug=Elsewhere("tests/gr/test_readable.py"),
     namespace_format=Elsewhere("tests/gr/test_sink.py"),
     publisher_depth=Elsewhere("tests/gr/test_sink.py"),
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
@@ -173,7 +205,7 @@ effects(
     imu_orientation_noise=drives(imu_orientation_noise=0.2),
     start_time_s=drives(start_time_s=1000.0),
     prefix_frames=drives(prefix_frames=True),
-    transforms=Elsewhere("tests/sim/test_fleet.py"),
+    transforms=Elsewhere("tests/sim/test_transforms.py"),
 )
 effects(
     "Losses in bursts",
@@ -188,7 +220,10 @@ effects(
     packet_loss=run(LOSSY),
     burst_loss=run(BURSTS.format("")),
     outages=run("channel.outages=[[0.5, 1]]"),
-    **{name: Elsewhere("tests/run/test_channels.py") for name in ("snr_db", "frequency_offset", "epsilon", "taps")},
+    snr_db=Elsewhere("tests/phy/test_snr.py"),
+    frequency_offset=Elsewhere("tests/phy/test_channel.py"),
+    epsilon=Elsewhere("tests/phy/test_ofdm.py"),
+    taps=Elsewhere("tests/phy/test_channel.py"),
     doppler_hz=Elsewhere("tests/phy/test_channel.py"),
 )
 effects(
@@ -197,7 +232,7 @@ effects(
     sample_rate=run("phy.sample_rate=200000"),
     headroom=run("phy.headroom=2", "phy.sample_rate=auto"),
     options=run("phy.options={payload_modulation: qpsk}", "phy.options={}"),
-    kernels=Elsewhere("tests/phy/test_kernels_choice.py"),
+    kernels=Elsewhere("tests/phy/kernels/test_library.py"),
 )
 effects(
     "Scenario",
@@ -222,11 +257,213 @@ effects(
 )
 
 
+BOTH_ENDS = {
+    name: EFFECTS["ROS Source", name] for name in ("packet_len", "registry", "version", "key", "seal", "state")
+}
+LOCAL = Elsewhere("tests/middleware/test_dds.py")
+effects(
+    "Scenario",
+    name=Elsewhere("tests/run/test_scenario.py"),
+    key=BOTH_ENDS["key"],
+    seal=BOTH_ENDS["seal"],
+    state=BOTH_ENDS["state"],
+    localhost_only=LOCAL,
+    description=Elsewhere("tests/run/test_scenario.py"),
+    repetitions=Elsewhere("tests/run/test_repeat.py"),
+    time=Elsewhere("tests/run/test_simulated_runner.py"),
+    bag_speed=run("bag_speed=2", *DRIVE),
+    back=Elsewhere("tests/run/test_scenario.py"),
+    receivers=Elsewhere("tests/run/test_version1.py"),
+)
+for part in ("channel", "ros_source", "ros_sink"):
+    EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
+effects(
+    "Link",
+    **BOTH_ENDS,
+    name=Elsewhere("tests/radio/test_version1.py"),
+    channel=Elsewhere("tests/radio/test_radio.py"),
+    ros_source=EFFECTS["Scenario", "ros_source"],
+    ros_sink=EFFECTS["Scenario", "ros_sink"],
+    phy=EFFECTS["Scenario", "phy"],
+    localhost_only=LOCAL,
+    front_end=Elsewhere("tests/radio/test_devices.py"),
+    record=Elsewhere("tests/radio/test_radio.py"),
+    diagnostics=Elsewhere("tests/radio/test_diagnostics.py"),
+)
+
+
+def judged(limit: str) -> Outcomes:
+    """What is said of a poor link without any limit, and with this one."""
+
+    def said(**limits: float) -> list[Any]:
+        health = make(
+            **{item.name: 0.0 for item in fields(DiagnosticsConfig) if "_warn" in item.name or "_error" in item.name}
+            | limits
+        )
+        parts(health, 0.0)
+        poor = {
+            "packets": 60,
+            "missing": 40,
+            "delivered": 60,
+            "lost": 40,
+            "latency": 1.5,
+            "age": 2.0,
+            "queued": 9,
+            "depth": 10,
+        }
+        return [(part.level, part.message) for now in (1.0, 60.0) for part in parts(health, now, **poor)]
+
+    return lambda: (said(), said(**{limit: 0.1}))
+
+
+for item in fields(DiagnosticsConfig):
+    EFFECTS["Diagnostics", item.name] = judged(item.name)
+effects(
+    "Diagnostics",
+    period_s=Elsewhere("tests/radio/test_diagnostics.py"),
+    window_s=Elsewhere("tests/gr/test_health.py"),
+)
+
+
+def elsewhere(section: str, **tests: str) -> None:
+    """Entries of a section by the file that shows them: names of settings, with spaces between them."""
+    for file, names in tests.items():
+        folder, _, test = file.partition("_")
+        effects(section, **dict.fromkeys(names.split(), Elsewhere(f"tests/{folder}/test_{test}.py")))
+
+
+elsewhere(
+    "Sweep",
+    study_sweep_definition="description repetitions scenario grid x by value list",
+    study_sweep_run="time",
+    study_sweep_summaries="set y topic",
+)
+elsewhere("Race", race_race_settings="source duration_s packet_len sample_rate bag_topic peers loss load")
+for name in ("match_s", "drain_s", "seed"):
+    EFFECTS["Race", name] = Hardware("a race needs root: two network namespaces")
+elsewhere(
+    "PHY `ofdm`",
+    phy_ofdm="gap lengths fec payload_modulation fft_len carriers pilots scramble detection_threshold",
+    phy_ofdm_rate="cp_len rate rungs",
+)
+elsewhere("PHY `gfsk`", phy_contract="gap lengths", phy_burst="fec sps bt")
+elsewhere("PHY `psk`", phy_contract="gap lengths", phy_burst="fec sps rolloff", phy_snr="modulation")
+elsewhere(
+    "PHY `lora`",
+    phy_lora_sdr="gap fec spreading_factor coding_rate implementation oversampling sync_word ldro carrier_hz",
+    phy_contract="lengths",
+)
+elsewhere(
+    "PHY `wifi`", phy_wifi="gap encoding equalizer sensitivity network address channel_hz", phy_contract="lengths"
+)
+elsewhere("PHY `modem`", phy_modem="bit_rate overhead_bytes overhead_s")
+for name in ("sim", "zmq", "file", "soapy", "uhd", "pluto", "kiss", "serial", "udp"):
+    elsewhere(f"Front end `{name}`", radio_devices="guard_s")
+elsewhere("Front end `zmq`", radio_zmq="bind connect burst_queue")
+elsewhere("Front end `file`", radio_file="write read speed repeat")
+for name in ("soapy", "uhd"):
+    elsewhere(
+        f"Front end `{name}`",
+        radio_devices="half_duplex frequency args frequency_rx gain_tx gain_rx antenna_tx antenna_rx bandwidth level "
+        "turnaround_s",
+        radio_bursts="lead tail multiple",
+    )
+effects(
+    "Front end `uhd`",
+    **dict.fromkeys(("clock_source", "subdev_tx", "subdev_rx"), Hardware("gr-uhd hands them to a USRP as they are")),
+)
+elsewhere(
+    "Front end `pluto`",
+    radio_pluto="frequency args frequency_rx gain_tx gain_rx bandwidth",
+    radio_devices="half_duplex level turnaround_s antenna_tx antenna_rx",
+    radio_bursts="lead tail multiple",
+)
+EFFECTS["Front end `pluto`", "buffer_rx"] = Hardware("gr-iio hands it to a Pluto as it is")
+for name in ("kiss", "serial", "udp"):
+    elsewhere(f"Front end `{name}`", radio_devices="half_duplex")
+elsewhere("Front end `kiss`", radio_modems="device baud callsign")
+effects(
+    "Front end `kiss`",
+    destination=lambda: (ui_header("GRROS2", "AA1AA"), ui_header("OTHERS", "AA1AA")),
+    tnc_port=lambda: (Kiss(64, Counter(), port=0).frame(b"x"), Kiss(64, Counter(), port=1).frame(b"x")),
+)
+elsewhere("Front end `serial`", radio_modems="device baud framing")
+elsewhere("Front end `udp`", radio_modems="listen send_to")
+
+
+def test_every_row_of_the_page_has_an_entry() -> None:
+    found = list(rows())
+    assert len(found) > 250
+    assert [row for row in found if row not in EFFECTS] == [], "a new setting needs an experiment that shows its effect"
+    assert [row for row in EFFECTS if row not in found] == []
+
+
+@pytest.mark.parametrize("row", [row for row, entry in EFFECTS.items() if isinstance(entry, Elsewhere)], ids=": ".join)
+def test_a_test_elsewhere_names_the_setting(row: Row) -> None:
+    text = (REPOSITORY / str(EFFECTS[row])).read_text(encoding="utf-8")
+    assert re.search(rf"\b(set_)?{row[1]}\b", text)
+
+
 @pytest.mark.parametrize(
-    "row", [row for row, entry in EFFECTS.items() if not isinstance(entry, Elsewhere)], ids=": ".join
+    "row", [row for row, entry in EFFECTS.items() if not isinstance(entry, Elsewhere | Hardware)], ids=": ".join
 )
 def test_a_setting_has_an_effect(row: Row) -> None:
     entry = EFFECTS[row]
-    assert not isinstance(entry, Elsewhere)
+    assert not isinstance(entry, Elsewhere | Hardware)
     without, with_it = entry()
     assert without != with_it
+
+
+def other(setting: Setting) -> Any:
+    """A value that is not the default."""
+    if setting.name in ("key", "state"):
+        return "somewhere"
+    if isinstance(setting.default, bool):
+        return not setting.default
+    choices = [choice for choice in setting.choices if choice not in (setting.default, AUTO)]
+    if choices:
+        return choices[0]
+    return 0.5 if setting.default == AUTO or setting.below is not None else setting.default + 1
+
+
+OF_ONE_VERSION = [
+    (cls, setting)
+    for cls in (SourceConfig, SinkConfig, TopicOptions)
+    for setting in settings_of(cls)
+    if setting.version is not None
+]
+
+
+@pytest.mark.parametrize(("cls", "setting"), OF_ONE_VERSION, ids=lambda one: getattr(one, "name", ""))
+def test_a_version_refuses_what_only_the_other_one_has(cls: type[Any], setting: Setting) -> None:
+    assert setting.version is not None
+    version, value = 1 - setting.version, {setting.name: other(setting)}
+    said = f"{setting.name} = {other(setting)!r}: version {version} has no such setting; leave it out, or set version"
+    if cls is TopicOptions:
+        with pytest.raises(ConfigError, match=re.escape(f"topic_options.odom.{said}")):
+            build(SourceConfig, {"version": version, "topic_options": {"odom": value}})
+        row = Topic(0, "odom", "nav_msgs/msg/Odometry", build(TopicOptions, value))
+        with pytest.raises(ConfigError, match=re.escape(f"registry: topic odom: {said}")):
+            make_endpoint(Registry([row]), SourceConfig(version=version, robot_id=1), None)
+    else:
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            build(cls, {"version": version, **value})
+    build(cls, {setting.name: setting.default})
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
+    rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    end = make_endpoint(rows, SourceConfig(version=version, robot_id=1), None)
+    with pytest.raises(ConfigError, match="greedy cannot change while running; these can: packet_rate, dst_id"):
+        end.reconfigure(greedy=True)
+    end.reconfigure(queue_depth=3)
+    assert end.depth(0) == 3
+
+
+def test_a_seal_needs_a_key_and_a_shared_setting_is_refused_once() -> None:
+    with pytest.raises(ConfigError, match="seal = 'authenticate': nothing is sealed without a key; set key"):
+        build(SourceConfig, {"seal": "authenticate"})
+    with pytest.raises(ConfigError) as error:
+        load_scenario("paper-direct", ["key=fleet.key"])
+    assert str(error.value).count("version 0 has no such setting") == 1

@@ -170,5 +170,5 @@ def test_a_link_speaks_version_1_unless_told_otherwise(tmp_path: Path) -> None:
     assert config.version == config.ros_source.version == config.ros_sink.version == 1
     assert config.ros_source.compresses
     assert config.ros_source.key == config.key == str(tmp_path / "fleet.key")
-    old = load_link(path, ["version=0", "registry=table4"])
+    old = load_link(path, ["version=0", "registry=table4", "key=''"])
     assert (old.ros_source.version, old.ros_source.compresses) == (0, False)

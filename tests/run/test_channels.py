@@ -1,4 +1,4 @@
-"""The built-in channel scenarios: each comes out as its first lines say, on simulated time."""
+"""The built-in channel scenarios: what each channel does without repair, and with it, on simulated time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ DURATION_S = 6.0
 
 
 def odometry(name: str, *changes: str) -> TopicResult:
-    scenario = load_scenario(name, ["time=samples", *changes], duration_s=DURATION_S, seed=1)
+    settings = ["time=samples", "ros_source.repair='off'", *changes]
+    scenario = load_scenario(name, settings, duration_s=DURATION_S, seed=1)
     (topic,) = run_scenario(scenario).result.topics
     assert sum(topic.ledger.values()) == topic.sent > 0
     return topic
@@ -55,13 +56,19 @@ def test_fades_take_packets_in_a_row() -> None:
     assert faded.age_s.peak > 0.1  # three messages or more
 
 
+def test_repair_brings_back_what_noise_and_fades_take() -> None:
+    assert pdr("channel-awgn", "ros_source.repair=auto") > pdr("channel-awgn") + 0.1
+    assert pdr("channel-rayleigh", "ros_source.repair=auto") > 0.98
+
+
 def test_bursts_take_fewer_messages_than_as_many_single_losses() -> None:
     alone = pdr("channel-burst-loss", "channel.burst_loss=null", "channel.packet_loss=0.0909")
     assert pdr("channel-burst-loss") > alone + 0.2
 
 
 def test_a_link_that_was_unplugged_goes_on_as_before() -> None:
-    odom = odometry("channel-unplugged", "channel.outages=[[2, 3.5]]")
+    alone = "ros_source.topic_options.odom.reliability=best_effort"  # in order, it would wait hold_s for what is lost
+    odom = odometry("channel-unplugged", "channel.outages=[[2, 3.5]]", alone)
     assert odom.pdr == pytest.approx(0.75, abs=0.01)
     assert odom.age_s.peak == pytest.approx(1.55, abs=0.05)
     assert odom.latency_s.max is not None

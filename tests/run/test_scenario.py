@@ -118,7 +118,7 @@ def test_override_values_are_yaml() -> None:
         ("seed=x", "^demo: seed = 'x': [^;]*$"),
         ("sim.robots=0", "sim.robots = 0"),
         ("ros_source.packet_len=64", "ros_source.packet_len = 64: both ends share it; set packet_len"),
-        ("ros_source.min_fragment=999", "ros_source: min_fragment = 999 does not fit packet_len = 220; at most 207"),
+        ("ros_source.min_fragment=999", "ros_source: min_fragment = 999: version 1 has no such setting"),
         ("ros_source.middleware=foo", "ros_source.middleware = 'foo': .* known are dds"),
         ("phy.name=foo", "phy.name = 'foo': .* known are direct, ofdm"),
         ("ros_source=5", "ros_source = 5"),

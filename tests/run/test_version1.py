@@ -26,8 +26,7 @@ def scenario(**settings: Any) -> Scenario:
         "sim": {"odom_rate": 35},
         "packet_len": 64,
         "version": 1,
-        "ros_source": {"namespace": "/robot_1", "compression": True},
-        "ros_sink": {"compression": True},
+        "ros_source": {"namespace": "/robot_1"},
         "phy": {"name": "ofdm", "sample_rate": 100000, "options": {"detection_threshold": "stock"}},
         "channel": {"packet_loss": LOSS},
         "duration_s": 10.0,
@@ -59,7 +58,7 @@ def test_one_way_everything_comes_in_spite_of_losses() -> None:
 
 
 def test_without_repair_what_is_lost_stays_lost() -> None:
-    result = run(ros_source={"namespace": "/robot_1", "compression": True, "repair": "off"})
+    result = run(ros_source={"namespace": "/robot_1", "repair": "off"})
     (odom,) = map(checked, result.topics)
     assert 0.7 < odom.pdr < 0.9
     assert odom.ledger["lost_fragments"] > 0
@@ -103,7 +102,7 @@ def test_both_ways_at_once() -> None:
         packet_len=220,
         sim={"robots": 2, "odom_rate": 20, "imu_rate": 20, "scan_rate": 1, "map_cells": 40},
         phy={"name": "ofdm", "sample_rate": 2_000_000, "options": {"detection_threshold": "stock"}},
-        ros_source={"namespace": "/robot_1", "compression": True, "topics": ["odom", "imu"]},
+        ros_source={"namespace": "/robot_1", "topics": ["odom", "imu"]},
         back={"ros_source": {"namespace": "/robot_2", "topics": ["odom"]}},
         duration_s=5.0,
     )
