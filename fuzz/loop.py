@@ -15,9 +15,11 @@ from contextlib import ExitStack
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
-from typing import Any
+from types import FrameType
+from typing import Any, TypeVar
 
 Harness = Callable[[bytes], None]
+_T = TypeVar("_T")
 _INTERESTING = (0, 1, 15, 16, 64, 127, 128, 254, 255)
 _MOST = 4096
 KEPT = ExitStack()
@@ -64,6 +66,24 @@ def within(limit_s: float, fresh: Callable[[], Callable[[], object]]) -> None:
         if fastest <= limit_s:
             return
     raise AssertionError(f"{fastest * 1e3:.2f} ms of processor time, at most {limit_s * 1e3:.2f} ms are allowed")
+
+
+def work(call: Callable[[], _T]) -> tuple[int, _T]:
+    """The lines of Python that a call executes, a measure of work that does not depend on the computer; its result."""
+    lines = 0
+
+    def count(_frame: FrameType, event: str, _: object) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return count
+
+    before = sys.gettrace()
+    sys.settrace(count)
+    try:
+        result = call()
+    finally:
+        sys.settrace(before)
+    return lines, result
 
 
 def main(harness: Harness, corpus: Sequence[bytes]) -> None:

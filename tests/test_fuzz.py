@@ -19,7 +19,7 @@ import fuzz.structure
 import fuzz.type_description
 import fuzz.wire
 import fuzz.wire_v1
-from fuzz.loop import Harness, inputs, run, within
+from fuzz.loop import Harness, inputs, run, within, work
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -115,6 +115,12 @@ def test_what_takes_too_long_is_noticed() -> None:
     within(60.0, lambda: lambda: None)
     with pytest.raises(AssertionError, match=r"ms of processor time, at most 0.00 ms are allowed"):
         within(0.0, lambda: lambda: sum(range(1000)))
+
+
+def test_work_is_counted_not_timed() -> None:
+    few, many = (work(lambda count=count: sum(1 for _ in range(count)))[0] for count in (10, 1000))
+    assert many - few >= 990
+    assert work(lambda: "result")[1] == "result"
 
 
 def test_what_paid_for_something_else_is_tried_again() -> None:

@@ -31,6 +31,8 @@ class Settings:
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one that can still be repaired
+    :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
+        topics with a deadline or lifespan, no bound for others; 0 = no bound
     :param report_every: packets received from one report to the next; more while none is lost
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param give_up_s: s of silence after which a robot is regarded as gone
@@ -55,6 +57,7 @@ class Settings:
     hears: bool = True
     half_duplex: bool = False
     hold_s: float = 1.0
+    max_age_s: float | Auto = AUTO
     report_every: int = 5
     repeat_s: float = 10.0
     give_up_s: float = 10.0
@@ -106,6 +109,7 @@ def settings_of(
         hears=hears,
         half_duplex=half_duplex,
         hold_s=take.hold_s,
+        max_age_s=take.max_age_s,
         repeat_s=send.repeat_s,
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,

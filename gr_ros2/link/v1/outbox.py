@@ -37,7 +37,7 @@ from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
@@ -369,8 +369,9 @@ class Outbox:
             ordered = ordered and line.queue.policy != "latest"
             depth = min(line.depth if options.depth == AUTO else options.depth, 255)
             codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
+            fresh = line.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
             rows.append(
-                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec)
+                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, ordered, line.kept, depth, codec, fresh)
             )
         if not rows and not self.digest:
             return
