@@ -6,6 +6,7 @@ Invariant: the same seed gives the same inputs; an input that fails is named in 
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import sys
 import time
@@ -15,10 +16,11 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 Harness = Callable[[bytes], None]
 TraceFunction = Callable[[FrameType, str, Any], Any]
+_T = TypeVar("_T")
 _INTERESTING = (0, 1, 15, 16, 64, 127, 128, 254, 255)
 _MOST = 4096
 KEPT = ExitStack()
@@ -47,9 +49,23 @@ def run(harness: Harness, corpus: Sequence[bytes], seed: int, count: int) -> Non
 
 
 def within(most: int, call: Callable[[], object]) -> None:
-    """Hold the work of one call to a limit. Lines of Python are counted, so every machine gives the same answer.
+    """Hold the work of one call to a limit.
 
     :param most: lines that may be executed in this thread
+    :raises AssertionError: at the first line beyond
+    """
+    work(call, most)
+
+
+class _TooMuch(BaseException):
+    """Not an Exception, which the code that is counted may catch."""
+
+
+def work(call: Callable[[], _T], most: float = math.inf) -> tuple[int, _T]:
+    """The lines of Python that a call executes in this thread, a measure of work that does not depend on the computer;
+    and its result.
+
+    :param most: lines that may be executed
     :raises AssertionError: at the first line beyond
     """
     done = 0
@@ -65,15 +81,12 @@ def within(most: int, call: Callable[[], object]) -> None:
     before = sys.gettrace()
     sys.settrace(count)
     try:
-        call()
+        result = call()
     except _TooMuch as error:
         raise AssertionError(f"more than {most} lines of Python, at {error}") from None
     finally:
         sys.settrace(before)
-
-
-class _TooMuch(BaseException):
-    """Not an Exception, which the code that is counted may catch."""
+    return done, result
 
 
 def main(harness: Harness, corpus: Sequence[bytes]) -> None:

@@ -1,40 +1,68 @@
 """What a robot keeps from one start to the next: its boot number, and the newest packet heard of each other robot.
 
-A boot number is greater than all earlier ones, and at least the wall clock's seconds. So it also grows if the file is
-lost, and if the clock is set back.
+A boot number begins with a number that is greater than all earlier ones and at least the wall clock's seconds, so that
+it also grows if the file is lost, and if the clock is set back. It ends in random bits, so that two robots which have
+one id by mistake, and a robot whose file cannot be written, never repeat a start.
+
+A file that cannot be written (a full disk) does not keep a robot from its link: this is logged once, and each further
+call tries again.
 
 Invariants: the file is replaced as a whole, and is on the disk before a call returns, so a power cut leaves the old or
-the new file; a boot number is used only after it has been written.
+the new file; one process at a time uses a file; what sealed and other links have heard is kept apart, because anybody
+can make a robot hear something on a link without a key.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
+import logging
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.files import replacing
 
+RANDOM_BITS = 32
+"""Random bits at the end of a boot number."""
 _LARGEST = (1 << 32) - 1
+_LOG = logging.getLogger("gr_ros2.boots")
+_LOCKS: dict[tuple[int, Path], IO[str]] = {}
+"""Locks that this process holds until it ends, by process id and file."""
 
 
 class BootFile:
     """The state file of one robot.
 
-    :param path: path of the file, which need not exist; its folder must exist
+    :param path: path of the file, which need not exist
     :param wall_clock: seconds since 1970
-    :raises ConfigError: the file cannot be read, written or understood
+    :param bits: ``RANDOM_BITS`` random bits
+    :param sealed: whether the link is sealed
+    :raises ConfigError: another process uses the file, or it cannot be read or understood
     """
 
-    def __init__(self, path: str | Path, wall_clock: float) -> None:
-        self._path = Path(path)
-        before, self._heard = self._read()
-        self.boot = min(max(before + 1, int(wall_clock)), _LARGEST)
+    def __init__(self, path: str | Path, wall_clock: float, bits: int, *, sealed: bool) -> None:
+        self._path = Path(path).absolute()
+        self._said = False
+        with suppress(OSError):  # the attempt to write says what is wrong
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock()
+        self._start, self._all = self._read()
+        self._heard = self._all["sealed" if sealed else "open"]
+        before, self._start = self._start, min(max(self._start + 1, int(wall_clock)), _LARGEST)
+        if self._start <= before:
+            raise ConfigError(
+                f"{self._path}: boot numbers are used up, since the clock of this robot was wrong once. Delete this "
+                "file. Robots that this one hears too take it again by themselves. The others, if they have a key: "
+                "delete their state files, and change the key"
+            )
+        self.boot = self._start << RANDOM_BITS | bits
         """Boot number of this start."""
-        if self.boot <= before:
-            raise ConfigError(f"{self._path}: boot numbers are used up; make a new key and delete this file")
-        self._write()
+        with suppress(ConfigError):  # it was logged
+            self._write()
 
     @property
     def heard(self) -> Mapping[int, tuple[int, int]]:
@@ -49,22 +77,61 @@ class BootFile:
         self._heard[src_id] = (boot, floor)
         self._write()
 
-    def _read(self) -> tuple[int, dict[int, tuple[int, int]]]:
+    def _lock(self) -> None:
+        """Keep other processes from this file.
+
+        :raises ConfigError: another process uses it
+        :raises OSError: the lock cannot be made
+        """
+        place = self._path.with_name(f".{self._path.name}.lock")
+        if (os.getpid(), place) in _LOCKS:
+            return
+        file = place.open("a+", encoding="ascii")
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            holder = file.read().strip() or "of another user"
+            file.close()
+            raise ConfigError(
+                f"{self._path}: process {holder} uses it, so a link of this robot runs already; end that one, or give "
+                "this one another robot_id or state"
+            ) from None
+        _LOCKS[os.getpid(), place] = file
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+
+    def _read(self) -> tuple[int, dict[str, dict[int, tuple[int, int]]]]:
         try:
             values = json.loads(self._path.read_text("ascii"))
-            heard = {int(name): (int(boot), int(floor)) for name, (boot, floor) in values["heard"].items()}
+            heard = {
+                name: {int(src_id): (int(boot), int(floor)) for src_id, (boot, floor) in values.get(name, {}).items()}
+                for name in ("sealed", "open")
+            }
             return int(values["boot"]), heard
         except FileNotFoundError:
-            return 0, {}
+            return 0, {"sealed": {}, "open": {}}
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot be read ({error.strerror})") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(f"{self._path}: no state file of a link ({error}); restore it, or change keys") from error
 
     def _write(self) -> None:
-        text = json.dumps({"boot": self.boot, "heard": {str(name): value for name, value in self._heard.items()}})
+        text = json.dumps({"boot": self._start, **self._all})
         try:
             with replacing(self._path, durable=True) as part:
                 part.write_text(text, encoding="ascii")
         except OSError as error:
-            raise ConfigError(f"{self._path}: cannot be written ({error.strerror})") from error
+            problem = f"{self._path}: cannot be written ({error.strerror})"
+            if not self._said:
+                self._said = True
+                _LOG.warning(
+                    "%s; the link runs. Until it can be written, nothing is taken that only this file could tell from "
+                    "a replay: with a key, the messages of robots that cannot hear this one",
+                    problem,
+                )
+            raise ConfigError(problem) from error
+        if self._said:
+            self._said = False
+            _LOG.warning("%s: can be written again", self._path)

@@ -27,6 +27,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.config_errors import explain
 from gr_ros2.errors import ConfigError
+from gr_ros2.keys import checked_key_file
 from gr_ros2.names import (
     checked_frame_form,
     checked_merged_topic,
@@ -151,7 +152,7 @@ class Agreed(Packets):
 
     registry: Annotated[Text, Field(title="Registry CSV")]
     version: Annotated[WireVersion, Field(title="Version of the wire format")] = 1
-    key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet")] = ""
+    key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
     seal: Annotated[Literal["encrypt", "authenticate"], OnlyIn(1)] = "encrypt"
     state: Annotated[str, OnlyIn(1), Field(title="State file")] = ""
 
@@ -350,6 +351,8 @@ class SinkConfig(EndConfig):
     :param reassembly_timeout_s: s an incomplete message is kept
     :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
         it does, until that one is repaired or given up by its sender
+    :param max_age_s: s for which a sealed message may have been withheld on its way (with a key), or it is not taken;
+        auto: 15 for calls and topics with a deadline or lifespan, any time for others; 0 = any time
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
     :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
     :param max_bytes: fragments held in all
@@ -363,6 +366,7 @@ class SinkConfig(EndConfig):
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
+    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
     max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000

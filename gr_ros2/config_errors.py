@@ -85,7 +85,8 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
     purpose = f" ({purpose})" if purpose else ""
     if item["type"] in ("missing", "missing_argument"):
         return f"{key} is missing{purpose}"
-    value = "" if isinstance(item["input"], Mapping) else f" = {item['input']!r}"
+    secret = keys[-1] == "key"  # a key by mistake must not be shown
+    value = "" if secret or isinstance(item["input"], Mapping) else f" = {item['input']!r}"
     if setting is not None and setting.derives and not isinstance(item["input"], bool) and item["input"] in _LIKE_AUTO:
         return f"{key}{value}: write {AUTO}{purpose}"
     ranges = [_asked(one, purpose) for one in group if one["type"] != "literal_error"][:1]

@@ -9,6 +9,7 @@
     │   ├── EntryKindError · VarintError · WindowError · SourcesError
     │   ├── SealError
     │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
+    │           NotStoredError · SameIdError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
     │   └── UnknownDictionaryError · DamagedError
@@ -164,6 +165,18 @@ class ReplayedError(SealError):
     """A packet that was received before, or that is too old to be accepted."""
 
     kind = "replayed"
+
+
+class NotStoredError(SealError):
+    """A packet that is not used because the state file cannot be written: it could be used again after a restart."""
+
+    kind = "not_stored"
+
+
+class SameIdError(SealError):
+    """A hello under the id of this robot, of a start that is not this one."""
+
+    kind = "same_id"
 
 
 class SourcesError(WireError):

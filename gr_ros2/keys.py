@@ -6,12 +6,15 @@ Invariants: a key file that other users may read or write is refused; an existin
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import stat
 from pathlib import Path
 
 from gr_ros2.errors import ConfigError
 
+_LIKE_A_KEY = re.compile(r"(0[xX])?[0-9a-fA-F:]{32,}")
+"""A setting that nobody means as a path. It must not be repeated in an error or a log."""
 KEY_LEN = 32
 """Bytes of a key."""
 
@@ -34,11 +37,25 @@ def new_key_file(path: str | Path) -> None:
         )
 
 
+def checked_key_file(path: str) -> str:
+    """The path, if it is not a key by mistake.
+
+    :raises ValueError: it looks like a key, which the message does not repeat
+    """
+    if _LIKE_A_KEY.fullmatch(Path(path.strip()).name):
+        raise ValueError("must be the path of a key file, and is a key itself; make a file with gr-ros2 key new FILE")
+    return path
+
+
 def read_key_file(path: str | Path) -> tuple[bytes, ...]:
     """The keys of a file, at least one.
 
     :raises ConfigError: the file cannot be read, other users may read it, or it holds something other than keys
     """
+    try:
+        checked_key_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"key: {error}") from None
     try:
         with open(path, encoding="ascii") as file:
             others = stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077

@@ -20,7 +20,7 @@ import fuzz.structure
 import fuzz.type_description
 import fuzz.wire
 import fuzz.wire_v1
-from fuzz.loop import Harness, inputs, run, within
+from fuzz.loop import Harness, inputs, run, within, work
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -123,6 +123,12 @@ def test_what_works_too_much_is_noticed() -> None:
     with pytest.raises(AssertionError, match=r"more than 1000 lines of Python, at .*:\d+"):
         within(1000, partial(loop, 1 << 60))
     assert sys.gettrace() is before
+
+
+def test_work_is_counted_not_timed() -> None:
+    few, many = (work(lambda count=count: sum(1 for _ in range(count)))[0] for count in (10, 1000))
+    assert many - few >= 990
+    assert work(lambda: "result")[1] == "result"
 
 
 @pytest.mark.parametrize("name", HARNESSES)

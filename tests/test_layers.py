@@ -20,8 +20,8 @@ MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py
 LAYERS = (
     {"errors"},
     {"wire", "names", "yaml_bounds", "setting", "files", "service_rows"},
-    {"yaml_text", "config_errors", "topic_choice"},
-    {"config", "backends", "backlog", "guard", "keys", "boots", "path_finder"},
+    {"yaml_text", "config_errors", "topic_choice", "keys"},
+    {"config", "backends", "backlog", "guard", "boots", "path_finder"},
     {"registry", "settings_file"},
     {"link", "calls"},
     {"middleware", "compression"},

@@ -16,7 +16,7 @@ MAX_DEADLINE_S = 6553.5
 """The longest deadline that a request can carry."""
 
 _REQUEST, _REPLY = 0, 1
-_HEAD = Struct(">BBII")
+_HEAD = Struct(">BBQI")
 _TAIL = Struct(">BH")
 _DEADLINES_PER_S = 10
 
@@ -50,7 +50,7 @@ def write_frame(frame: Frame) -> bytes:
 
     :raises EncodeError: a field out of range
     """
-    fits = 0 <= frame.dst_id < 255 and 0 <= frame.dst_boot < 1 << 32 and 0 < frame.number < 1 << 32
+    fits = 0 <= frame.dst_id < 255 and 0 <= frame.dst_boot < 1 << 64 and 0 < frame.number < 1 << 32
     if not fits or not -1 <= frame.service_id < 240 or not 0 <= frame.deadline_s <= MAX_DEADLINE_S:
         raise EncodeError(f"a field of {frame} is out of range")
     kind = _REQUEST if frame.is_request else _REPLY

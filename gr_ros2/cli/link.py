@@ -199,7 +199,7 @@ def status_line(stats: Mapping[str, Any]) -> str:
     sent = f"sent {taken} messages in {packets['out']} packets"
     if missing and not taken:
         sent = f"nothing sent, no publisher on {missing[0]}" + (f" and {len(missing) - 1} more" if missing[1:] else "")
-    received = f"received {given} messages in {packets['in']} packets" if packets["in"] else "nobody heard"
+    received = f"received {given} messages in {sink['packets']} packets" if sink["packets"] else "nobody heard"
     parts = [f"{stats['uptime_s']:.0f} s", sent, received]
     if sink["packet_loss_est"]:
         parts.append(f"about {sink['packet_loss_est']} packets lost")

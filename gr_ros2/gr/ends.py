@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import secrets
 import threading
 import time
 import weakref
@@ -18,7 +19,7 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gr_ros2.boots import BootFile
+from gr_ros2.boots import RANDOM_BITS, BootFile
 from gr_ros2.config import SinkConfig, SourceConfig, build, refuse_without_effect
 from gr_ros2.errors import ConfigError
 from gr_ros2.keys import read_key_file
@@ -199,13 +200,10 @@ def start_of(
     if not config.version:
         return Start(ladder=ladder)
     if not config.state and not config.key and src_id < 0:
-        return Start(int(time.time()), reports=reports, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
+        boot = int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS)
+        return Start(boot, reports=reports, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
     path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be made ({error.strerror}); set state to a file that can be") from error
-    file = BootFile(path, time.time())
+    file = BootFile(path, time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
     return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length, ladder)
 
 

@@ -23,6 +23,8 @@ _LOCKED = {
     "not_sealed": "not sealed, where a key is configured",
     "wrong_key": "sealed with a key that is not accepted here",
     "replayed": "replays of what was heard before",
+    "not_stored": "not used, because the state file cannot be written",
+    "same_id": "under this robot's own id",
     "tag": "damaged, or forged",
 }
 """Reasons to refuse a packet that may be caused by an attack or by a wrong configuration."""

@@ -13,8 +13,8 @@ from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError
 
 _HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
 
-_heard = Struct(">BI")
-_hello = Struct(">IIBI")
+_heard = Struct(">B4sH")
+_hello = Struct(">QIBI")
 _mark = Struct(">BI")
 _report = Struct(">BHHQB")
 _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
@@ -24,14 +24,16 @@ MARK_LEN = _mark.size
 REPORT_LEN = 2 + _report.size
 """Bytes of a report without SNR. With it, a report has one more."""
 HEARD_LEN = 2 + _heard.size
+ECHO_LEN = 4
 
 
 class Hello(NamedTuple):
     """Announces a robot.
 
-    :param boot: number of this start of the robot, 0..2^32-1, greater than those of all earlier ones
+    :param boot: number of this start of the robot, 0..2^64-1: a number greater than those of all earlier ones, and 32
+        random bits
     :param turns: how often the 16-bit packet number has wrapped around, 0..2^32-1
-    :param capabilities: ``CAN_HEAR``, ``ENCRYPTS`` and ``REPORTED``; other bits are ignored
+    :param capabilities: ``CAN_HEAR``, ``ENCRYPTS``, ``REPORTED`` and ``WANTS_PROOF``; other bits are ignored
     :param digest: CRC-32 of the robot's table of topics, 0 if it has none
     :param marks: (topic id, CRC-32 of the message as transmitted) of messages kept for robots that join late
     """
@@ -44,10 +46,11 @@ class Hello(NamedTuple):
 
     def describe(self) -> str:
         """The entry in words."""
-        words = [f"hello, boot {self.boot}, turns {self.turns}"]
+        words = [f"hello, boot {self.boot >> 32}.{self.boot & 0xFFFF_FFFF:08x}, turns {self.turns}"]
         words += ["hears and reports"] * (self.capabilities & CAN_HEAR != 0)
         words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
         words += ["is reported to"] * (self.capabilities & REPORTED != 0)
+        words += ["wants proof"] * (self.capabilities & WANTS_PROOF != 0)
         words += [f"table {self.digest:08x}"] * (self.digest != 0)
         words += [f"keeps topic {topic_id} {mark:08x}" for topic_id, mark in self.marks]
         return ", ".join(words)
@@ -59,6 +62,8 @@ ENCRYPTS = 2
 """Bodies of the robot's packets are encrypted; without this bit, sealed packets are only authenticated."""
 REPORTED = 4
 """Robots report to this one what they hear: it repairs what they lack, or says that it does not."""
+WANTS_PROOF = 8
+"""The robot hears another one that has not proven yet that it heard this start: who hears this answers with a hello."""
 
 
 class Ask(NamedTuple):
@@ -107,19 +112,21 @@ class Report(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The sender has heard a start of another robot. This proves to that robot that the packet is not a replay of an
-    earlier one.
+    """The sender has heard a hello of another robot. This proves to that robot that the sender's packets with a number
+    above ``since`` were sealed after that hello.
 
     :param src_id: id of the other robot
-    :param boot: boot number of its start, 0..2^32-1
+    :param echo: the last ``ECHO_LEN`` bytes of that hello's packet
+    :param since: number of the sender's newest source packet when the hello came, mod 2^16
     """
 
     src_id: int
-    boot: int
+    echo: bytes
+    since: int
 
     def describe(self) -> str:
         """The entry in words."""
-        return f"heard, robot {self.src_id}, boot {self.boot}"
+        return f"heard, robot {self.src_id}, its hello that ends in {self.echo.hex()}, after number {self.since}"
 
 
 Control = Hello | Ask | Report | Heard
@@ -149,6 +156,8 @@ def write_control(entry: Control) -> bytes:
             marks = b"".join(_mark.pack(*mark) for mark in entry.marks)
             name, data = _HELLO, _hello.pack(*entry[:4]) + marks
         elif isinstance(entry, Heard):
+            if len(entry.echo) != ECHO_LEN:
+                raise EncodeError(f"{entry}: an echo has {ECHO_LEN} bytes")
             name, data = _HEARD, _heard.pack(*entry)
         else:
             name, data = _ASK, bytes((entry.src_id,)) + entry.topic_ids

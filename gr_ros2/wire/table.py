@@ -13,7 +13,7 @@ from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError, Versio
 from gr_ros2.wire.format import QOS_NAMES
 
 _FORMAT = 1
-_QOS, _RELIABLE, _LATCHED = 3, 4, 8
+_QOS, _RELIABLE, _LATCHED, _FRESH = 3, 4, 8, 16
 _FIXED = 4
 
 
@@ -28,6 +28,7 @@ class Row(NamedTuple):
     :param latched: its publishers keep messages for late joiners (transient-local)
     :param depth: history depth of its publishers, 1..255; 0 if unknown
     :param codec: how its messages are coded, '' if they are not; the codec defines the text
+    :param fresh: its messages are of no use when they are old: they have a deadline or a lifespan, or are calls
     """
 
     topic_id: int
@@ -38,11 +39,12 @@ class Row(NamedTuple):
     latched: bool = False
     depth: int = 0
     codec: str = ""
+    fresh: bool = False
 
     def describe(self) -> str:
         """The row in words."""
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
-        words += ["reliable"] * self.reliable + ["latched"] * self.latched
+        words += ["reliable"] * self.reliable + ["latched"] * self.latched + ["of no use when old"] * self.fresh
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
         return ", ".join(words)
 
@@ -59,7 +61,7 @@ def write_table(rows: Iterable[Row]) -> bytes:
             raise EncodeError(f"a field of {row} is out of range")
         if max(map(len, texts)) > 255:
             raise EncodeError(f"{row}: name, type and codec have at most 255 bytes each")
-        flags = row.qos | row.reliable * _RELIABLE | row.latched * _LATCHED
+        flags = row.qos | row.reliable * _RELIABLE | row.latched * _LATCHED | row.fresh * _FRESH
         parts.append(bytes((row.topic_id, flags, row.depth)))
         parts += [bytes((len(text),)) + text for text in texts]
     return b"".join(parts)
@@ -89,9 +91,9 @@ def read_table(data: bytes) -> tuple[Row, ...]:
                 texts.append(data[start:position].decode())
             except UnicodeDecodeError as error:
                 raise EntryKindError(f"a text in row {len(rows)} of a table is no UTF-8") from error
-        if topic_id >= 240 or flags & _QOS == _QOS or flags > 15 or any(row.topic_id == topic_id for row in rows):
+        if topic_id >= 240 or flags & _QOS == _QOS or flags > 31 or any(row.topic_id == topic_id for row in rows):
             raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in row {len(rows)} of a table")
         name, type_name, codec = texts
         reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
-        rows.append(Row(topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec))
+        rows.append(Row(topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0))
     return tuple(rows)

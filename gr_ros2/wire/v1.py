@@ -66,7 +66,7 @@ _SHORT = 15
 _WHOLE, _FIRST, _MIDDLE, _LAST = range(4)
 
 _header = Struct(">BBH")
-_session = Struct(">II")
+_session = Struct(">QI")
 
 
 class Header(NamedTuple):

@@ -62,7 +62,7 @@ local f = {
     back = ProtoField.uint32("gr_ros2.back", "Packets since the message began"),
     offset = ProtoField.uint32("gr_ros2.offset", "Offset in the message"),
     control = ProtoField.uint8("gr_ros2.control", "Control entry", base.HEX, CONTROLS),
-    hello_boot = ProtoField.uint32("gr_ros2.hello.boot", "Boot number"),
+    hello_boot = ProtoField.uint64("gr_ros2.hello.boot", "Boot number"),
     hello_turns = ProtoField.uint32("gr_ros2.hello.turns", "Turns of the packet number"),
     hello_hears = ProtoField.bool("gr_ros2.hello.hears", "Hears and reports", 8, nil, 0x01),
     hello_encrypts = ProtoField.bool("gr_ros2.hello.encrypts", "Encrypts", 8, nil, 0x02),
@@ -79,7 +79,8 @@ local f = {
     report_loss = ProtoField.uint8("gr_ros2.report.loss", "Packets lost lately, of 128", base.DEC, nil, 0x7F),
     report_snr = ProtoField.float("gr_ros2.report.snr", "SNR (dB)"),
     heard_src_id = ProtoField.uint8("gr_ros2.heard.src_id", "Has heard robot"),
-    heard_boot = ProtoField.uint32("gr_ros2.heard.boot", "Of this boot number"),
+    heard_echo = ProtoField.uint32("gr_ros2.heard.echo", "End of its newest hello", base.HEX),
+    heard_since = ProtoField.uint16("gr_ros2.heard.since", "Heard at own number"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
     table_type = ProtoField.string("gr_ros2.table.type", "Type"),
@@ -293,7 +294,7 @@ end
 -- Version 1 -----------------------------------------------------------------------------------------------------------
 
 local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
-local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 13, 5, 14, 5
+local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 17, 5, 14, 7
 local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
@@ -316,7 +317,7 @@ local function crc32(crc, bytes)
 end
 
 local function expected_crc32(boot, turns, buffer)
-    local session = ByteArray.new(string.format("%08x%08x", boot, turns))
+    local session = ByteArray.new(boot .. string.format("%08x", turns))
     return 0xFFFFFFFF - crc32(crc32(0xFFFFFFFF, session), buffer:bytes())
 end
 
@@ -352,11 +353,11 @@ local function varint(buffer, at, limit)
 end
 
 local function dissect_hello(buffer, tree, at, size)
-    tree:add(f.hello_boot, buffer(at, 4))
-    tree:add(f.hello_turns, buffer(at + 4, 4))
-    tree:add(f.hello_hears, buffer(at + 8, 1))
-    tree:add(f.hello_encrypts, buffer(at + 8, 1))
-    tree:add(f.hello_digest, buffer(at + 9, 4))
+    tree:add(f.hello_boot, buffer(at, 8))
+    tree:add(f.hello_turns, buffer(at + 8, 4))
+    tree:add(f.hello_hears, buffer(at + 12, 1))
+    tree:add(f.hello_encrypts, buffer(at + 12, 1))
+    tree:add(f.hello_digest, buffer(at + 13, 4))
     for mark = at + HELLO_LEN, at + size - 1, MARK_LEN do
         tree:add(f.hello_topic_id, buffer(mark, 1))
         tree:add(f.hello_mark, buffer(mark + 1, 4))
@@ -404,7 +405,8 @@ local function dissect_control(buffer, tree, at, limit)
         end
     elseif name == "heard" then
         item:add(f.heard_src_id, buffer(start, 1))
-        item:add(f.heard_boot, buffer(start + 1, 4))
+        item:add(f.heard_echo, buffer(start + 1, 4))
+        item:add(f.heard_since, buffer(start + 5, 2))
     end
     return start + size, name
 end
@@ -611,7 +613,7 @@ end
 
 -- Take the start of a robot that a hello tells of.
 local function meet(buffer, packet, at)
-    local boot, turns = buffer(at, 4):uint(), buffer(at + 4, 4):uint()
+    local boot, turns = buffer(at, 8):bytes():tohex(), buffer(at + 8, 4):uint()
     local number = turns * 0x10000 + packet.low
     local known = starts[packet.src] or {}
     starts[packet.src] = known
@@ -621,7 +623,7 @@ local function meet(buffer, packet, at)
             break
         end
     end
-    known[#known + 1] = { boot = boot, newest = number, encrypts = buffer(at + 8, 1):bitfield(6, 1) == 1 }
+    known[#known + 1] = { boot = boot, newest = number, encrypts = buffer(at + 12, 1):bitfield(6, 1) == 1 }
 end
 
 -- Which start of its sender a packet belongs to, found when it is read for the first time: by its CRC, or the newest.

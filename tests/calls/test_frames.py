@@ -38,9 +38,9 @@ def test_whatever_is_read_is_written_the_same_or_refused_by_name(data: bytes) ->
 
 def test_the_bytes_are_those_of_the_page() -> None:
     request = Frame(2, 0x6B49D200, 7, b"\0\1\0\0abcd", service_id=3, deadline_s=30.0)
-    assert write_frame(request).hex(" ") == "00 02 6b 49 d2 00 00 00 00 07 03 01 2c 00 01 00 00 61 62 63 64"
+    assert write_frame(request).hex(" ") == "00 02 00 00 00 00 6b 49 d2 00 00 00 00 07 03 01 2c 00 01 00 00 61 62 63 64"
     reply = Frame(1, 0x6B49D201, 7, b"\0\1\0\0efgh")
-    assert write_frame(reply).hex(" ") == "01 01 6b 49 d2 01 00 00 00 07 00 01 00 00 65 66 67 68"
+    assert write_frame(reply).hex(" ") == "01 01 00 00 00 00 6b 49 d2 01 00 00 00 07 00 01 00 00 65 66 67 68"
 
 
 def test_a_short_deadline_is_not_taken_for_none() -> None:
@@ -66,12 +66,12 @@ def test_what_does_not_fit_is_not_written(frame: Frame) -> None:
     ("data", "error"),
     [
         ("", EntryBoundsError),
-        ("0102000000010000000", EntryBoundsError),
-        ("000200000001000000010100", EntryBoundsError),
-        ("0202000000010000000100", EntryKindError),
-        ("01ff0000000100000001", EntryKindError),
-        ("01020000000100000000", EntryKindError),
-        ("00020000000100000001f00000", EntryKindError),
+        ("010200000000000000010000000", EntryBoundsError),
+        ("00020000000000000001000000010100", EntryBoundsError),
+        ("0202000000000000000100000001", EntryKindError),
+        ("01ff000000000000000100000001", EntryKindError),
+        ("0102000000000000000100000000", EntryKindError),
+        ("0002000000000000000100000001f00000", EntryKindError),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(data: str, error: type[WireError]) -> None:

@@ -40,10 +40,11 @@ def stats(
         },
         "sink": {
             "topics": {"/rx_robot_2/odom": {"delivered": 5}},
+            "packets": 60,
             "packet_loss_est": missing,
             "publish_failed": unpublished,
         },
-        "packets": {"out": 90, "in": 60, "refused": 0, "damaged": damaged},
+        "packets": {"out": 90, "in": 64, "refused": 0, "damaged": damaged},
         "phy": {"snr_db": snr_db},
         "front_end": {"name": "uhd", "passed": {"bursts_out": 90}, "lost": {"overflows": 0}},
     }
@@ -53,7 +54,8 @@ def test_a_link_that_sends_nothing_says_what_it_waits_for() -> None:
     silent = stats(None)
     silent["source"]["topics"] = {"/odom": {"submitted": 0, "lost_on_graph": 0, "types": 1}}
     silent["source"]["unmatched"] = ["/odom", "/scan"]
-    silent["packets"] |= {"out": 0, "in": 0}
+    silent["packets"] |= {"out": 0, "in": 3}  # of another link
+    silent["sink"]["packets"] = 0
     assert status_line(silent) == "12 s; nothing sent, no publisher on /odom and 1 more; nobody heard"
     silent["source"]["unmatched"] = []
     assert status_line(silent).startswith("12 s; sent 0 messages in 0 packets")

@@ -189,7 +189,7 @@ CONTROLS = {
     "hello": {"hello": "boot", "turns": "turns", "digest": "digest"},
     "ask": {"ask": "src_id"},
     "report": {"report": "src_id", "boot": "boot", "number": "number", "arrived": "arrived", "loss": "loss"},
-    "heard": {"heard": "src_id", "boot": "boot"},
+    "heard": {"heard": "src_id", "echo": "echo", "since": "since"},
 }
 """Names of values in the vectors, and of the dissector's fields."""
 

@@ -30,12 +30,6 @@ class Sized:
         self._sizes = sizes
         self._messages: list[bytes] = []
 
-    def announcement(self, topic_id: int) -> str:  # noqa: ARG002
-        return "codec=sized"
-
-    def lacks(self, topic_id: int, coded: bytes) -> bool:  # noqa: ARG002
-        return False
-
     def canonical(self, topic_id: int, payload: bytes) -> bytes:  # noqa: ARG002
         return payload
 

@@ -46,7 +46,7 @@ def coefficient(row: int, number: int) -> int:
 def subkey(key: bytes, src_id: int, boot: int) -> bytes:
     """HKDF-SHA256, one block of it."""
     extracted = hmac.new(b"gr-ros2 version 1", key, sha256).digest()
-    info = bytes([src_id]) + boot.to_bytes(4, "big")
+    info = bytes([src_id]) + boot.to_bytes(8, "big")
     return hmac.new(extracted, info + b"\x01", sha256).digest()[:16]
 
 
@@ -160,14 +160,14 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
         return int.from_bytes(content[start:stop], "big")
 
     if kind == 0xF8:
-        if len(content) < 13 or (len(content) - 13) % 5:
+        if len(content) < 17 or (len(content) - 17) % 5:
             raise Refused("entry_bounds")
-        marks = [[content[at], number(at + 1, at + 5)] for at in range(13, len(content), 5)]
+        marks = [[content[at], number(at + 1, at + 5)] for at in range(17, len(content), 5)]
         return {
-            "hello": number(0, 4),
-            "turns": number(4, 8),
-            "capabilities": content[8],
-            "digest": number(9, 13),
+            "hello": number(0, 8),
+            "turns": number(8, 12),
+            "capabilities": content[12],
+            "digest": number(13, 17),
             "marks": marks,
         }
     if kind == 0xF9:
@@ -190,9 +190,9 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
             "snr_db": content[14] / 2 - 40 if len(content) == 15 else None,
         }
     if kind == 0xFB:
-        if len(content) != 5:
+        if len(content) != 7:
             raise Refused("entry_bounds")
-        return {"heard": content[0], "boot": number(1, 5)}
+        return {"heard": content[0], "echo": number(1, 5), "since": number(5, 7)}
     return None
 
 
@@ -252,7 +252,7 @@ def read_packet(
     else:
         body = data[start:end]
         turns = number >> 16
-        session = boot.to_bytes(4, "big") + turns.to_bytes(4, "big")
+        session = boot.to_bytes(8, "big") + turns.to_bytes(4, "big")
         if crc32(session + data[:end]) != int.from_bytes(data[end:], "big"):
             raise Refused("crc")
     room = packet_len - (6 if addressed else 4) - 2 - trailer

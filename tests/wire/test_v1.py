@@ -36,7 +36,7 @@ marks = st.lists(st.tuples(U8, U32), max_size=7).map(tuple)
 controls = (
     st.builds(Hello, U32, U32, U8, U32, marks)
     | st.builds(Ask, U8, st.binary(min_size=1, max_size=9))
-    | st.builds(Heard, U8, U32)
+    | st.builds(Heard, U8, st.binary(min_size=4, max_size=4), st.integers(0, 0xFFFF))
     | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127), SNRS)
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)

@@ -2,22 +2,27 @@
 
 The decoder holds the bodies that are known. For the missing ones it holds a system of linear equations over GF(256) in
 echelon form. Each equation is stored under its oldest packet, its *pivot*, whose coefficient is 1. A repair spans at
-most 127 numbers, and so does every equation made of repairs. The work per packet therefore stays bounded, however long
-the window is.
+most 127 numbers, and so does every equation made of repairs. At most ``MOST_EQUATIONS`` are held, so the work per
+packet is bounded, however long the window is and whatever is sent.
 
 Invariants: a body that the decoder returns is the one that was sent, unless the packet's own check failed to notice
 damage; a body that follows from equations but cannot be parsed is dropped together with all equations, since one wrong
 equation would spread; packet numbers do not wrap around here (the caller counts how often they have); memory is bounded
-by ``span`` bodies and as many equations as numbers are missing among them.
+by ``span`` bodies and the number of equations.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from gr_ros2.link.v1.gf256 import CAUCHY, INVERSE, TIMES
 from gr_ros2.wire.v1 import MAX_WINDOW
+
+MOST_EQUATIONS = 4096
+"""Equations held. A packet may pass through all of them, which takes some ms; a message of 10,000 packets at 20 % loss
+needs fewer."""
 
 Found = list[tuple[int, bytes]]
 """Source packets that have become known: (number, body)."""
@@ -29,12 +34,15 @@ class RepairDecoder:
     :param room: bytes of the longest body
     :param plausible: whether a recovered body can be valid
     :param span: numbers remembered, counted back from the newest
+    :param equations: most equations held
     """
 
-    def __init__(self, room: int, plausible: Callable[[bytes], bool], span: int) -> None:
+    def __init__(
+        self, room: int, plausible: Callable[[bytes], bool], span: int, equations: int = MOST_EQUATIONS
+    ) -> None:
         self.counts: Counter[str] = Counter()
-        """Counts: ``recovered`` packets; repairs that were ``redundant``, ``too_old`` or stored for later (``held``);
-        ``implausible`` results. Each implausible result discards all equations."""
+        """Counts: ``recovered`` packets; repairs that were ``redundant``, ``too_old``, ``too_many`` or stored for later
+        (``held``); ``implausible`` results. Each implausible result discards all equations."""
         self.newest = -1
         """The newest number seen."""
         self.floor = 0
@@ -42,6 +50,7 @@ class RepairDecoder:
         self._room = room
         self._plausible = plausible
         self._span = span
+        self._most = equations
         self._bodies: dict[int, bytes] = {}
         self._rows: dict[int, tuple[bytes, bytes]] = {}
         """By pivot: the coefficients of the equation from the pivot on, and its right side."""
@@ -134,6 +143,9 @@ class RepairDecoder:
         body = right.to_bytes(room, "little").translate(factor)
         if left < 256:
             return self._believe(pivot, body)
+        if len(rows) >= self._most:
+            self.counts["too_many"] += 1
+            return []
         self.counts["held"] += 1
         rows[pivot] = (left.to_bytes((left.bit_length() + 7) >> 3, "little").translate(factor), body)
         return []
@@ -141,6 +153,7 @@ class RepairDecoder:
     def _learn(self, found: Found) -> Found:
         """Put packets that have become known into the equations; return these and all that follow."""
         bodies, rows, room = self._bodies, self._rows, self._room
+        known = {number for number, _ in found}
         done = 0
         while done < len(found):
             number, body = found[done]
@@ -168,8 +181,10 @@ class RepairDecoder:
                 rest = int.from_bytes(own[0], "little") ^ 1
                 side = int.from_bytes(own[1], "little") ^ int.from_bytes(body, "little")
                 more += self._insert(number, rest, side)
-            known = {item[0] for item in found}
-            found += [item for item in more if item[0] not in known and item[0] not in bodies]
+            for item in more:
+                if item[0] not in known and item[0] not in bodies:
+                    known.add(item[0])
+                    found.append(item)
         return found
 
     def _naming(self, number: int) -> list[int]:
@@ -196,17 +211,15 @@ class RepairDecoder:
 
     def _forget(self, floor: int) -> None:
         """Forget everything older than ``floor``."""
-        bodies, rows = self._bodies, self._rows
-        if floor - self.floor > len(bodies):
-            for number in [number for number in bodies if number < floor]:
-                del bodies[number]
-        else:
-            for number in range(self.floor, floor):
-                bodies.pop(number, None)
-        if rows:
-            for pivot in [pivot for pivot in rows if pivot < floor]:
-                del rows[pivot]
-        self.floor = max(self.floor, floor)
+        held: dict[int, Any]
+        for held in (self._bodies, self._rows):
+            if floor - self.floor > len(held):
+                for number in [number for number in held if number < floor]:
+                    del held[number]
+            else:
+                for number in range(self.floor, floor):
+                    held.pop(number, None)
+        self.floor = floor
 
 
 def window_numbers(number: int, mask: int) -> list[int]:

@@ -51,7 +51,9 @@ from gr_ros2.registry import NewRow, Registry
 from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import (
     CAN_HEAR,
+    ECHO_LEN,
     REPORTED,
+    WANTS_PROOF,
     Ask,
     Control,
     Heard,
@@ -152,7 +154,13 @@ class Endpoint:
             "idle" if settings.repair == AUTO else settings.repair, self._room, settings.expected_loss
         )
         self.neighbours = Neighbours(
-            (settings.src_id, boot), settings, self.keys, heard=heard or {}, save=save, inbox=self._inbox
+            (settings.src_id, boot),
+            settings,
+            self.keys,
+            heard=heard or {},
+            save=save,
+            inbox=self._inbox,
+            dropped=self.received.dropped,
         )
         self.topics = topics
         """What it sends."""
@@ -547,9 +555,24 @@ class Endpoint:
         if self._talk.starting and not self.window.reported:
             outbox.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         turns, marks = self.window.newest >> 16, outbox.marks(now)
-        reported, lone = self.window.reported, self._lone
-        entries = self._talk.hello(self._room, turns, outbox.digest, marks, now, reported=reported, lone=lone)
-        return self._control(entries, "hello", now, clear=True)
+        heard = self.neighbours.heard(self.window.newest)
+        entries = self._talk.hello(
+            self._room,
+            turns,
+            outbox.digest,
+            marks,
+            heard=heard,
+            wants=self.neighbours.unproven,
+            reported=self.window.reported,
+            lone=self._lone,
+            now=now,
+        )
+        data = self._control(entries, "hello", now, clear=isinstance(entries[0], Hello))
+        self.neighbours.said_hello(data, now)
+        for entry in entries:
+            if isinstance(entry, Heard):
+                self.window.proven(entry.src_id, self.neighbours.since(entry.src_id))
+        return data
 
     def _say(self, due: Sequence[Neighbour], now: float) -> bytes:
         """A packet with reports, and with requests where there is room."""
@@ -607,20 +630,21 @@ class Endpoint:
             opened = self._open(data, now)
             if opened is None:
                 return
-            if snr_db is not None:
+            if snr_db is not None and opened.new:
                 opened.neighbour.inbox.measured(snr_db)
-            self._use(data, opened, now)
+            proved = self._use(data, opened, now)
         except WireError as error:
             self.received.rejected[error.kind] += 1
             self._report_all([Rejected(data, error)])
             return
-        if opened.met:
+        if opened.met or proved:
             for early in self.neighbours.early(opened.neighbour.src_id):
                 self._receive(early, now)
 
     def _open(self, data: bytes, now: float) -> Opened | None:
         header = read_header(data, self.settings.packet_len)
         if header.src_id == self.settings.src_id:
+            self.neighbours.check_own(data, header)
             self.received.dropped["own"] += 1
             return None
         if header.dst_id not in (BROADCAST, self.settings.src_id) and self.settings.src_id != NOBODY:
@@ -630,13 +654,12 @@ class Endpoint:
             raise NoKeyError(f"a sealed packet of robot {header.src_id}, and no key is configured here")
         if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
-        opened = self.neighbours.open(data, header, now)
-        if opened is None:
-            self.received.dropped["early"] += 1
-        return opened
+        return self.neighbours.open(data, header, now)
 
-    def _use(self, data: bytes, opened: Opened, now: float) -> None:
+    def _use(self, data: bytes, opened: Opened, now: float) -> bool:
+        """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
         self.received.packets += 1
+        proved = False
         neighbour, number, standing = opened.neighbour, opened.number, opened.standing
         control = standing is not None and not standing.mask
         self.urged = self.urged or control or self._talk.lacking
@@ -653,17 +676,31 @@ class Endpoint:
         elif standing.mask:
             self._report_all([Received(data, Packet(opened.header, (), standing, opened.body, encrypted))])
             self._report_all(
-                inbox.repair(number, standing.mask, standing.row, opened.body, oldest=standing.oldest, now=now)
+                inbox.repair(
+                    number,
+                    standing.mask,
+                    standing.row,
+                    opened.body,
+                    oldest=standing.oldest,
+                    now=now,
+                    new=opened.new,
+                )
             )
         else:
             entries = opened.entries if opened.entries is not None else read_body(opened.body, room)
             self._report_all([Received(data, Packet(opened.header, tuple(entries), standing, b"", encrypted))])
+            if standing.clear:
+                neighbour.echo = data[-ECHO_LEN:], self.window.newest
+                if neighbour.hello.capabilities & WANTS_PROOF:
+                    self._talk.answer(now)
+            proved = self.neighbours.proved(neighbour, number, entries)
             for entry in entries:
                 if isinstance(entry, Hello):
                     inbox.told = self.settings.hears and entry.capabilities & REPORTED != 0
-                elif isinstance(entry, (Ask, Report, Heard)):
+                elif isinstance(entry, (Ask, Report)):
                     self._entry(entry)
             self._report_all(inbox.heard(number, now, over=standing.oldest))
+        return proved
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
@@ -680,7 +717,7 @@ class Endpoint:
         if self._repeats > 1:
             self._repeats, self._repeat_at = 1, now + self.settings.repeat_s
         if self.settings.hears:
-            self._talk.met(neighbour.src_id, neighbour.boot, now)
+            self._talk.met(now)
         self._report_all([Met(neighbour.src_id, neighbour.boot, hears)])
 
     def _entry(self, entry: Control) -> None:

@@ -30,6 +30,8 @@ class Settings:
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
+    :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
+        topics with a deadline or lifespan, no bound for others; 0 = no bound
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
@@ -46,6 +48,7 @@ class Settings:
     hears: bool = True
     half_duplex: bool = False
     hold_s: float = 1.0
+    max_age_s: float | Auto = AUTO
     repeat_s: float = 10.0
     max_source_bytes: int = 32_000_000
     max_sources: int = 16
@@ -90,6 +93,7 @@ def settings_of(
         hears=hears,
         half_duplex=half_duplex,
         hold_s=take.hold_s,
+        max_age_s=take.max_age_s,
         repeat_s=send.repeat_s,
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,

@@ -24,11 +24,12 @@ from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
-from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, PROMPT, SPAN
+from gr_ros2.setting import AUTO
 from gr_ros2.wire.control import REPORT_LEN, Control, Report, reportable
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table
@@ -36,8 +37,11 @@ from gr_ros2.wire.v1 import TABLE_TOPIC, Entry, Part, read_body
 
 Events = list[Delivered | Lost | Announced]
 
-_PACKET_COST = 150
-"""Bytes of bookkeeping that are counted per packet held."""
+_PACKET_COST, _EQUATION_COST = 250, 350
+"""Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
+of the list of gaps)."""
+_VOID = 1024
+"""Packets noted as left out of repairs before the notes about old ones are dropped."""
 _INCOMPLETE_S = 60.0
 """s that an incomplete message waits for its next fragment."""
 _REPORT_EVERY = 5
@@ -59,6 +63,9 @@ the greater is the share (a Kalman filter whose channel noise is estimated)."""
 _SQUARE_SMOOTHING = 0.125
 _SNR_CHANGE_DB = 1.5
 """Change of the SNR that is reported at once."""
+MAX_AGE_S = 15.0
+"""Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
+next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
 _WAITING = 256
 """Number of messages of unknown topics, or coded in an unknown way, that are kept until the table arrives."""
 
@@ -119,8 +126,11 @@ class Inbox:
         self._stats = stats
         self._decoder_for = decoder_for
         self._codec: MessageCodec | None = None
-        span = max(min(SPAN, settings.max_source_bytes // (room + _PACKET_COST)), MAP)
-        self.decoder = RepairDecoder(room, self._plausible, span)
+        memory = settings.max_source_bytes // 2  # for packets, and as much for messages
+        equations = max(min(MOST_EQUATIONS, memory // 4 // (room + _EQUATION_COST)), MAP)
+        rest = memory - equations * (room + _EQUATION_COST)
+        span = max(min(SPAN, rest // (room + _PACKET_COST)), MAP)
+        self.decoder = RepairDecoder(room, self._plausible, span, equations)
         self.decoder.begin(first)
         self.decoder.newest = first - 1
         self._first = self._low = self._wanted = first
@@ -129,13 +139,14 @@ class Inbox:
         """The sender does not repair packets before this number any more."""
         self._void: set[int] = set()
         """Packets that their sender has left out of a repair."""
-        self._gaps: deque[tuple[float, int]] = deque()
-        """Packets that are missing, and since when (s); only numbers that are still remembered."""
+        self._most_void = _VOID
+        self._gaps: deque[tuple[float, int, int]] = deque()
+        """Packets that are missing: since when (s), the first and the last of them."""
         self.told = False
         """Whether the sender gets reports. It then says which packets it does not repair any more."""
         self._hope = 1.0
         """Share of missing packets that are recovered in time."""
-        self._reassembly = Reassembly(settings.max_source_bytes)
+        self._reassembly = Reassembly(memory // 2)
         self._kept_back = 0
         """Bytes of the complete messages that wait for an earlier one."""
         self._ready: dict[int, list[_Ready]] = {}
@@ -158,6 +169,8 @@ class Inbox:
         self._pause = _REPORT_S
         """s after which the next report is due."""
         self._old_turn = False
+        self.sealed_after: Callable[[int], float] | None = None
+        """Tells the time in s after which a packet was sealed; None where this cannot be proven."""
         if rows:
             self._know(rows)
 
@@ -172,7 +185,6 @@ class Inbox:
         :param body: as it stood in the packet, padding included
         :param entries: the entries of the packet
         """
-        self.unreported += 1
         if number in self.decoder:
             self.counts["duplicate"] += 1
             self._stats.dropped["duplicate"] += 1
@@ -180,6 +192,7 @@ class Inbox:
         if number < self.decoder.floor:
             self.counts["late"] += 1
             return []
+        self.unreported += 1
         self._now = now
         self.counts["packets"] += 1
         late = number < self.decoder.newest
@@ -195,9 +208,15 @@ class Inbox:
         self._settle()
         return self._given()
 
-    def repair(self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float) -> Events:
-        """Take a repair."""
-        self.unreported += 1
+    def lacks_packet(self, number: int) -> bool:
+        """Whether a source packet is neither here nor too old."""
+        return number not in self.decoder and number >= self.decoder.floor
+
+    def repair(
+        self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
+    ) -> Events:
+        """Take a repair; only one that was not here before calls for a report."""
+        self.unreported += new
         self._advance(number, now, here=False)
         window = mask.bit_length()
         if oldest and number - window + 1 > self._dead:
@@ -208,6 +227,9 @@ class Inbox:
             for back in range(window):
                 if not mask >> back & 1 and number - back not in self.decoder and number - back >= self._wanted:
                     self._void.add(number - back)
+            if len(self._void) > self._most_void:
+                self._void = {left_out for left_out in self._void if left_out >= self._wanted}
+                self._most_void = 2 * len(self._void) + _VOID
         self._settle()
         return self._given()
 
@@ -323,7 +345,7 @@ class Inbox:
 
     @property
     def held(self) -> int:
-        """Bytes of incomplete messages."""
+        """Bytes of incomplete messages, bookkeeping included."""
         return self._reassembly.held
 
     def _given(self) -> Events:
@@ -352,8 +374,9 @@ class Inbox:
                 self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(gone, 1000)
         self.decoder.advance(number)
         gaps, floor = self._gaps, self.decoder.floor
-        gaps.extend((now, missing) for missing in range(max(newest + 1, floor), newest + 1 + gone))
-        while gaps and gaps[0][1] < floor:
+        if gone:
+            gaps.append((now, newest + 1, newest + gone))
+        while gaps and gaps[0][2] < floor:
             gaps.popleft()
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
@@ -398,7 +421,7 @@ class Inbox:
         if row is None or self._awaits_table(ready):
             self._unknown.append(ready)
             self._waiting += len(ready.payload)
-            while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes:
+            while len(self._unknown) > _WAITING or self._waiting > self._settings.max_source_bytes // 4:
                 lost = self._unknown.popleft()
                 self._waiting -= len(lost.payload)
                 self._never_known(lost)
@@ -420,20 +443,17 @@ class Inbox:
     def _settle(self) -> None:
         """Find up to which packet everything is here or given up, and deliver the messages that waited for that."""
         decoder, dead, void = self.decoder, max(self._dead, self.decoder.floor), self._void
-        newest, low = decoder.newest, self._low
+        newest, low = decoder.newest, max(self._low, min(dead, decoder.newest + 1))
         if self._kept_back > self._settings.max_source_bytes:
             low = newest + 1
         elif self._gaps and not self.told:
             low = self._give_up(low, dead)
-        while low <= newest and (low in decoder or low < dead or low in void):
+        while low <= newest and (low in decoder or low in void):
             low += 1
         wanted = max(self._wanted, dead)
         while wanted <= newest and (wanted in decoder or wanted in void):
             wanted += 1
-        if wanted > self._wanted:
-            if void:
-                self._void = {number for number in void if number >= wanted}
-            self._wanted = wanted
+        self._wanted = wanted
         if low > self._low:
             self._low = low
             for topic_id, line in self._ready.items():
@@ -444,14 +464,15 @@ class Inbox:
         """The number up to which missing packets are given up; also updates the share of packets that are recovered."""
         gaps, decoder, hold_s = self._gaps, self.decoder, self._settings.hold_s
         while gaps and gaps[0][0] + hold_s <= self._now:
-            number = gaps.popleft()[1]
-            if number in decoder:
-                self._hope += (1 - self._hope) * _HOPE
-            elif number >= dead and number not in self._void:
-                self._hope -= self._hope * _HOPE
-                low = max(low, number + 1)
+            _, first, last = gaps.popleft()
+            for number in range(max(first, last + 1 - MAP), last + 1):  # earlier ones hardly count
+                if number in decoder:
+                    self._hope += (1 - self._hope) * _HOPE
+                elif number >= dead and number not in self._void:
+                    self._hope -= self._hope * _HOPE
+            low = max(low, last + 1)
         if gaps and self._hope < 0.5:
-            low = max(low, gaps[-1][1] + 1)
+            low = max(low, gaps[-1][2] + 1)
         return low
 
     def _release(self, row: TableRow, line: list[_Ready]) -> None:
@@ -463,6 +484,9 @@ class Inbox:
 
     def _deliver(self, ready: _Ready, row: TableRow) -> None:
         topic_id, key = ready.topic_id, self._key(ready.order)
+        if self._old(ready, row):
+            self._events.append(Lost(self.src_id, topic_id, LedgerRow.NOT_FRESH, key))
+            return
         if ready.order <= self._last.get(topic_id, (-1, -1)):
             self._events.append(Lost(self.src_id, topic_id, _passed_over(row), key))
             return
@@ -486,6 +510,13 @@ class Inbox:
                 return
         qos = ready.qos if ready.qos >= 0 else row.qos
         self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
+
+    def _old(self, ready: _Ready, row: TableRow) -> bool:
+        """Whether a message may be older than its topic allows, because nothing proves that it is not."""
+        most = self._settings.max_age_s
+        if most == AUTO:
+            most = MAX_AGE_S if row.fresh else 0.0
+        return most > 0 and self.sealed_after is not None and self._now - self.sealed_after(ready.order[0]) > most
 
     def _table(self, payload: bytes) -> None:
         try:

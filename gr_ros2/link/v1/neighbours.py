@@ -3,31 +3,48 @@
 A robot's packets can be opened once a hello has told its boot number. Packets that arrive shortly before the hello are
 kept until then.
 
-Where packets are sealed, the newest boot number of every robot is stored, together with a packet number below which
-nothing is accepted. This number is stored before a packet above it is used. So after a restart of this robot, every
-packet heard before the restart is refused. A robot that stands still (its packet number does not grow) is accepted
-below that number once it says that it has heard the present start of this robot: only that robot can say so, and only
-after the restart.
+*Proof.* Where packets are sealed and two robots hear each other, a packet of messages is used only if it was sealed
+after this robot started. The other robot proves it: it echoes the end of a hello of this start, and says at which
+number it was then (*heard*). So what was recorded before is refused, whether this robot heard it or not. Echoes also
+tell how long ago a packet was sealed at most (``Neighbour.sealed_after``). Packets that arrive before the first proof
+are kept until then.
 
-Where packets are not sealed, only the boot number of every robot is stored. A robot whose boot number is stored was
-heard before this robot restarted, so its packets count from the first hello on, and no message comes out twice.
+A robot that cannot hear this one can prove nothing. Of such a robot, a packet number is stored below which nothing is
+accepted, before a packet above it is used. So after a restart of this robot, every packet that it heard before is
+refused, but not what it never heard.
 
-Invariants: no body is given out that was not opened; no standing packet is given out twice; where packets are sealed,
-an older start of a robot is never accepted again.
+The newest boot number of every robot is stored. An older start of a robot is accepted only with a proof; where packets
+are not sealed, after a silence. A robot whose boot number is stored was heard before this robot restarted, so its
+packets count from the first hello on, and no message comes out twice.
+
+Invariants: no body is given out that was not opened; no control packet is given out twice; work per packet is bounded;
+where packets are sealed, nothing is given out that was sealed before this start and could be a replay.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
-from gr_ros2.errors import CrcError, EntryKindError, ReplayedError, SourcesError, TagError, WireError, WrongKeyError
+from gr_ros2.errors import (
+    CrcError,
+    EntryKindError,
+    GrRos2Error,
+    NotStoredError,
+    ReplayedError,
+    SameIdError,
+    SourcesError,
+    TagError,
+    WireError,
+    WrongKeyError,
+)
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.repair import MAP
+from gr_ros2.link.v1.repair import START
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
-from gr_ros2.wire.control import ENCRYPTS, Heard, Hello
+from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
     HEADER_LEN,
     QOS_STANDING,
@@ -41,18 +58,27 @@ from gr_ros2.wire.v1 import (
 )
 
 Save = Callable[[int, int, int], None]
-"""Stores robot id, boot number and the packet number below which nothing more is accepted. Stores before it returns."""
+"""Stores robot id, boot number and the packet number below which nothing more is accepted. Stores before it returns.
+
+:raises GrRos2Error: it cannot be stored
+"""
 
 _HALF = 1 << 15
 _EARLY = 64
 """Number of packets kept per robot that cannot be opened yet."""
-_START = 64
-"""If a robot is first heard within this number of packets of its start, its packets count from its start on."""
 _RETREAT_S = 1.0
 """s of silence after which a robot that does not seal may return with a smaller boot number."""
+_ROWS_KEPT = 512
+"""Packet numbers, counted back from the newest, for which it is known which rows were used."""
+_ECHOES = 64
+"""Hellos of this robot that can be echoed, and proofs kept of each other robot."""
+_MOST = 1 << 48
+"""Number of packets that a start of a robot can have."""
 _RESERVE = 16
 _MOST_RESERVED = 1 << 14
 _SAVING_S = 0.25
+_RETRY_S = 10.0
+"""s after which a state file that could not be written is tried again where nothing waits for it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -71,10 +97,20 @@ class Neighbour:
     """Whether it has been silent for long."""
     reserve: int = _RESERVE
     saved: float = 0.0
+    failed: bool = False
+    """Whether storing failed the last time."""
     rows: dict[int, int] = field(default_factory=dict)
     """Rows of standing packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When each topic was requested."""
+    proofs: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_ECHOES))
+    """(number, time in s): packets above this number were sealed after this time."""
+    proven: int | None = None
+    """Packets above this number were sealed after this robot started; None as long as nothing proves it."""
+    not_before: float = -inf
+    """Hellos of this robot up to this time in s prove nothing: an earlier start of the other robot heard them."""
+    echo: tuple[bytes, int] | None = None
+    """The end of its newest hello, and the number that this robot had reached then."""
 
     @property
     def encrypts(self) -> bool:
@@ -85,21 +121,32 @@ class Neighbour:
         """The full packet number for its low 16 bits: the one nearest to the newest."""
         newest = self.inbox.newest
         number = newest + ((low - newest + _HALF) & 0xFFFF) - _HALF
-        if number < 0:
+        if not 0 <= number < _MOST:
             raise ReplayedError(f"packet {low} of robot {self.src_id} is older than its start")
         return number
 
-    def fresh(self, number: int, row: int) -> None:
-        """Check that a standing packet with entries is used only once.
-
-        :raises ReplayedError: it was used before, or is too old to decide
-        """
+    def new(self, number: int, row: int) -> bool:
+        """Whether a packet was not here before, as far as this is known; notes the row of a standing packet."""
+        if row == SOURCE_ROW:
+            return self.inbox.lacks_packet(number)
+        oldest = self.inbox.newest - _ROWS_KEPT
         used = self.rows.get(number, 0)
-        if used >> row & 1 or number <= self.inbox.newest - MAP:
-            raise ReplayedError(f"row {row} at packet {number} of robot {self.src_id} was here before")
+        if used >> row & 1 or number <= oldest:
+            return False
         self.rows[number] = used | 1 << row
-        if len(self.rows) > 2 * MAP:
-            self.rows = {number: used for number, used in self.rows.items() if number > self.inbox.newest - MAP}
+        if len(self.rows) > 2 * _ROWS_KEPT:
+            self.rows = {number: used for number, used in self.rows.items() if number > oldest}
+        return True
+
+    def prove(self, number: int, at: float) -> None:
+        """Note that its packets above a number were sealed after a time, s."""
+        self.proven = number if self.proven is None else min(self.proven, number)
+        if not self.proofs or (number >= self.proofs[-1][0] and at > self.proofs[-1][1]):
+            self.proofs.append((number, at))
+
+    def sealed_after(self, number: int) -> float:
+        """Time in s after which a packet was sealed; -inf if nothing proves it."""
+        return next((at for since, at in reversed(self.proofs) if since < number), -inf)
 
 
 @dataclass(slots=True)
@@ -107,7 +154,7 @@ class Opened:
     """A packet whose trailer was checked.
 
     ``met``: it is of a start that was not known before, or of a robot that was taken for gone; ``replaced``: the robot
-    start that is now forgotten, if any.
+    start that is now forgotten, if any; ``new``: whether it was not here before.
     """
 
     neighbour: Neighbour
@@ -118,6 +165,7 @@ class Opened:
     entries: list[Entry] | None = None
     met: bool = False
     replaced: Neighbour | None = None
+    new: bool = True
 
 
 class Neighbours:
@@ -125,6 +173,8 @@ class Neighbours:
 
     :param own: id and boot number of this robot
     :param heard: what ``save`` has stored, by robot id: boot number and packet number
+    :param dropped: counts packets that are kept (``early``), packets that may have been sealed before this robot
+        started (``unproven``), and failures of ``save`` (``state_not_written``)
     :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be needed, bytes of its
         longest body)
     """
@@ -138,7 +188,9 @@ class Neighbours:
         heard: Mapping[int, tuple[int, int]],
         save: Save | None,
         inbox: Callable[[int, int, int, int], Inbox],
+        dropped: Counter[str],
     ) -> None:
+        self.dropped = dropped
         self._own = own
         self._settings = settings
         self._keys = keys
@@ -147,6 +199,10 @@ class Neighbours:
         self._make_inbox = inbox
         self._known: dict[int, Neighbour] = {}
         self._early: dict[int, deque[bytes]] = {}
+        self._met_at: dict[int, float] = {}
+        """When the present start of each robot was heard for the first time."""
+        self._hellos: dict[bytes, float] = {}
+        """When the newest hellos of this robot left, by their ends."""
 
     def __iter__(self) -> Iterator[Neighbour]:
         return iter(self._known.values())
@@ -174,7 +230,7 @@ class Neighbours:
     def open(self, data: bytes, header: Header, now: float) -> Opened | None:
         """Open a packet.
 
-        :return: None if it is kept until a hello tells how to open it
+        :return: None if it is kept until a hello or a proof comes, or dropped because it is not proven
         :raises WireError: the packet cannot be opened, or must not be
         """
         start, end = header.size, len(data) - self._keys.trailer_len
@@ -187,6 +243,7 @@ class Neighbours:
         neighbour = self._known.get(header.src_id)
         if neighbour is None:
             self._keep(header.src_id, data)
+            self.dropped["early"] += 1
             return None
         number = neighbour.number(header.number)
         row = SOURCE_ROW if standing is None else standing.row
@@ -195,64 +252,147 @@ class Neighbours:
         except (CrcError, TagError):
             self._keep(header.src_id, data)
             raise
-        if standing is not None and not standing.mask:
-            neighbour.fresh(number, row)
-        met = self._heard(neighbour, number, now)
-        return Opened(neighbour, header, number, standing, body, met=met)
+        control = standing is not None and not standing.mask
+        if not control and self.proves(neighbour.hello):
+            if neighbour.proven is None:
+                self._keep(header.src_id, data)
+                self.dropped["early"] += 1
+                return None
+            if number <= neighbour.proven:
+                self.dropped["unproven"] += 1
+                return None
+        new = neighbour.new(number, row)
+        if control and not new:
+            raise ReplayedError(f"row {row} at packet {number} of robot {header.src_id} was here before")
+        met = new and self._heard(neighbour, number, now)
+        return Opened(neighbour, header, number, standing, body, met=met, new=new)
+
+    def proves(self, hello: Hello) -> bool:
+        """Whether a robot can prove when it sealed a packet: it hears this one, and packets are sealed."""
+        return self._keys.sealed and self._settings.hears and hello.capabilities & CAN_HEAR != 0
+
+    @property
+    def unproven(self) -> bool:
+        """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
+        return any(n.proven is None and not n.gone and self.proves(n.hello) for n in self._known.values())
+
+    def proved(self, neighbour: Neighbour, number: int, entries: Sequence[Entry]) -> bool:
+        """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
+        before = neighbour.proven
+        for since, at in self._proofs(number, entries, neighbour.not_before):
+            neighbour.prove(since, at)
+        return before is None and neighbour.proven is not None
+
+    def said_hello(self, data: bytes, now: float) -> None:
+        """A hello of this robot leaves: from now on, other robots can prove that they have heard it."""
+        self._hellos[data[-ECHO_LEN:]] = now
+        if len(self._hellos) > _ECHOES:
+            del self._hellos[next(iter(self._hellos))]
+
+    def heard(self, newest: int) -> list[Heard]:
+        """What proves to other robots that they were heard.
+
+        :param newest: number of this robot's newest source packet
+        """
+        echoes = [(n.src_id, *n.echo) for n in self._known.values() if n.echo and self.proves(n.hello) and not n.gone]
+        return [Heard(src_id, echo, since & 0xFFFF) for src_id, echo, since in echoes if newest - since < 1 << 16]
+
+    def since(self, src_id: int) -> int:
+        """The number that this robot had reached when it heard the newest hello of another one."""
+        neighbour = self._known.get(src_id)
+        return 0 if neighbour is None or neighbour.echo is None else neighbour.echo[1]
+
+    def check_own(self, data: bytes, header: Header) -> None:
+        """Look at a packet that has this robot's own id.
+
+        :raises SameIdError: it is a hello of another start
+        """
+        if header.qos != QOS_STANDING or header.sealed != self._keys.sealed:
+            return
+        standing = read_standing(data, header.size, len(data) - self._keys.trailer_len)
+        if not standing.clear:
+            return
+        hello, _, clear, rest = self._read_hello(data, header, standing)
+        if hello.boot != self._own[1]:
+            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, standing.row))
+            raise SameIdError(
+                f"robot {header.src_id} is this robot, but start {hello.boot:016x} has that id too: two robots have it "
+                "(give one another robot_id), or a recording of an earlier start is on the air"
+            )
 
     def settle(self, now: float) -> None:
         """Store the exact packet number reached by robots that are quiet."""
-        if self._save is None or not self._keys.sealed:
-            return
         for neighbour in self._known.values():
             exact = neighbour.inbox.newest + 1
-            if neighbour.floor > exact and now - max(neighbour.heard, neighbour.saved) > 2 * _SAVING_S:
+            quiet = now - max(neighbour.heard, neighbour.saved) > 2 * _SAVING_S
+            if neighbour.failed and now - neighbour.saved > _RETRY_S:
+                self._store(neighbour, exact if self._counts_on_store(neighbour.hello) else 0, now)
+            elif self._counts_on_store(neighbour.hello) and neighbour.floor > exact and quiet:
                 neighbour.reserve = _RESERVE
                 self._store(neighbour, exact, now)
 
-    def _hello(self, data: bytes, header: Header, standing: Standing, now: float) -> Opened:
-        """Open a packet with a hello, which itself says how the packet is opened."""
-        src_id, start = header.src_id, header.size + standing.size
+    def _read_hello(self, data: bytes, header: Header, standing: Standing) -> tuple[Hello, list[Entry], bytes, bytes]:
+        """A hello, all entries of its packet, and the packet before and after its body begins."""
+        start = header.size + standing.size
         room = body_room(self._settings.packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
         entries = read_body(data[start : len(data) - self._keys.trailer_len], room)
-        hello = entries[0] if entries else None
-        if not isinstance(hello, Hello):
+        if not entries or not isinstance(entries[0], Hello):
             raise EntryKindError("a packet in the clear that does not begin with a hello")
+        return entries[0], entries, data[:start], data[start:]
+
+    def _hello(self, data: bytes, header: Header, standing: Standing, now: float) -> Opened:
+        """Open a packet with a hello, which itself says how the packet is opened."""
+        src_id, sealed = header.src_id, self._keys.sealed
+        hello, entries, clear, rest = self._read_hello(data, header, standing)
         number = hello.turns << 16 | header.number
-        clear, rest = data[:start], data[start:]
         neighbour = self._known.get(src_id)
         if neighbour is not None and neighbour.boot == hello.boot:
-            body = neighbour.trailer.open(clear, rest, number, standing.row, plain=True)
-            neighbour.fresh(number, standing.row)
-            neighbour.hello = hello
-            return Opened(neighbour, header, number, standing, body, entries, self._heard(neighbour, number, now))
-        self._refuse_old(src_id, hello.boot, neighbour, now)
-        trailer = self._trailer(src_id, hello, clear, rest, (number, standing.row))
+            neighbour.trailer.open(clear, rest, number, standing.row, plain=True)
+            jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
+            if not (jumps and neighbour.gone):
+                if jumps or not neighbour.new(number, standing.row):
+                    raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
+                neighbour.hello = hello
+                return Opened(neighbour, header, number, standing, b"", entries, self._heard(neighbour, number, now))
         boot, floor = self._stored.get(src_id, (-1, 0))
-        floor = floor if boot == hello.boot else 0
-        if not self._keys.sealed:
-            floor = number + 1 if boot == hello.boot else 0
-        elif number < floor:
-            if Heard(*self._own) not in entries:
-                raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
-            floor = number + 1
+        before = self._met_at.get(src_id, -inf)
+        proofs = self._proofs(number, entries, before) if sealed else ()
+        newest = boot
+        if not sealed:
+            newest = -1 if neighbour is None or now - neighbour.heard >= _RETREAT_S else neighbour.boot
+        if hello.boot < newest and not proofs:
+            raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
+        trailer = self._trailer(src_id, hello, clear, rest, (number, standing.row))
+        again, stores = boot == hello.boot, self._counts_on_store(hello)
+        if again and stores and number < floor:
+            raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
         if neighbour is None:
             neighbour = self._room_for(src_id)
-        first = max(floor, 1 if number <= _START else number + 1)
-        inbox = self._make_inbox(src_id, hello.boot, first, room)
-        met = Neighbour(src_id, hello.boot, trailer, inbox, hello, now)
-        met.rows[number] = 1 << standing.row
+        first = 1 if number <= START else number + 1
+        if again:
+            first = max(first, floor if stores else number + 1)
+        room = body_room(self._settings.packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
+        met = Neighbour(src_id, hello.boot, trailer, self._make_inbox(src_id, hello.boot, first, room), hello, now)
+        if self.proves(hello):
+            met.inbox.sealed_after = met.sealed_after
+        met.not_before, self._met_at[src_id] = before, now
+        met.new(number, standing.row)
         self._known[src_id] = met
-        self._store(met, max(floor, number + 1) if self._keys.sealed else 0, now)
+        self._store(met, max(first, number + 1) if stores else 0, now)
         return Opened(met, header, number, standing, b"", entries, True, neighbour)
 
-    def _refuse_old(self, src_id: int, boot: int, neighbour: Neighbour | None, now: float) -> None:
-        newest = self._stored.get(src_id, (-1, 0))[0]
-        if self._keys.sealed:
-            if boot < newest:
-                raise ReplayedError(f"start {boot} of robot {src_id}, after start {newest} was heard")
-        elif neighbour is not None and boot < neighbour.boot and now - neighbour.heard < _RETREAT_S:
-            raise ReplayedError(f"start {boot} of robot {src_id}, while start {neighbour.boot} is heard")
+    def _proofs(self, number: int, entries: Sequence[Entry], before: float) -> list[tuple[int, float]]:
+        """What entries prove: packets of their sender above a number were sealed after a time in s.
+
+        :param number: at which the entries stand
+        :param before: hellos up to this time in s prove nothing: another start of the sender may have echoed them
+        """
+        own, hellos = self._own[0], self._hellos
+        found = [entry for entry in entries if isinstance(entry, Heard) and entry.src_id == own]
+        proofs = [
+            (number - (number - entry.since & 0xFFFF), hellos[entry.echo]) for entry in found if entry.echo in hellos
+        ]
+        return [(since, at) for since, at in proofs if since >= 0 and at > before]
 
     def _trailer(self, src_id: int, hello: Hello, clear: bytes, rest: bytes, place: tuple[int, int]) -> Trailer:
         encrypt = hello.capabilities & ENCRYPTS != 0
@@ -268,7 +408,7 @@ class Neighbours:
         raise failed
 
     def _heard(self, neighbour: Neighbour, number: int, now: float) -> bool:
-        """A packet of a known robot arrived; returns whether the robot was taken for gone."""
+        """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
         self._guard(neighbour, number, now)
@@ -288,16 +428,36 @@ class Neighbours:
             del self._early[next(iter(self._early))]
         self._early.setdefault(src_id, deque(maxlen=_EARLY)).append(data)
 
-    def _guard(self, neighbour: Neighbour, number: int, now: float) -> None:
-        """Store that a robot has reached this number, before the packet is used."""
-        if number < neighbour.floor or self._save is None or not self._keys.sealed:
-            return
-        if now - neighbour.saved < _SAVING_S:
-            neighbour.reserve = min(2 * neighbour.reserve, _MOST_RESERVED)
-        self._store(neighbour, number + neighbour.reserve, now)
+    def _counts_on_store(self, hello: Hello) -> bool:
+        """Whether only the stored packet number keeps replays of a robot out."""
+        return self._save is not None and self._keys.sealed and not self.proves(hello)
 
-    def _store(self, neighbour: Neighbour, floor: int, now: float) -> None:
-        neighbour.floor, neighbour.saved = floor, now
-        self._stored[neighbour.src_id] = (neighbour.boot, floor)
+    def _guard(self, neighbour: Neighbour, number: int, now: float) -> None:
+        """Store that a robot has reached this number, before the packet is used.
+
+        :raises NotStoredError: it cannot be stored
+        """
+        if number < neighbour.floor or not self._counts_on_store(neighbour.hello):
+            return
+        soon = now - neighbour.saved < _SAVING_S
+        if soon and not neighbour.failed:
+            neighbour.reserve = min(2 * neighbour.reserve, _MOST_RESERVED)
+        if (soon and neighbour.failed) or not self._store(neighbour, number + neighbour.reserve, now):
+            raise NotStoredError(
+                f"packet {number} of robot {neighbour.src_id} is not used, because the state file cannot be written: "
+                "after a restart it could be replayed"
+            )
+
+    def _store(self, neighbour: Neighbour, floor: int, now: float) -> bool:
+        """Store the number below which nothing is accepted; returns whether that worked."""
+        neighbour.saved, neighbour.failed = now, False
         if self._save is not None:
-            self._save(neighbour.src_id, neighbour.boot, floor)
+            try:
+                self._save(neighbour.src_id, neighbour.boot, floor)
+            except GrRos2Error:
+                self.dropped["state_not_written"] += 1
+                neighbour.failed = True
+                return False
+        neighbour.floor = floor
+        self._stored[neighbour.src_id] = (neighbour.boot, floor)
+        return True

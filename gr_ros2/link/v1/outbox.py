@@ -39,7 +39,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
@@ -140,6 +140,7 @@ class _Line:
         """Whether its messages are delivered in order, each after all earlier ones."""
         wanted = self.topic.options.reliability
         return (self.ordered if wanted == AUTO else wanted == "reliable") and self.queue.policy != "latest"
+
 
 @dataclass(slots=True)
 class Filling:
@@ -393,8 +394,19 @@ class Outbox:
             topic, options = line.topic, line.topic.options
             depth = min(line.kept_depth if line.kept else line.depth if options.depth == AUTO else options.depth, 255)
             codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
+            fresh = line.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
             rows.append(
-                TableRow(topic.topic_id, topic.name, topic.type_name, line.qos, line.in_order, line.kept, depth, codec)
+                TableRow(
+                    topic.topic_id,
+                    topic.name,
+                    topic.type_name,
+                    line.qos,
+                    line.in_order,
+                    line.kept,
+                    depth,
+                    codec,
+                    fresh,
+                )
             )
         if not rows and not self.digest:
             return

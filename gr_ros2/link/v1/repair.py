@@ -47,6 +47,8 @@ FEW = 8
 """The same when repair cannot keep up with the losses."""
 SPAN = 30_000
 """Numbers that a sender repairs and a receiver remembers, if its memory allows; numbers are mod 65,536."""
+START = 64
+"""If a robot is first heard within this number of packets of its start, its packets count from its start on."""
 MAP = 64
 """Number of packets that a report covers."""
 
@@ -142,6 +144,10 @@ class Receiver:
     heard: float
     loss: float = 0.0
     newest: int = -1
+    proven: int = 0
+    """It may take packets up to this number for replays. A combination that stands at a later one brings them back."""
+    settled: int = 0
+    """It needs no packet before this number."""
     interval: float = 0.0
     prompt: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
@@ -271,6 +277,18 @@ class RepairWindow:
             self._note_losses()
         return peer
 
+    def proven(self, receiver: int, number: int) -> None:
+        """A receiver is told that packets above a number were sealed after it had started."""
+        peer = self._receivers.get(receiver)
+        if peer is not None and peer.newest < 0:  # a report shows that it knows
+            peer.proven = number
+            if number <= START:
+                peer.lost.update(older for older, record in self._records.items() if older <= number and record.lives)
+
+    @property
+    def _proven(self) -> int:
+        return max((peer.proven for peer in self._receivers.values()), default=0)
+
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
         """A receiver says what it has.
 
@@ -314,11 +332,12 @@ class RepairWindow:
                     heappush(self._urgent, record.number)
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         if settled:
-            for older in range(self._oldest, number - MAP + 1):
+            for older in range(max(self._oldest, peer.settled), number - MAP + 1):
                 record = records.get(older)
                 if record is not None:
                     record.confirmed |= bit
                     peer.lost.discard(older)
+            peer.settled = max(peer.settled, number - MAP + 1)
         self._retire(now)
 
     def forget(self, receiver: int) -> None:
@@ -451,9 +470,9 @@ class RepairWindow:
         return soonest
 
     def exhausted(self, now: float) -> tuple[Life, ...]:
-        """The lifetimes of the newest live packet, if no further standing packet can stand at the newest number and
-        something is alive; otherwise (). A packet with these lifetimes and no content makes room for repairs."""
-        if self._rows.get(self.newest, 0) == (1 << ROWS) - 1:
+        """The lifetimes of the newest live packet, if no further repair can stand at the newest number and something is
+        alive; otherwise (). A packet with these lifetimes and no content makes room for repairs."""
+        if self._rows.get(self.newest, 0) == (1 << ROWS) - 1 or self.newest <= self._proven:
             for number in range(self.newest, self._oldest - 1, -1):
                 record = self._records.get(number)
                 if record is not None and record.alive(now):
@@ -468,7 +487,7 @@ class RepairWindow:
         while self._resend:
             number = -heappop(self._resend)
             record = self._records.get(number)
-            if number in peer.lost:
+            if number in peer.lost and number > peer.proven:
                 peer.lost.discard(number)
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     return self._again(record, now)
@@ -616,17 +635,17 @@ class RepairWindow:
 
         A later packet is added, or the newest ones are left out.
         """
-        full = (1 << ROWS) - 1
+        full, proven = (1 << ROWS) - 1, self._proven
         newest = window[0].number
-        if self._rows.get(newest, 0) != full:
+        if self._rows.get(newest, 0) != full and newest > proven:
             return window
-        for number in range(newest + 1, min(self.newest, window[-1].number + MAX_WINDOW - 1) + 1):
+        for number in range(max(newest, proven) + 1, min(self.newest, window[-1].number + MAX_WINDOW - 1) + 1):
             record = self._records.get(number)
             if record is not None and self._rows.get(number, 0) != full:
                 return [record, *window]
         while window and self._rows.get(window[0].number, 0) == full:
             window = window[1:]
-        return window
+        return window if window and window[0].number > proven else []
 
     def _fly(self, now: float, first: int, last: int) -> None:
         if self.mode == "thrifty":

@@ -2,10 +2,10 @@
 the key.
 
 A fleet shares keys. Each start of each robot seals with its own key. That key is derived from the fleet's key by HKDF
-(RFC 5869), with the robot's id and the number of the start, its *boot number*. The nonce consists of the full packet
-number (not only 16 bits of it) and the packet's row. No pair of key and nonce is used twice as long as boot numbers
-grow, a number is sent once, and a row is used once per number. A packet that is sent again is the same packet, byte for
-byte.
+(RFC 5869), with the robot's id and the number of the start, its *boot number*, half of which is random. So two robots
+that have one id by mistake do not share a key. The nonce consists of the full packet number (not only 16 bits of it)
+and the packet's row. No pair of key and nonce is used twice as long as a number is sent once, and a row is used once
+per number. A packet that is sent again is the same packet, byte for byte.
 
 Invariants: ``open`` returns a body only if the trailer belongs to the packet's bytes, its sender's boot number and its
 full packet number; otherwise it raises a named WireError. The hop count of a sealed packet is not covered, because
@@ -36,7 +36,7 @@ _SUBKEY_LEN = 16
 _SALT = b"gr-ros2 version 1"
 _HOP = HEADER_LEN + 1
 _nonce = Struct(">IQB")
-_info = Struct(">BI")
+_info = Struct(">BQ")
 
 
 class Trailer(Protocol):

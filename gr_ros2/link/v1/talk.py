@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from math import inf
+from typing import TypeVar
 
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
@@ -23,12 +24,15 @@ from gr_ros2.wire.control import (
     HELLO_LEN,
     MARK_LEN,
     REPORTED,
+    WANTS_PROOF,
     Ask,
     Control,
     Heard,
     Hello,
 )
 from gr_ros2.wire.v1 import TABLE_TOPIC
+
+_T = TypeVar("_T")
 
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 """Times in s after the start at which hellos are sent."""
@@ -38,6 +42,9 @@ OFTEN_S, SELDOM_S = 1.0, 2.0
 LONE_S = 10.0
 """Most s between two hellos of a robot that hears nobody: the time doubles with each hello, as in Trickle (RFC 6206). A
 robot that starts is met at once, by its own hellos."""
+EAGER_S, EAGER = 0.1, 20
+"""s between hellos, and number of them, while another robot has not proven yet that it heard this start: until then its
+messages are not delivered."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 ASK_S = 0.5
@@ -60,8 +67,10 @@ class Talk:
         self._pause = self._period
         """s to the next hello."""
         self._starting: deque[float] = deque()
-        self._answers: dict[int, int] = {}
-        self._mark = 0
+        self._apart: list[Control] = []
+        """What did not fit into the last hello and goes into a packet of its own."""
+        self._mark = self._heard = self._eager = 0
+        self._answering = False
         self._look_at = -inf
         self.lacking = False
         """Whether other robots keep messages that this one lacked when it last looked."""
@@ -78,10 +87,15 @@ class Talk:
         """Whether hellos are still frequent."""
         return bool(self._starting)
 
-    def met(self, src_id: int, boot: int, now: float) -> None:
+    def met(self, now: float) -> None:
         """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
-        self._answers[src_id] = boot
         self._starting = deque(now + after for after in STARTING_S[1:])
+        self._eager = EAGER
+        self.answer(now)
+
+    def answer(self, now: float) -> None:
+        """Send the next hello at once, before messages."""
+        self._answering = True
         self.hurry(now)
 
     def hurry(self, now: float) -> None:
@@ -96,7 +110,7 @@ class Talk:
         :param heard: some robot reports, so a new robot announces itself and is answered at once
         """
         late = now - self.due
-        if late < 0 or idle:
+        if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
             return late >= latency * LATENCY_S
@@ -108,32 +122,49 @@ class Talk:
         turns: int,
         digest: int,
         marks: Sequence[tuple[int, int]],
-        now: float,
         *,
+        heard: Sequence[Heard],
+        wants: bool,
         reported: bool,
         lone: bool,
+        now: float,
     ) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
+
+        Where ``heard`` does not fit beside a hello, it goes into the next packet, alone.
 
         :param room: bytes free for it
         :param turns: how often the packet number has wrapped around
         :param digest: CRC-32 of the table of topics
         :param marks: marks of the kept messages
+        :param heard: what proves to the other robots that they were heard
+        :param wants: whether such a proof of another robot is missing here
         :param reported: whether robots report to this one
         :param lone: whether nobody is heard, though somebody could be
         """
+        self._answering = False
+        if self._apart:
+            apart, self._apart = self._apart, []
+            self.due = self._next(now, wants=wants)
+            return apart
         free = room - HELLO_LEN
-        answers = [Heard(*answer) for answer in list(self._answers.items())[: free // HEARD_LEN]]
-        free -= len(answers) * HEARD_LEN
-        if not self._starting or len(answers) < len(self._answers):
-            for answer in answers:
-                del self._answers[answer.src_id]
-        count = min(len(marks), free // MARK_LEN)
-        named = tuple([*marks, *marks][self._mark : self._mark + count])
-        self._mark = (self._mark + count) % max(len(marks), 1)
         self._pause = min(2 * self._pause, LONE_S) if lone and not self._starting else self._period
-        self.due = self._starting.popleft() if self._starting else now + self._pause
-        return [Hello(self._boot, turns, self._capabilities | reported * REPORTED, digest, named), *answers]
+        proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
+        if free < HEARD_LEN:
+            self._apart, proofs = [*proofs], []
+        free -= len(proofs) * HEARD_LEN
+        named, self._mark = _in_turn(marks, self._mark, free // MARK_LEN)
+        self.due = now if self._apart else self._next(now, wants=wants)
+        capabilities = self._capabilities | reported * REPORTED | wants * WANTS_PROOF
+        return [Hello(self._boot, turns, capabilities, digest, tuple(named)), *proofs]
+
+    def _next(self, now: float, *, wants: bool) -> float:
+        """When the next hello is due, s."""
+        due = self._starting.popleft() if self._starting else now + self._pause
+        if not wants or not self._eager:
+            return due
+        self._eager -= 1
+        return min(due, now + EAGER_S)
 
     def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
         """Requests for messages that other robots keep and this one lacks."""
@@ -153,3 +184,9 @@ class Talk:
                 found.append(Ask(neighbour.src_id, wanted))
                 asked.update(dict.fromkeys(wanted, now + ASK_S))
         return found
+
+
+def _in_turn(items: Sequence[_T], turn: int, most: int) -> tuple[list[_T], int]:
+    """So many of the items from a place on, and the place after them."""
+    count = min(len(items), most)
+    return [*items, *items][turn : turn + count], (turn + count) % max(len(items), 1)

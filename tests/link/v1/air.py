@@ -47,6 +47,7 @@ class Robot:
         self.keys = keys(mode)
         self.settings = Settings(src_id, **{"packet_len": 64, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
+        self.save: Callable[[int, tuple[int, int]], None] = self.stored.__setitem__
         self.boot = 1000 * abs(src_id)
         self.events: list[SenderEvent | ReceiverEvent] = []
         self.start()
@@ -62,7 +63,7 @@ class Robot:
             codec=self.coding[0],
             decoder_for=self.coding[1],
             heard=dict(self.stored),
-            save=lambda src_id, boot, floor: self.stored.__setitem__(src_id, (boot, floor)),
+            save=lambda src_id, boot, floor: self.save(src_id, (boot, floor)),
             observer=self.events.append,
         )
         self.end.use_credit()

@@ -70,7 +70,7 @@ def test_a_relay_may_change_the_hop_count_and_nothing_else() -> None:
 
 def test_subkeys_are_those_of_rfc_5869() -> None:
     extracted = hmac.digest(b"gr-ros2 version 1", KEY, sha256)
-    info = bytes((3, 0, 0, 0, 7))
+    info = bytes((3, 0, 0, 0, 0, 0, 0, 0, 7))
     assert subkey(KEY, 3, 7) == hmac.digest(extracted, info + b"\1", sha256)[:16]
 
 
