@@ -72,7 +72,7 @@ def test_a_receiver_waits_as_long_as_its_sender_repairs() -> None:
 
 
 def test_a_receiver_goes_on_when_its_sender_is_gone() -> None:
-    one, two = Robot(1, registry(fifo=FIFO)), Robot(2, give_up_s=5.0)
+    one, two = Robot(1, registry(fifo=FIFO)), Robot(2)
     air = Air(one, two)
     air.run(2.0)
     air.lost = lambda sender, _: sender is one
@@ -82,7 +82,7 @@ def test_a_receiver_goes_on_when_its_sender_is_gone() -> None:
     one.end.submit(0, b"second", air.now)
     air.step()
     air.robots.remove(one)
-    air.run(4.0)
+    air.run(GIVE_UP_S - 1)
     assert two.delivered() == []
     air.run(2.0)
     assert two.delivered() == [b"second"]

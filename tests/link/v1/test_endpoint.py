@@ -9,6 +9,7 @@ import pytest
 from gr_ros2.config import TopicOptions
 from gr_ros2.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
+from gr_ros2.link.v1.endpoint import GIVE_UP_S
 from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.registry import Registry
@@ -446,12 +447,12 @@ def test_a_lifespan_ends_repair_and_message() -> None:
 
 
 def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
-    one, two = Robot(1, registry(), repair="idle", give_up_s=60), Robot(2, give_up_s=60)
+    one, two = Robot(1, registry(), repair="idle"), Robot(2)
     air = Air(one, two)
     air.run(0.5)
     air.lost = lambda *_: True
     one.end.submit(ODOM, text(1), air.now)
-    air.run(10.0)
+    air.run(GIVE_UP_S - 1)
     air.lost = lambda *_: False
     air.run(1.5)
     assert two.delivered() == [text(1)]
@@ -562,9 +563,9 @@ def test_the_destination_does_not_change_while_the_link_runs() -> None:
     one = Robot(1, registry(), dst_id=3).end
     for other in (2, 255):
         with pytest.raises(ConfigError, match=rf"dst_id = {other}: another destination needs a restart"):
-            one.reconfigure(dst_id=other, hop=9)
-    one.reconfigure(dst_id=3, hop=1)
-    assert (one.settings.dst_id, one.settings.hop) == (3, 1)
+            one.reconfigure(dst_id=other, packet_rate=5.0)
+    one.reconfigure(dst_id=3, packet_rate=7.0)
+    assert (one.settings.dst_id, one.settings.packet_rate) == (3, 7.0)
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.2, 0.4])
