@@ -25,6 +25,8 @@ HELLO_BYTES_S = 50.0
 OFTEN_S, SELDOM_S = 1.0, 2.0
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
+ASK_LEN = 3
+"""Bytes of a request for messages, without the topics."""
 ASK_S = 0.5
 """s after which a request is repeated."""
 LOOK_S = 0.02
@@ -105,8 +107,8 @@ class Talk:
         self.due = self._starting.popleft() if self._starting else now + self._period
         return [Hello(self._boot, turns, self._capabilities, digest, named), *answers]
 
-    def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
-        """Requests for messages that other robots keep and this one lacks."""
+    def asks(self, neighbours: Iterable[Neighbour], now: float, room: int) -> list[Ask]:
+        """Requests for messages that other robots keep and this one lacks, as many as ``room`` bytes hold."""
         found: list[Ask] = []
         if now < self._look_at or not self._settings.hears:
             return found
@@ -119,7 +121,8 @@ class Talk:
                 lacking.append(TABLE_TOPIC)
             self.lacking = self.lacking or bool(lacking)
             wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
-            if wanted:
+            if wanted and room >= ASK_LEN + len(wanted):
+                room -= ASK_LEN + len(wanted)
                 found.append(Ask(neighbour.src_id, wanted))
                 asked.update(dict.fromkeys(wanted, now + ASK_S))
         return found
