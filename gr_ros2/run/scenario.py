@@ -22,8 +22,9 @@ from gr_ros2.config import (
     ChannelConfig,
     OneWay,
     OverChannel,
+    Populated,
     Seconds,
-    SourceConfig,
+    Sending,
     Traffic,
     build,
     replaced,
@@ -90,21 +91,20 @@ class Reports(OverChannel):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig:
-    """One of the robots that share a medium. What is not set in its block is as in the scenario's.
+class RobotConfig(Sending):
+    """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
+    namespace: ``/robot_1``, ``/robot_2``, …
 
-    :param ros_source: its sending block; its namespace is ``/robot_1``, ``/robot_2``, … unless it is set
     :param tx_power_dbm: power that it transmits, dBm
     :param noise_figure_db: of its receiver, dB
     """
 
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
     tx_power_dbm: Decibels = 20.0
     noise_figure_db: Decibels = 6.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Experiment, Traffic, AnyLink):
+class Scenario(Populated, Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it

@@ -10,14 +10,14 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Seeded
+from gr_ros2.config import Populated, Seeded
 
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class SimSettings(Seeded):
+class SimSettings(Populated, Seeded):
     """Robots, world, rates and noise.
 
     :param seed: of the world, the routes and all noise; in a scenario that of the scenario unless it is set
