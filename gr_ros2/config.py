@@ -91,6 +91,16 @@ class Seeded:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class Populated:
+    """What robots take part in.
+
+    :param robots: how many, or the settings of each
+    """
+
+    robots: Any = ()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Traffic(Seeded):
     """What a link is given to carry.
 
@@ -502,14 +512,22 @@ class OverChannel:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OneWay(OverChannel):
-    """One direction: the block that sends, what lies between, and the block that receives.
+class Sending:
+    """What sends.
 
     :param ros_source: the sending block
-    :param ros_sink: the receiving block
     """
 
     ros_source: SourceConfig = Field(default_factory=SourceConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OneWay(Sending, OverChannel):
+    """One direction: the block that sends, what lies between, and the block that receives.
+
+    :param ros_sink: the receiving block
+    """
+
     ros_sink: SinkConfig = Field(default_factory=SinkConfig)
 
 

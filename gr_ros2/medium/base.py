@@ -183,6 +183,10 @@ class Medium(ABC):
             found += [other for other in takewhile(lambda one: one.start < sent.end, recent) if other.overlaps(sent)]
         return [other for other in found if other is not sent]
 
+    def reaches(self, sent: Transmission, receiver: int) -> bool:
+        """Whether a robot hears a packet, or sends it."""
+        return receiver == sent.sender or sent.sender in self._hears.get(receiver, ())
+
     def passed(self, received: Iterable[tuple[Path, Reception]]) -> Iterator[Reception]:
         """Receptions, now or later, without those of packets that their path drops."""
         for path, reception in received:

@@ -146,8 +146,13 @@ class PacketMedium(Medium):
         phy = hearers.phy
         if self._ideal or not phy.has_samples:
             return np.ones(len(levels))
-        if not hearers.ladder:
+        if not hearers.ladder and not self.shared:
             return self._fixed(hearers)
+        if not hearers.ladder and any(path.channel.doppler_hz for path in hearers.paths):
+            raise ConfigError(
+                "channel.doppler_hz: on a shared channel that fades, packets of a fixed rate are not simulated at "
+                "packets; set time to samples"
+            )
         if hearers.fading:
             return self._on_curves(hearers, sent, np.where(hearers.noise > 0, levels, inf))
         known = hearers.clear.get(sent.rung)
@@ -207,11 +212,6 @@ class PacketMedium(Medium):
         """PDR of a packet if it were like this chunk from end to end."""
         if not hearers.phy.has_samples or self._ideal:
             return np.where(power > 0, 0.0, 1.0)  # nothing is known of a level: packets that overlap are lost
-        if hearers.bursts:
-            raise ConfigError(
-                "channel.doppler_hz: packets that overlap on a fading channel are not simulated at packets; "
-                "set time to samples"
-            )
         return self._on_curves(hearers, sent, sinrs)
 
 

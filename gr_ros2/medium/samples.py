@@ -11,6 +11,7 @@ give equal samples.
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -58,11 +59,20 @@ class _Ear:
         self._power = phy.burst_power()
         self._lead = modem.preamble_samples + modem.margin + len(self._tail) + _MARGIN
         self._at = 0
-        self.bursts: deque[_Burst] = deque()
+        self._coming: list[tuple[int, int, _Burst]] = []
+        self.bursts: list[_Burst] = []
+        """What is on the air or has been since the last packets."""
         self.deaf: deque[tuple[int, int]] = deque()
+
+    def add(self, burst: _Burst) -> None:
+        """A burst will reach this receiver."""
+        heapq.heappush(self._coming, (burst.start, len(self._coming), burst))
 
     def hear(self, until: int) -> list[Heard]:
         """The packets that are complete at a sample."""
+        self.bursts = [burst for burst in self.bursts if burst.end > self._at]
+        while self._coming and self._coming[0][0] < until:
+            self.bursts.append(heapq.heappop(self._coming)[2])
         first = min((burst.start for burst in self.bursts), default=until)
         begin = max(self._at, min(first, until) - self._lead)
         if until <= begin:
@@ -81,8 +91,6 @@ class _Ear:
             drawn = self._noise.standard_normal((2, len(samples)), np.float32) * np.float32(sigma / math.sqrt(2))
             samples.real += drawn[0]
             samples.imag += drawn[1]
-        while self.bursts and self.bursts[0].end <= until:
-            self.bursts.popleft()
         while self.deaf and self.deaf[0][1] <= until:
             self.deaf.popleft()
         return self._receiver.feed(self._filtered(samples))
@@ -123,7 +131,7 @@ class SampleMedium(Medium):
         for path in self.paths_of(sent):
             phy.check_channel(path.channel)
             samples = self._through(burst, path.channel, start, phy.sample_rate)
-            self._ear(path.receiver, sender).bursts.append(_Burst(sent, path, first, samples))
+            self._ear(path.receiver, sender).add(_Burst(sent, path, first, samples))
         if self.shared:
             last = round(sent.end * phy.sample_rate)
             self._ear(sender, sender).deaf.append((first, last))
@@ -134,15 +142,17 @@ class SampleMedium(Medium):
         until = round(sent.end * phy.sample_rate)
         for path in self.paths_of(sent):
             ear = self._ear(path.receiver, sent.sender)
-            on_air = list(ear.bursts)
             arrived = False
             for heard in ear.hear(until):
-                burst = next((one for one in on_air if one.packet.data == heard.data), None)
+                burst = next((one for one in ear.bursts if one.packet.data == heard.data), None)
                 packet, way = (sent, path) if burst is None else (burst.packet, burst.path)
                 arrived = arrived or packet is sent
                 snr_db = math.inf if way.channel.snr_db is None else way.channel.snr_db
                 yield way, Reception(path.receiver, packet, sent.end, heard.data, snr_db, snr_db, heard.snr_db)
-            self.lost[sent.sender, path.receiver]["phy"] += not arrived
+            if not arrived:
+                disturbing = {other.sender for other in self.others(sent) if self.reaches(other, path.receiver)}
+                reason = "sending" if path.receiver in disturbing else "collision" if disturbing else "phy"
+                self.lost[sent.sender, path.receiver][reason] += 1
 
     def _ear(self, receiver: int, sender: int) -> _Ear:
         """A robot's receiver: the one of the shared channel, or of the channel on which the sender sends."""

@@ -115,10 +115,12 @@ class ReceiverResult:
     """The topics at a further receiver of the same sender.
 
     :param number: from 2; the topics of the first receiver are in the result itself
+    :param name: of a robot that receives from several; '' for a receiver without name
     """
 
     number: _Count
     topics: tuple[TopicResult, ...]
+    name: str = ""
 
 
 @dataclass(frozen=True, config=_READ)

@@ -104,7 +104,8 @@ def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
     """Every topic with its name in the tables. Topics of further receivers follow those of the first receiver."""
     yield from ((topic.topic, topic) for topic in result.topics)
     for receiver in result.receivers:
-        yield from ((f"{topic.topic} at receiver {receiver.number}", topic) for topic in receiver.topics)
+        name = receiver.name or f"receiver {receiver.number}"
+        yield from ((f"{topic.topic} at {name}", topic) for topic in receiver.topics)
 
 
 def as_table(grid: Grid) -> Table:

@@ -5,7 +5,7 @@ Invariant: each recorder gets the events of all senders, and those of its own re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -34,22 +34,57 @@ def make_recorder(
     )
 
 
+class Ear:
+    """Passes on what one receiver can hear: the events of some senders, and all of its own.
+
+    :param sources: source ids of those senders
+    """
+
+    def __init__(self, observer: LinkObserver, sources: Collection[int]) -> None:
+        self._observer, self._sources = observer, frozenset(sources)
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        if src_id in self._sources:
+            self._observer.sender_event(src_id, event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        self._observer.receiver_event(event, now)
+
+
 class FurtherRecorders:
     """The recorders of the further receivers. Attach it as an observer of the run, from which it takes what is sent.
 
     :param registry, ways: see :func:`make_recorder`
+    :param ears: for each further receiver the directions that it can hear; None: each receiver of the first direction
+        hears all
+    :param names: of the receivers; None numbers them
     """
 
-    def __init__(self, registry: Registry, ways: Sequence[Scenario]) -> None:
-        self._recorders = [make_recorder(registry, ways) for _ in ways[0].receivers]
+    def __init__(
+        self,
+        registry: Registry,
+        ways: Sequence[Scenario],
+        ears: Sequence[Sequence[int]] | None = None,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        if ears is None:
+            ears = [range(len(ways)) for _ in ways[0].receivers]
+        self._recorders = [make_recorder(registry, [ways[number] for number in heard]) for heard in ears]
+        self._names = names or [""] * len(ears)
         self._observers = [Observers[LinkObserver]() for _ in self._recorders]
         self._guards = [
             observers.add(recorder, needed=True)
             for observers, recorder in zip(self._observers, self._recorders, strict=True)
         ]
 
+        self._hearing: dict[int, list[Observers[LinkObserver]]] = {}
+        for observers, heard in zip(self._observers, ears, strict=True):
+            for number in heard:
+                self._hearing.setdefault(ways[number].ros_source.src_id(), []).append(observers)
+        self._offering = {way.ros_source.src_id() for way in ways}
+
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        for observers in self._observers:
+        for observers in self._hearing.get(src_id, self._observers if src_id not in self._offering else ()):
             observers.sender_event(src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
@@ -74,6 +109,6 @@ class FurtherRecorders:
     def finish(self, duration_s: float, t_end: float, drained: bool) -> tuple[ReceiverResult, ...]:
         """See :meth:`gr_ros2.record.recorder.Recorder.finish`."""
         return tuple(
-            ReceiverResult(number, recorder.finish(duration_s, t_end, drained))
-            for number, recorder in enumerate(self._recorders, 2)
+            ReceiverResult(number, recorder.finish(duration_s, t_end, drained), name)
+            for number, (recorder, name) in enumerate(zip(self._recorders, self._names, strict=True), 2)
         )

@@ -7,17 +7,23 @@ order of :meth:`Scenario.directions`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gr_ros2.config import SinkConfig, SourceConfig
+from gr_ros2.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.gr.ends import Start
 from gr_ros2.link.rate import Rung
-from gr_ros2.medium.base import Path, Paths
+from gr_ros2.medium.base import Path, Paths, PathsAt
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.setting import AUTO
 from gr_ros2.wire import BROADCAST
 
+THERMAL_DBM_HZ = -174.0
+"""Noise of a resistor at 290 K, dBm in a band of 1 Hz."""
+LEAST_DB, MOST_DB = -30.0, 100.0
+"""SNRs below the first are not heard and do not disturb; above the second nothing gets better."""
+_SEEDS_APART = 7919
 Halves = tuple[SourceConfig | None, SinkConfig | None]
 """The settings of a robot's sending half and of its receiving half; None for a half that it does not have."""
 
@@ -43,7 +49,10 @@ def halves_of_robots(ways: Sequence[Scenario]) -> list[Halves]:
     """
     there = ways[0]
     if len(ways) > 1:
-        return [(way.ros_source, ways[1 - number].ros_sink) for number, way in enumerate(ways)]
+        sinks = [way.ros_sink for way in ways]
+        if len(ways) == 2:
+            sinks.reverse()  # each block is configured with the direction that it belongs to
+        return [(way.ros_source, sink) for way, sink in zip(ways, sinks, strict=True)]
     halves: list[Halves] = [(there.ros_source, None)]
     own_id = there.ros_source.src_id()
     for number in range(1 + len(there.receivers)):
@@ -54,8 +63,38 @@ def halves_of_robots(ways: Sequence[Scenario]) -> list[Halves]:
     return halves
 
 
-def paths_of(scenario: Scenario) -> Paths:
-    """For every robot the paths to those that can hear it."""
+def paths_at(scenario: Scenario, sample_rate: float) -> PathsAt:
+    """For every robot the paths to those that can hear it, as a function of time. No gain changes yet.
+
+    :param sample_rate: samples/s, which is the bandwidth of the noise
+    """
+    fixed = _between(scenario, sample_rate) if scenario.robots else _directed(scenario)
+    return lambda _: fixed
+
+
+def _between(scenario: Scenario, sample_rate: float) -> Paths:
+    """The paths between robots that all send and receive."""
+    paths: list[list[Path]] = []
+    for number, sender in enumerate(scenario.robots):
+        paths.append([])
+        for other, receiver in enumerate(scenario.robots):
+            snr_db = scenario.channel.snr_db
+            if scenario.gains_db is not None:
+                row = scenario.gains_db
+                gain_db = row[number][other] if isinstance(row, tuple) else row
+                noise_dbm = THERMAL_DBM_HZ + 10 * math.log10(sample_rate) + receiver.noise_figure_db
+                snr_db = None if gain_db is None else sender.tx_power_dbm + gain_db - noise_dbm
+                if snr_db is None or snr_db < LEAST_DB:
+                    continue
+            if other != number:
+                seed = scenario.channel.seed + _SEEDS_APART * (1 + number * BROADCAST + other)
+                snr_db = None if snr_db is None else min(snr_db, MOST_DB)
+                paths[-1].append(Path(other, replaced(scenario.channel, snr_db=snr_db, seed=seed)))
+    return paths
+
+
+def _directed(scenario: Scenario) -> Paths:
+    """The paths of the short forms: one sender and its receivers, or two robots."""
     ways = scenario.directions()
     if len(ways) > 1:
         return [[Path(1 - number, way.channel)] for number, way in enumerate(ways)]
@@ -66,8 +105,23 @@ def paths_of(scenario: Scenario) -> Paths:
     return [there, *([Path(0, channel, delay_s)] for channel in scenario.report_channels())]
 
 
+def ears_of(scenario: Scenario, paths: Paths) -> list[list[int]]:
+    """For each recorder of a run the robots whose packets it counts: first that of the result, then those of further
+    receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear."""
+    ways = len(scenario.directions())
+    if ways <= 2:
+        return [list(range(ways)) for _ in range(1 + len(scenario.receivers))]
+    heard: list[list[int]] = [[] for _ in range(ways)]
+    for number, hearers in enumerate(paths):
+        for path in hearers:
+            heard[path.receiver].append(number)
+    return heard
+
+
 def recorder_of(scenario: Scenario, robot: int) -> int:
-    """Which recorder takes what a robot receives: 0 that of the result, 1 and above those of further receivers."""
+    """The place in :func:`ears_of` of the recorder of what a robot receives."""
+    if scenario.robots:
+        return robot if len(scenario.robots) > 2 else 0
     return 0 if scenario.back is not None else max(robot - 1, 0)
 
 

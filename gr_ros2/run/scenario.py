@@ -2,7 +2,7 @@
 
 Invariants: settings that must be equal at both ends of the link (`registry`, `packet_len`) are given once, at the top
 level, and apply to all ends; `source` names where messages come from, `ros_source` and `ros_sink` configure the two
-blocks; a two-way scenario is two one-way scenarios between the same two graphs; `dump` gives a mapping from which
+blocks; a scenario of several senders is as many one-way scenarios; `dump` gives a mapping from which
 `scenario_from` makes the same scenario again.
 """
 
@@ -16,7 +16,19 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, AnyLink, ChannelConfig, OneWay, OverChannel, Seconds, Traffic, build, replaced
+from gr_ros2.config import (
+    STRICT,
+    AnyLink,
+    ChannelConfig,
+    OneWay,
+    OverChannel,
+    Populated,
+    Seconds,
+    Sending,
+    Traffic,
+    build,
+    replaced,
+)
 from gr_ros2.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
@@ -24,6 +36,7 @@ from gr_ros2.registry import Registry, check_outputs
 from gr_ros2.setting import Auto
 from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2.wire import BROADCAST
 
 _GRAPH_KEYS = ("middleware", "domain_id")
 """Settings of a block that say on which ROS graph it is."""
@@ -34,6 +47,7 @@ _BACK_SEED = 100_003
 
 
 Time = Literal["real", "unthrottled", "samples", "packets"]
+Decibels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -77,7 +91,20 @@ class Reports(OverChannel):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Experiment, Traffic, AnyLink):
+class RobotConfig(Sending):
+    """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
+    namespace: ``/robot_1``, ``/robot_2``, …
+
+    :param tx_power_dbm: power that it transmits, dBm
+    :param noise_figure_db: of its receiver, dB
+    """
+
+    tx_power_dbm: Decibels = 20.0
+    noise_figure_db: Decibels = 6.0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Scenario(Populated, Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
@@ -86,6 +113,13 @@ class Scenario(Experiment, Traffic, AnyLink):
     :param reports: the way back for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
         for the seed
+    :param robots: robots that all send and receive, in simulated time; a number stands for as many that differ in
+        their names alone
+    :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
+        channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
+    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
+        each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
+        ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param seed: of the simulator, the channel and the sender
     """
 
@@ -94,6 +128,9 @@ class Scenario(Experiment, Traffic, AnyLink):
     back: Back | None = None
     reports: Reports | None = None
     receivers: tuple[ChannelConfig, ...] = ()
+    robots: Annotated[tuple[RobotConfig, ...], Field(max_length=BROADCAST)] = ()
+    duplex: Literal["full", "half"] = "full"
+    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     localhost_only: bool | Auto = True
 
     @model_validator(mode="after")
@@ -113,7 +150,29 @@ class Scenario(Experiment, Traffic, AnyLink):
             raise ValueError("reports: version 0 has none, and with back they go along; set reports to null")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
+        if self.duplex == "half" and not self.simulated:
+            raise ValueError("duplex = 'half': one channel for all is simulated only; set time to packets or samples")
+        self._check_robots()
         return self
+
+    def _check_robots(self) -> None:
+        if not self.robots:
+            if self.gains_db is not None:
+                raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
+            return
+        if not self.simulated:
+            raise ValueError(f"robots: time = {self.time!r}; they share a simulated medium: set packets or samples")
+        if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
+            raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
+        count = len(self.robots)
+        ids = {robot.ros_source.src_id() for robot in self.robots}
+        if count < 2 or len(ids) < count:
+            raise ValueError(
+                f"robots: {count} robots with {len(ids)} source ids; two or more robots, each with its own"
+            )
+        matrix = self.gains_db
+        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
+            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
 
     def _check_back(self, back: Back) -> None:
         if self.source != "sim":
@@ -128,7 +187,10 @@ class Scenario(Experiment, Traffic, AnyLink):
             )
 
     def directions(self) -> tuple[Scenario, ...]:
-        """The one-way scenarios that this scenario consists of: itself, or the way there and the way back."""
+        """The one-way scenarios that this scenario consists of, one for each robot that offers messages."""
+        if self.robots:
+            alone = replace(self, robots=(), gains_db=None)
+            return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
         if self.back is None:
             return (self,)
         there = replace(self, back=None, reports=None, receivers=())
@@ -184,10 +246,28 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
             values["reports"] = {**reports, "channel": _another(channel, reports.get("channel", {}), 1)}
         if isinstance(receivers := values.get("receivers"), list | tuple):
             values["receivers"] = [_another(channel, given, 2 + n) for n, given in enumerate(receivers)]
+    robots = values.get("robots")
+    if isinstance(robots, int):
+        robots = [{}] * robots
+    if isinstance(robots, list | tuple):
+        values["robots"] = [_robot(values, given, n, shared, prefix) for n, given in enumerate(robots, 1)]
+        if isinstance(values.get("sim", {}), Mapping):
+            values["sim"] = {"robots": max(len(robots), 1), **values.get("sim", {})}
     if isinstance(values.get("back"), Mapping):
         back = _way_back(values)
         values["back"] = {**back, **with_shared(back, shared, f"{prefix}back.")}
     return build(Scenario, values, where)
+
+
+def _robot(values: Mapping[str, Any], given: Any, number: int, shared: Mapping[str, Any], prefix: str) -> Any:
+    """The settings of a robot. Those of its block that it does not have are the scenario's."""
+    block = given.get("ros_source", {}) if isinstance(given, Mapping) else None
+    if not isinstance(block, Mapping) or not isinstance(values.get("ros_source", {}), Mapping):
+        return given  # build() says what is wrong with it
+    kept = {key: value for key, value in values.get("ros_source", {}).items() if key not in _OWN_KEYS}
+    source = {**kept, "namespace": f"/robot_{number}", **block}
+    block = with_shared({"ros_source": source}, shared, f"{prefix}robots[{number - 1}].")["ros_source"]
+    return {**given, "ros_source": block}
 
 
 def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import heapq
 import random
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
@@ -36,7 +36,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phys, recorded_names, source_names
-from gr_ros2.run.robots import Halves, halves_of_robots, paths_of, start_of_run
+from gr_ros2.run.robots import Halves, halves_of_robots, paths_at, start_of_run
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
@@ -46,6 +46,8 @@ _LONGEST_GAP_S = 30 * 86400.0
 simulated for all of the gap: decades where the first stamp is 0."""
 _IN_VAIN = 1000
 """Steps in a row without an event at one time after which a simulation is said to stand still."""
+STARTED_S = 1.0
+"""s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
 _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
@@ -112,6 +114,22 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
         yield Offered(t, names[message.topic], message.payload)
 
 
+def offered_by(ways: Sequence[Scenario], registry: Registry) -> list[Iterator[Offered]]:
+    """What each direction's source gives to the link. The robots of a simulator drive only once."""
+    if len(ways) == 1 or ways[0].bag_path is not None:
+        return [offered(way, registry) for way in ways]
+    names = [source_names(way, registry) for way in ways]
+    sent = list(_simulated(ways[0].sim, ways[0].duration_s, frozenset().union(*names)))
+    return [_own(sent, own) for own in names]
+
+
+def _own(sent: Sequence[SimMessage], names: Mapping[str, int]) -> Iterator[Offered]:
+    """The messages on these topics."""
+    for message in sent:
+        if message.topic in names:
+            yield Offered(message.t, names[message.topic], message.payload)
+
+
 def _simulated(settings: SimSettings, duration_s: float, topics: frozenset[str]) -> Iterable[SimMessage]:
     """The simulator's messages. Those of short runs are cached, because a sweep needs them many times."""
     if duration_s <= _REMEMBERED_S:
@@ -143,8 +161,8 @@ def simulate(
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
-    there = scenario.directions()[0] if scenario.back is not None else scenario
-    there = replace(there, receivers=())
+    ways = scenario.directions()
+    there = replace(ways[0] if len(ways) > 1 else scenario, receivers=())
     registry = there.load_registry()
     phys = make_phys([there], registry) if phy is None else [phy]
     if phys[0].ladder:
@@ -202,9 +220,12 @@ class Simulation:
                 "be simulated; set time to real, samples or packets"
             )
         ways = scenario.directions()
-        coming = list(messages or [offered(way, registry) for way in ways])
-        start = start_of_run(ways, any_length=all(phy.any_length for phy in phys), ladder=phys[0].ladder)
+        coming = list(messages or offered_by(ways, registry))
+        shared = scenario.duplex == "half"
+        any_length = all(phy.any_length for phy in phys)
+        start = start_of_run(ways, any_length=any_length, ladder=phys[0].ladder, half_duplex=shared)
         self.robots: list[Robot] = []
+        starts = random.Random(f"starts {scenario.seed}")
         for number, halves in enumerate(halves_of_robots(ways)):
             sends = number < len(ways)
             phy = phys[number if sends else 0]
@@ -217,18 +238,21 @@ class Simulation:
                 src_id=robot_of(*halves),
                 airtime=phy.airtime,
                 messages=coming[number] if sends else iter(()),
+                start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
             )
             self.robots.append(robot)
         all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
-        self.paths = paths = paths_of(scenario)
+        at = paths_at(scenario, phys[0].sample_rate)
+        self.paths = paths = at(0.0)
         if ideal:
-            self.medium: Medium = PacketMedium(lambda _: paths, all_phys, ideal=True)
+            self.medium: Medium = PacketMedium(at, all_phys, shared=shared, ideal=True)
         else:
             answer = any(self.robots[path.receiver].endpoint.answers for heard in paths for path in heard)
             self.medium = make_medium(
-                lambda _: paths,
+                at,
                 all_phys,
                 samples=scenario.time == "samples",
+                shared=shared,
                 seed=scenario.seed,
                 at_once=answer,
             )
@@ -265,6 +289,7 @@ class Robot:
     :param src_id: -1 for none
     :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without airtime
     :param messages: in the order of time
+    :param start_s: s, when it begins to send
     """
 
     def __init__(
@@ -277,11 +302,13 @@ class Robot:
         src_id: int,
         airtime: Airtime,
         messages: Iterator[Offered],
+        start_s: float = 0.0,
     ) -> None:
+        self._start_s = start_s
         self.number, self.endpoint, self.src_id = number, endpoint, src_id
         self.over = False
         """Whether it has nothing more to send, as far as is known: a robot that answers may send later."""
-        self.due = 0.0
+        self.due = start_s
         """s, time at which it may do something next; infinite when it is over."""
         self.duration_s = scenario.duration_s
         """s during which messages were offered. Where the length of the bag decides this, it is known at the end."""
@@ -336,7 +363,7 @@ class Robot:
         """Look again at when there is a packet. Something has just been received and may let one leave earlier."""
         at = self.endpoint.next_departure() if self.endpoint.answers else None
         if at is not None:
-            self.due = min(self.due, max(now, at))
+            self.due = min(self.due, max(now, at, self._start_s))
             self.over = False
 
     def _next(self, now: float) -> float:
@@ -385,7 +412,11 @@ class EventLoop:
         for robot in self._robots:
             self._plan(robot)
         in_vain = 0
-        while self._busy and (now := min(self._soonest(), self._medium.next_due)) < inf:
+        # What takes no time on the air is received although its robot is over since it has sent it.
+        while self._busy or self._medium.next_due <= self.now:
+            now = min(self._soonest(), self._medium.next_due)
+            if now == inf:
+                break
             before, self.now = self.now, now
             happened = False
             for timed_event in self._happen(now):

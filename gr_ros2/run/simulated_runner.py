@@ -25,8 +25,8 @@ from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
-from gr_ros2.run.recorders import FurtherRecorders, make_recorder
-from gr_ros2.run.robots import recorder_of
+from gr_ros2.run.recorders import Ear, FurtherRecorders, make_recorder
+from gr_ros2.run.robots import ears_of, recorder_of
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import Simulation, pass_on
 
@@ -68,14 +68,18 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        recorder = make_recorder(registry, ways, None if bag is None else bag.take)
-        further = FurtherRecorders(registry, ways)
+        run = Simulation(scenario, registry, phys)
+        ears = ears_of(scenario, run.paths)
+        heard = [ways[number] for number in ears[0]]
+        recorder = make_recorder(registry, heard, None if bag is None else bag.take)
+        called = [robot.ros_source.namespace for robot in scenario.robots] if len(ears) == len(ways) else None
+        further = FurtherRecorders(registry, ways, ears[1:], called and called[1:])
         run_observers = run_observers or RunObservers(threaded=False)
         link_observers = Observers[LinkObserver]()
-        recorded = link_observers.add(recorder, needed=True)
+        own = recorder if len(ways) < 3 else Ear(recorder, [way.ros_source.src_id() for way in heard])
+        recorded = link_observers.add(own, needed=True)
         link_observers.add(further)
         link_observers.add(run_observers)
-        run = Simulation(scenario, registry, phys)
         clock = _EventClock()
         run_observers.run_started(_live_run(scenario, registry, recorder, clock))
         reported, progress = 0.0, Guard("progress")
@@ -92,7 +96,8 @@ def run_simulated(
         further.check()
     played = run.duration_s
     topics = recorder.finish(played, played, run.empty)
-    there, *back = (_counters(run, number, source_names(way, registry)) for number, way in enumerate(ways))
+    there, *others = (_counters(run, number, source_names(way, registry)) for number, way in enumerate(ways))
+    back = {"back": others[0]} if len(others) == 1 else {"robots": others} if others else {}
     result = Result(
         scenario=scenario.name,
         seed=scenario.seed,
@@ -101,10 +106,10 @@ def run_simulated(
         topics=topics,
         receivers=further.finish(played, played, run.empty),
         packets=recorder.ledger.packets(),
-        phy=phy_numbers(phys[0], len(ways), recorder),
+        phy=phy_numbers(phys[0], 1 if run.medium.shared else len(ways), recorder),
         wall_s=time.monotonic() - began,
         incomplete=tuple(run_observers.incomplete()),
-        counters={**there, **({"back": back[0]} if back else {}), "listener": {} if bag is None else dict(bag.written)},
+        counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
     return Outcome(result, recorder.trace(0.0, played, published_as))
@@ -126,7 +131,7 @@ def _counters(run: Simulation, number: int, names: Mapping[str, int]) -> dict[st
     :param number: of the robot that sends
     :param names: topic ids by name
     """
-    receiver = run.paths[number][0].receiver
+    receiver = run.paths[number][0].receiver if run.paths[number] else number
     sent, got = run.robots[number].endpoint.sent, run.robots[receiver].endpoint.received
     lost = run.medium.lost[number, receiver]
     return {

@@ -10,14 +10,14 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Seeded
+from gr_ros2.config import Populated, Seeded
 
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class SimSettings(Seeded):
+class SimSettings(Populated, Seeded):
     """Robots, world, rates and noise.
 
     :param seed: of the world, the routes and all noise; in a scenario that of the scenario unless it is set
@@ -45,7 +45,7 @@ class SimSettings(Seeded):
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
-    robots: Annotated[int, Field(ge=1, le=8)] = 2
+    robots: Annotated[int, Field(ge=1, le=64)] = 2
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12
     max_speed: Annotated[float, Field(ge=0.1, le=2)] = 1.0

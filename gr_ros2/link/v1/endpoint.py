@@ -435,7 +435,7 @@ class Endpoint:
             return self._new(filling, due, now)
         if due:
             return self._say(due, now)
-        asks = talk.asks(self.neighbours, now)
+        asks = talk.asks(self.neighbours, now, self._room)
         if asks:
             return self._control(asks, "hello", now)
         self.window.mode = self._mode()
@@ -582,10 +582,7 @@ class Endpoint:
             if free >= neighbour.inbox.report_len:
                 free -= neighbour.inbox.report_len
                 entries.append(neighbour.inbox.report(now))
-        for ask in self._talk.asks(self.neighbours, now):
-            if free >= 3 + len(ask.topic_ids):
-                entries.append(ask)
-                free -= 3 + len(ask.topic_ids)
+        entries += self._talk.asks(self.neighbours, now, free)
         self._unheard = 0
         return self._control(entries, "report", now)
 

@@ -47,6 +47,8 @@ EAGER_S, EAGER = 0.1, 20
 messages are not delivered."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
+ASK_LEN = 3
+"""Bytes of a request for messages, without the topics."""
 ASK_S = 0.5
 """s after which a request is repeated."""
 LOOK_S = 0.02
@@ -166,8 +168,8 @@ class Talk:
         self._eager -= 1
         return min(due, now + EAGER_S)
 
-    def asks(self, neighbours: Iterable[Neighbour], now: float) -> list[Ask]:
-        """Requests for messages that other robots keep and this one lacks."""
+    def asks(self, neighbours: Iterable[Neighbour], now: float, room: int) -> list[Ask]:
+        """Requests for messages that other robots keep and this one lacks, as many as ``room`` bytes hold."""
         found: list[Ask] = []
         if now < self._look_at or not self._settings.hears:
             return found
@@ -180,7 +182,8 @@ class Talk:
                 lacking.append(TABLE_TOPIC)
             self.lacking = self.lacking or bool(lacking)
             wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
-            if wanted:
+            if wanted and room >= ASK_LEN + len(wanted):
+                room -= ASK_LEN + len(wanted)
                 found.append(Ask(neighbour.src_id, wanted))
                 asked.update(dict.fromkeys(wanted, now + ASK_S))
         return found

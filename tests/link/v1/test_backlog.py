@@ -7,6 +7,7 @@ import pytest
 from bench.repair_backlog import CASES, LOSSES, OLDER, run
 from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import SentPacket
+from gr_ros2.link.v1.endpoint import GIVE_UP_S
 from tests.link.v1.air import Air, Robot, registry
 
 FIFO = TopicOptions(queue="fifo", reliability="reliable")

@@ -1,0 +1,87 @@
+"""Scenarios made of robots: two on one channel, many, and what lies between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.errors import ConfigError
+from gr_ros2.record.result import Result, read_result, write_result
+from gr_ros2.report.table import summary_grid
+from gr_ros2.run.robots import ears_of, paths_at
+from gr_ros2.run.runner import run_scenario
+from gr_ros2.run.scenario import dump, load_scenario, scenario_from
+from tests.e2e.support import check_books
+
+
+def run(name: str, *overrides: str, **settings: Any) -> Result:
+    result = run_scenario(load_scenario(name, overrides, **settings)).result
+    check_books(result)
+    return result
+
+
+@pytest.mark.parametrize("time", ["packets", "samples"])
+def test_two_robots_on_one_channel_disturb_each_other_and_repair_it(time: str) -> None:
+    result = run("two-robots-half-duplex", f"time={time}", duration_s=5.0)
+    assert {topic.topic for topic in result.topics} == {"/robot_1/odom", "/robot_2/odom"}
+    assert result.counters["channel"]["sending"] > 0
+    assert result.phy["channels"] == 1
+    assert all(topic.delivered for topic in result.topics)
+    apart = run("two-robots-half-duplex", f"time={time}", "duplex=full", duration_s=5.0)
+    assert "sending" not in apart.counters["channel"]
+    assert [topic.pdr for topic in apart.topics] == [1.0, 1.0]
+    assert apart.phy["channels"] == 2
+
+
+def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
+    result = run("twenty-robots", duration_s=1.0)
+    assert len(result.topics) == 19
+    assert [receiver.name for receiver in result.receivers] == [f"/robot_{number}" for number in range(2, 21)]
+    assert {len(receiver.topics) for receiver in result.receivers} == {19}
+    assert result.counters["channel"]["collision"] > 0
+    assert sum(topic.delivered for topic in result.topics) > 0
+    again = read_result(write_result(result, tmp_path / "result.json"))
+    assert again.receivers == result.receivers
+    assert "/robot_3/odom at /robot_2" in [line[1] for line in summary_grid([again]).sections[0]]
+
+
+def test_levels_follow_from_power_gain_and_noise() -> None:
+    rows = "[[null, -100, null], [-110, null, -90], [null, -200, null]]"
+    louder = "robots=[{}, {tx_power_dbm: 30}, {noise_figure_db: 3}]"
+    scenario = load_scenario("two-robots-half-duplex", [louder, f"gains_db={rows}"])
+    paths = paths_at(scenario, 1e6)(0.0)
+    noise_dbm = -174 + 60 + 6
+    assert [[(path.receiver, path.channel.snr_db) for path in heard] for heard in paths] == [
+        [(1, 20 - 100 - noise_dbm)],
+        [(0, 30 - 110 - noise_dbm), (2, 30 - 90 - noise_dbm + 3)],
+        [],  # 20 - 200 dBm is below what anybody hears
+    ]
+    assert ears_of(scenario, paths) == [[1], [0], [1]]
+    assert len({path.channel.seed for heard in paths for path in heard}) == 3
+    assert scenario_from(dump(scenario)) == scenario
+
+
+def test_without_gains_the_snr_is_that_of_the_channel() -> None:
+    scenario = load_scenario("two-robots-half-duplex", ["gains_db=null", "channel.snr_db=7"])
+    assert [path.channel.snr_db for heard in paths_at(scenario, 1e6)(0.0) for path in heard] == [7, 7]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("time=real", "set time to packets or samples"),
+        ("robots=1", "two or more"),
+        ("robots=[{}, {ros_source: {namespace: /robot_1}}]", "each with its own"),
+        ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),
+        ("robots=null", "must be a list"),
+        ("reports={}", "leave back, reports, receivers out"),
+        ("robots=[]", "gains_db: lie between robots"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_scenario("two-robots-half-duplex", [override])
