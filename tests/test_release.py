@@ -15,7 +15,7 @@ import pytest
 import gr_ros2
 
 ROOT = Path(__file__).resolve().parent.parent
-FILES = ("gr_ros2/__init__.py", "package.xml", "CHANGELOG.md")
+FILES = ("gr_ros2/__init__.py", "package.xml", "CHANGELOG.md", "packaging/conda/meta.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def tool() -> ModuleType:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for name in FILES:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, tmp_path / name)
     return tmp_path
 
@@ -44,14 +44,16 @@ def test_a_version_is_written_where_it_stands_and_to_its_copies(tool: ModuleType
     assert '__version__ = "9.8.7"' in (root / FILES[0]).read_text()
     assert "<version>9.8.7</version>" in (root / FILES[1]).read_text()
     assert f"## 9.8.7 ({date.today()})" in (root / FILES[2]).read_text()
+    assert '{% set version = "9.8.7" %}' in (root / FILES[3]).read_text()
     assert tool.problems(root, "9.8.7") == []
 
 
 def test_what_is_not_ready_is_named_with_the_remedy(tool: ModuleType, root: Path) -> None:
     (root / "CHANGELOG.md").write_text("# Changes\n\n## 1.2.3 (not released)\n")
-    (unreleased,) = tool.problems(root, "1.2.3")[1:]
+    *_, unreleased = tool.problems(root, "1.2.3")
     assert unreleased == "CHANGELOG.md calls 1.2.3 not released; run: tools/release 1.2.3"
-    copies, absent = tool.problems(root, "1.2.4")
+    copies, recipe, absent = tool.problems(root, "1.2.4")
+    assert "packaging/conda/meta.yaml has another version than 1.2.4" in recipe
     assert "package.xml has another version than 1.2.4; run: tools/release 1.2.4" in copies
     assert "no heading `## 1.2.4 (DATE)`" in absent
 

@@ -19,11 +19,12 @@ def version() -> str:
 
 def copy_of_clone(target: Path) -> None:
     """Copy what git knows or does not ignore; without git everything but what is hidden or was built."""
-    git = ["git", "-c", f"safe.directory={ROOT}", "-C", str(ROOT), "ls-files", "--cached", "--others"]
-    listed = subprocess.run([*git, "--exclude-standard"], capture_output=True, text=True)
-    if listed.returncode:
-        shutil.copytree(ROOT, target, ignore=shutil.ignore_patterns(".*", "build", "dist", "*.so", "__pycache__"))
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        hidden_or_built = shutil.ignore_patterns(".*", "build", "dist", "results", "*.egg-info", "*.so", "__pycache__")
+        shutil.copytree(ROOT, target, ignore=hidden_or_built)
         return
+    git = ["git", "-c", f"safe.directory={ROOT}", "-C", str(ROOT), "ls-files", "--cached", "--others"]
+    listed = subprocess.run([*git, "--exclude-standard"], check=True, capture_output=True, text=True)
     for name in listed.stdout.splitlines():
         if (ROOT / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
