@@ -50,7 +50,7 @@ local f = {
     window = ProtoField.uint8("gr_ros2.window", "Window", base.DEC, nil, 0x7F),
     masked = ProtoField.bool("gr_ros2.masked", "M: a mask follows, or not encrypted", 8, nil, 0x80),
     row = ProtoField.uint8("gr_ros2.row", "Row", base.DEC, nil, 0x7F),
-    oldest = ProtoField.bool("gr_ros2.oldest", "Nothing older is worth repairing (O)", 8, nil, 0x80),
+    oldest = ProtoField.bool("gr_ros2.oldest", "Nothing older is repaired any more (O)", 8, nil, 0x80),
     mask = ProtoField.bytes("gr_ros2.mask", "Mask"),
     combined = ProtoField.bytes("gr_ros2.combined", "Combined bodies"),
     ciphertext = ProtoField.bytes("gr_ros2.ciphertext", "Encrypted body"),
@@ -66,6 +66,8 @@ local f = {
     hello_turns = ProtoField.uint32("gr_ros2.hello.turns", "Turns of the packet number"),
     hello_hears = ProtoField.bool("gr_ros2.hello.hears", "Hears and reports", 8, nil, 0x01),
     hello_encrypts = ProtoField.bool("gr_ros2.hello.encrypts", "Encrypts", 8, nil, 0x02),
+    hello_reported = ProtoField.bool("gr_ros2.hello.reported", "Gets reports", 8, nil, 0x04),
+    hello_wants_proof = ProtoField.bool("gr_ros2.hello.wants_proof", "Wants proof", 8, nil, 0x08),
     hello_digest = ProtoField.uint32("gr_ros2.hello.digest", "CRC-32 of the table of topics", base.HEX),
     hello_topic_id = ProtoField.uint8("gr_ros2.hello.topic_id", "Kept for late joiners, topic id"),
     hello_mark = ProtoField.uint32("gr_ros2.hello.mark", "CRC-32 of that message", base.HEX),
@@ -357,6 +359,8 @@ local function dissect_hello(buffer, tree, at, size)
     tree:add(f.hello_turns, buffer(at + 8, 4))
     tree:add(f.hello_hears, buffer(at + 12, 1))
     tree:add(f.hello_encrypts, buffer(at + 12, 1))
+    tree:add(f.hello_reported, buffer(at + 12, 1))
+    tree:add(f.hello_wants_proof, buffer(at + 12, 1))
     tree:add(f.hello_digest, buffer(at + 13, 4))
     for mark = at + HELLO_LEN, at + size - 1, MARK_LEN do
         tree:add(f.hello_topic_id, buffer(mark, 1))
@@ -556,14 +560,14 @@ end
 
 -- The entries of a body from `at` on, and the zeros behind them; what is to be said of them in a line.
 local function dissect_body(buffer, tree, packet, at, limit)
-    local summary = {}
-    while at < limit and buffer(at, 1):uint() ~= 0 do
+    local summary, last = {}, math.min(limit, packet.filled)
+    while at < last and buffer(at, 1):uint() ~= 0 do
         local control = buffer(at, 1):uint() > TABLE_TOPIC + 1
         local after, text
         if control then
-            after, text = dissect_control(buffer, tree, at, limit)
+            after, text = dissect_control(buffer, tree, at, last)
         else
-            after, text = dissect_part(buffer, tree, packet, at, limit)
+            after, text = dissect_part(buffer, tree, packet, at, last)
         end
         if not after then
             return summary
@@ -584,11 +588,7 @@ local function dissect_standing(buffer, tree, at, limit)
     local item = tree:add(f.window, buffer(at, 1))
     tree:add(f.masked, buffer(at, 1))
     tree:add(f.row, buffer(at + 1, 1))
-    local oldest = tree:add(f.oldest, buffer(at + 1, 1))
-    if window == 0 and buffer(at + 1, 1):uint() > 127 then
-        oldest:add_proto_expert_info(refused.window)
-        return nil
-    end
+    tree:add(f.oldest, buffer(at + 1, 1))
     at = at + 2
     if window > 0 and masked then
         local size = math.ceil(window / 8)
@@ -715,9 +715,9 @@ local function dissect_v1(buffer, pinfo, tree)
     elseif at < limit then
         local packet_len = math.max(proto.prefs.packet_len, longest)
         local room = packet_len - header - 2 - trailer
-        -- Where all packets are as long as this one, the longest body ends 2 bytes before the trailer; where a sender
+        -- Without the preference: where all packets are as long as this one, the longest body ends 2 bytes before the trailer; where a sender
         -- sends only what is needed, it ends with the longest packet's.
-        if packet_len == buffer:len() and buffer(limit - 2, 2):uint() ~= 0 then
+        if packet_len > proto.prefs.packet_len and packet_len == buffer:len() and buffer(limit - 2, 2):uint() ~= 0 then
             room = limit - at
         end
         packet.short, packet.filled = limit - at < room, at + room

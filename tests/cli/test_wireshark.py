@@ -181,6 +181,9 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
             for field, key in of_kind.items():
                 if field != name:
                     assert numbers(f"{name}.{key}") == [entry[field] for entry in said]
+        for bit, capability in enumerate(("hears", "encrypts", "reported", "wants_proof")):
+            said = [entry["capabilities"] >> bit & 1 for entry in entries if "hello" in entry]
+            assert numbers(f"hello.{capability}") == said, vector["name"]
     assert not tshark(path, "-Y", "_ws.expert")
     assert tshark(path, "-V").count("(correct)") == 4 * len(V1["packets"])
 
@@ -225,7 +228,7 @@ def test_what_a_receiver_of_version_1_refuses_is_marked_by_the_same_name(tmp_pat
     for number, vector in enumerate(V1["refused_bodies"], 1):
         add(write_header(Header(0, False, 1, number)), bytes.fromhex(vector["hex"]), vector["error"])
     standing = write_header(Header(3, False, 1, 1))
-    for text in ("0080", "850003", "850012", "85001f"):
+    for text in ("850003", "850012", "85001f"):
         add(standing, bytes.fromhex(text), "window")
     for text in ("00", "8900ff"):
         add(standing, bytes.fromhex(text), "entry_bounds")

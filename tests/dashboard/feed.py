@@ -47,7 +47,7 @@ class Feed:
 
     def forget(self) -> None:
         """The receiver starts anew."""
-        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=self.sender.config.packet_len))
+        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=self.sender.config.packet_len, version=self.sender.config.version))
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         self.sender.submit(topic_id, payload, now)

@@ -168,7 +168,7 @@ def test_a_repeat_counts_only_where_it_delivers_the_message_it_repeats(with_ledg
 
 def test_packets_field_by_field() -> None:
     state = make()
-    feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, hop=5)
+    feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, version=0, hop=5)
     feed.submit(1, bytes(300), 10.0)
     feed.fly(10.0)
     feed.hear(b"no packet", 11.0)
