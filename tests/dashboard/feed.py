@@ -47,7 +47,8 @@ class Feed:
 
     def forget(self) -> None:
         """The receiver starts anew."""
-        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=self.sender.config.packet_len, version=self.sender.config.version))
+        config = self.sender.config
+        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=config.packet_len, version=config.version))
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         self.sender.submit(topic_id, payload, now)
