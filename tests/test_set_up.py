@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).resolve().parent.parent
 USED = ("sh", "cat", "cut", "date", "dirname", "find", "flock", "grep", "mkdir", "mktemp", "rm", "sed", "tail", "touch")
@@ -128,5 +128,5 @@ def test_two_at_once(clone: Path) -> None:
         second = subprocess.Popen([str(clone / "tools" / "set-up"), "test"], stdout=output)
         wait_for(lambda: said.read_text() != "", "the second one's line")
         assert second.poll() is None
-    assert second.wait(60) == 0
+    assert second.wait(PATIENCE_S) == 0
     assert said.read_text() == "Another make is setting this clone up; waiting for it\n"

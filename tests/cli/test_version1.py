@@ -15,6 +15,7 @@ from gr_ros2.record.result import read_result
 from tests.run.test_replay import COUNT, make_bag
 from tests.study.sweeps import write_sweep_file
 
+PLAIN = ("--set", "version=0", "--set", "ros_source.topic_options={}")
 LOSSY = ("--set", "version=1", "--set", "reports={}", "--set", "channel.packet_loss=0.2")
 
 
@@ -28,7 +29,7 @@ def test_replay_repairs_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert int(found[1]) > 0
     assert re.search(r"\d+ for repair \(\d+%\), \d+ for reports", printed)
     assert len(list(read_bag(tmp_path / "out.mcap"))) == COUNT
-    assert run([*command, str(tmp_path / "lost.mcap"), "--set", "channel.packet_loss=0.2"]) == 0
+    assert run([*command, str(tmp_path / "lost.mcap"), *PLAIN, "--set", "channel.packet_loss=0.2"]) == 0
     assert "Repair recovered" not in capsys.readouterr().out
     assert len(list(read_bag(tmp_path / "lost.mcap"))) < COUNT
 

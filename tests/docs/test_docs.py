@@ -187,6 +187,7 @@ def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.
     """Run the program in a folder, with a home folder of its own; what it measures is kept for the next command."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **({} if home is None else {"HOME": str(home)})}
     environment["XDG_CACHE_HOME"] = str((home or folder).parent / "cache")
+    environment["XDG_STATE_HOME"] = str((home or folder).parent / "state")  # a link of this process may hold its own
     command = [sys.executable, "-m", "gr_ros2.cli", *arguments]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, f"{' '.join(arguments)}: {done.stderr}"
