@@ -6,6 +6,7 @@ import random
 from functools import partial
 
 import numpy as np
+from gnuradio import fec  # noqa: F401 - the decoder imports it at its first use, which is no work of a frame
 
 from fuzz.loop import main, within
 from gr_ros2.phy.wifi_frames import ENCODINGS, DataFrames, FrameDecoder

@@ -173,6 +173,7 @@ effects(
     namespace_format=Elsewhere("tests/gr/test_sink.py"),
     publisher_depth=Elsewhere("tests/gr/test_sink.py"),
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
+    max_age_s=Elsewhere("tests/link/v1/test_endpoint.py"),
     hold_s=run("ros_sink.hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
     max_sources=Elsewhere("tests/link/test_receiver.py"),
     max_source_bytes=Elsewhere("tests/link/v1/test_endpoint.py"),
@@ -277,6 +278,13 @@ effects(
 )
 for part in ("channel", "ros_source", "ros_sink"):
     EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
+effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
+effects(
+    "Robot",
+    ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),
+    tx_power_dbm=Elsewhere("tests/run/test_robots.py"),
+    noise_figure_db=Elsewhere("tests/run/test_robots.py"),
+)
 effects(
     "Link",
     **BOTH_ENDS,

@@ -563,7 +563,7 @@ class Endpoint:
             marks,
             heard=heard,
             wants=self.neighbours.unproven,
-            reported=self.window.reported,
+            reported=self.window.reported and self.settings.repair != "off",
             lone=self._lone,
             now=now,
         )
