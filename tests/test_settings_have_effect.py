@@ -20,6 +20,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.errors import ConfigError
 from gr_ros2.gr.ends import make_endpoint
+from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode
 from gr_ros2.radio.ax25 import ui_header
 from gr_ros2.radio.framing import Kiss
@@ -30,6 +31,7 @@ from gr_ros2.setting import AUTO, Setting, settings_of
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from tests.gr.test_health import make, parts
+from tests.link.v1.air import Air, Robot, registry
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "reference" / "parameters.md"
@@ -82,6 +84,26 @@ def sealed() -> Outcomes:
         return Keys((bytes(32),), mode).own(1, 1).close(b"head", b"body", 1, SOURCE_ROW)
 
     return close
+
+
+def withheld(**sink: Any) -> list[bytes]:
+    """Messages that are taken of sealed packets which somebody held back for 5 s."""
+    take = end_settings(None, SinkConfig(robot_id=2, **sink), hears=True)
+    one = Robot(1, registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
+    two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s)
+    air = Air(one, two)
+    air.run(2.0)
+    air.lost = lambda sender, _: sender is one
+    before = len(air.recorded)
+    for number in range(10):
+        one.end.submit(0, b"late %d" % number, air.now)
+        air.run(0.1)
+    held = [data for sender, data in air.recorded[before:] if sender is one]
+    air.robots = [two]
+    air.run(5.0)
+    for data in held:
+        two.receive(data, air.now)
+    return two.delivered()
 
 
 class Elsewhere(str):
@@ -173,7 +195,7 @@ effects(
     namespace_format=Elsewhere("tests/gr/test_sink.py"),
     publisher_depth=Elsewhere("tests/gr/test_sink.py"),
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
-    max_age_s=Elsewhere("tests/link/v1/test_endpoint.py"),
+    max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
     hold_s=run("ros_sink.hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
     max_sources=Elsewhere("tests/link/test_receiver.py"),
     max_source_bytes=Elsewhere("tests/link/v1/test_endpoint.py"),
