@@ -23,8 +23,8 @@ from tests.waiting import wait_for
 
 MESSAGES, WARM_UP, BATCH = 200_000, 50_000, 1_000
 WINDOW_BYTES = 1_000_000
-"""For the packets that are remembered. A dictionary of the 30,000 that the default allows moves every 57,000 packets, and
-each move may leave 2.6 MB of the heap unused."""
+"""For packets that are remembered. A dictionary of the 30,000 that the default allows is copied every 57,000 packets;
+each copy may leave 2.6 MB of the heap unused."""
 LEAST = 0.999
 """Of the messages are delivered."""
 
