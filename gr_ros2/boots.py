@@ -8,8 +8,8 @@ A file that cannot be written (a full disk) does not keep a robot from its link:
 call tries again.
 
 Invariants: the file is replaced as a whole, and is on the disk before a call returns, so a power cut leaves the old or
-the new file; one process at a time uses a file; what sealed and other links have heard is kept apart, because anybody
-can make a robot hear something on a link without a key.
+the new file; one process at a time uses a file, as long as a link of it is open; what sealed and other links have heard
+is kept apart, because anybody can make a robot hear something on a link without a key.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from weakref import WeakValueDictionary
 
 from gr_ros2.errors import ConfigError
 from gr_ros2.files import replacing
@@ -30,8 +30,38 @@ RANDOM_BITS = 32
 """Random bits at the end of a boot number."""
 _LARGEST = (1 << 32) - 1
 _LOG = logging.getLogger("gr_ros2.boots")
-_LOCKS: dict[tuple[int, Path], IO[str]] = {}
-"""Locks that this process holds until it ends, by process id and file."""
+
+
+class _Lock:
+    """Keeps other processes from a state file as long as this object lives.
+
+    :param path: path of the state file
+    :raises ConfigError: another process uses it
+    :raises OSError: the lock cannot be made
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.with_name(f".{path.name}.lock").open("a+", encoding="ascii")
+        try:
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.seek(0)
+            holder = self._file.read().strip() or "of another user"
+            raise ConfigError(
+                f"{path}: process {holder} uses it, so a link of this robot runs already; end that one, or give "
+                "this one another robot_id or state"
+            ) from None
+        self._file.truncate(0)
+        self._file.write(f"{os.getpid()}\n")
+        self._file.flush()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_file"):
+            self._file.close()
+
+
+_LOCKS: WeakValueDictionary[tuple[int, Path], _Lock] = WeakValueDictionary()
+"""Locks that this process holds, by process id and file. Links of one process share a lock."""
 
 
 class BootFile:
@@ -44,12 +74,15 @@ class BootFile:
     :raises ConfigError: another process uses the file, or it cannot be read or understood
     """
 
+    _lock: _Lock | None = None
+
     def __init__(self, path: str | Path, wall_clock: float, bits: int, *, sealed: bool) -> None:
         self._path = Path(path).absolute()
-        self._said = False
+        self._said = self._closed = False
         with suppress(OSError):  # the attempt to write says what is wrong
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock()
+            self._lock = _LOCKS.get((os.getpid(), self._path)) or _Lock(self._path)
+            _LOCKS[os.getpid(), self._path] = self._lock
         self._start, self._all = self._read()
         self._heard = self._all["sealed" if sealed else "open"]
         before, self._start = self._start, min(max(self._start + 1, int(wall_clock)), _LARGEST)
@@ -72,35 +105,16 @@ class BootFile:
     def save(self, src_id: int, boot: int, floor: int) -> None:
         """Store up to which packet a robot has been heard.
 
-        :raises ConfigError: the file cannot be written
+        :raises ConfigError: the file cannot be written, or this object is closed
         """
+        if self._closed:
+            raise ConfigError(f"{self._path}: the link that used it is closed")
         self._heard[src_id] = (boot, floor)
         self._write()
 
-    def _lock(self) -> None:
-        """Keep other processes from this file.
-
-        :raises ConfigError: another process uses it
-        :raises OSError: the lock cannot be made
-        """
-        place = self._path.with_name(f".{self._path.name}.lock")
-        if (os.getpid(), place) in _LOCKS:
-            return
-        file = place.open("a+", encoding="ascii")
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read().strip() or "of another user"
-            file.close()
-            raise ConfigError(
-                f"{self._path}: process {holder} uses it, so a link of this robot runs already; end that one, or give "
-                "this one another robot_id or state"
-            ) from None
-        _LOCKS[os.getpid(), place] = file
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
+    def close(self) -> None:
+        """Let another process use the file, once all links of this one that use it are closed. Idempotent."""
+        self._closed, self._lock = True, None
 
     def _read(self) -> tuple[int, dict[str, dict[int, tuple[int, int]]]]:
         try:

@@ -92,11 +92,16 @@ def test_a_file_that_cannot_be_written_is_said_once_and_keeps_nobody_from_a_link
 
 def test_a_second_process_is_told_who_uses_the_file(tmp_path: Path) -> None:
     path = tmp_path / "state"
-    BootFile(path, 1.0, 0, sealed=False)
+    files = [BootFile(path, 1.0, 0, sealed=False) for _ in range(2)]
     code = "import sys; from gr_ros2.boots import BootFile; BootFile(sys.argv[1], 1.0, 0, sealed=False)"
-    other = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
-    assert other.returncode
-    assert f"process {os.getpid()} uses it" in other.stderr
+    for file in files:
+        other = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
+        assert other.returncode
+        assert f"process {os.getpid()} uses it" in other.stderr
+        file.close()
+    subprocess.run([sys.executable, "-c", code, path], check=True)
+    with pytest.raises(ConfigError, match="is closed"):
+        files[0].save(3, 77, 1)
 
 
 def test_a_key_by_mistake_is_not_repeated(capsys: pytest.CaptureFixture[str]) -> None:

@@ -104,6 +104,7 @@ class Start:
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     :param ladder: the rungs of an adaptive rate, see :attr:`gr_ros2.phy.Phy.ladder`; () for a fixed rate
+    :param close: lets another process start this robot; nothing is stored afterwards
     """
 
     boot: int = 1
@@ -114,6 +115,7 @@ class Start:
     half_duplex: bool = False
     any_length: bool = False
     ladder: Sequence[Rung] = ()
+    close: Callable[[], None] = lambda: None
 
 
 def make_endpoint(
@@ -204,7 +206,7 @@ def start_of(
         return Start(boot, reports=reports, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
     path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
     file = BootFile(path, time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
-    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length, ladder)
+    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length, ladder, file.close)
 
 
 def state_folder() -> Path:

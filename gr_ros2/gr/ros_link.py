@@ -60,7 +60,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        start = start_of(
+        start = self._start = start_of(
             source,
             source.src_id(),
             reports=True,
@@ -89,11 +89,12 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self.msg_connect(self.source, "pdus", self, "pdus")
 
     def close(self) -> None:
-        """Leave the ROS graphs. Idempotent."""
+        """Leave the ROS graphs, and let another process use the state file. Idempotent."""
         if self.calls is not None:
             self.calls.close()
         self.source.close()
         self.sink.close()
+        self._start.close()
 
 
 def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: Any) -> RosLink:

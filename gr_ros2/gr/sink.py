@@ -22,7 +22,7 @@ from gnuradio import gr
 from gr_ros2.config import SinkConfig, replaced
 from gr_ros2.errors import ConfigError, DescriptionError, GrRos2Error, SealError
 from gr_ros2.gr.early import LOOK_S, EarlyMessages
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.readable import debug_logger, describe
@@ -120,8 +120,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if rows:
             check_outputs(rows, self.config)
             self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
+        self._start = Start()
         if end is None:
-            start = start_of(self.config, robot_of(None, self.config), reports=False)
+            start = self._start = start_of(self.config, robot_of(None, self.config), reports=False)
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
         self._live, self._end = end, end.endpoint
         self._announced: dict[tuple[int, int], Topic] = {}
@@ -228,6 +229,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             publisher.close()
         LOOP_GUARD.remove(self)
         self._finalizer()
+        self._start.close()
 
     def stats(self) -> dict[str, Any]:
         """A snapshot. ``packet_loss_est`` and ``message_loss_est`` are estimates from gaps in numbers."""

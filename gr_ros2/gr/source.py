@@ -22,7 +22,7 @@ from gnuradio import gr
 
 from gr_ros2.config import SourceConfig, replaced
 from gr_ros2.errors import ConfigError, GrRos2Error
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
@@ -93,8 +93,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.src_id = self.config.src_id()
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
+        self._start = Start()
         if end is None:
-            start = start_of(self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder)
+            start = self._start = start_of(
+                self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder
+            )
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -229,6 +232,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._subscriptions.clear()
         LOOP_GUARD.remove(self)
         self._finalizer()
+        self._start.close()
 
     def stats(self) -> dict[str, Any]:
         """A snapshot of the counters of packets and messages, per topic and in total."""

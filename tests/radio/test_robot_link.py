@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -50,6 +53,20 @@ def test_the_channel_is_what_the_configuration_says() -> None:
         robot.say(0)
         wait_for(lambda: robot.link.stats()["packets"]["out"] >= 4, "packets to be sent")
         assert robot.heard == []
+
+
+@pytest.mark.parametrize("name", ["sim", "zmq"])
+def test_a_link_that_was_stopped_keeps_no_other_process_from_its_state(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("zmq" if name == "zmq" else "gnuradio")
+    front_end = (
+        SIM if name == "sim" else {"name": "zmq", "bind": f"ipc://{tmp_path}/1", "connect": [f"ipc://{tmp_path}/2"]}
+    )
+    code = "import sys; from gr_ros2.boots import BootFile; BootFile(sys.argv[1], 1.0, 0, sealed=False)"
+    command = [sys.executable, "-c", code, str(tmp_path / "state")]
+    with Robot(1, front_end, version=1, state=command[-1]):
+        refused = subprocess.run(command, capture_output=True, check=False)
+        assert b"a link of this robot runs already" in refused.stderr
+    subprocess.run(command, check=True)
 
 
 def test_packets_leave_at_the_pace_of_the_air() -> None:
