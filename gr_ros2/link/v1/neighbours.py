@@ -194,6 +194,7 @@ class Neighbours:
         self._own = own
         self._settings = settings
         self._keys = keys
+        self._provable = keys.sealed and settings.hears
         self._stored = dict(heard)
         self._save = save
         self._make_inbox = inbox
@@ -269,7 +270,7 @@ class Neighbours:
 
     def proves(self, hello: Hello) -> bool:
         """Whether a robot can prove when it sealed a packet: it hears this one, and packets are sealed."""
-        return self._keys.sealed and self._settings.hears and hello.capabilities & CAN_HEAR != 0
+        return self._provable and hello.capabilities & CAN_HEAR != 0
 
     @property
     def unproven(self) -> bool:
@@ -437,7 +438,7 @@ class Neighbours:
 
         :raises NotStoredError: it cannot be stored
         """
-        if number < neighbour.floor or not self._counts_on_store(neighbour.hello):
+        if self._save is None or number < neighbour.floor or not self._counts_on_store(neighbour.hello):
             return
         soon = now - neighbour.saved < _SAVING_S
         if soon and not neighbour.failed:

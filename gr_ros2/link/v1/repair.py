@@ -215,6 +215,10 @@ class RepairWindow:
         """Number of the last source packet; 0 before the first."""
         self._receivers: dict[int, Receiver] = {}
         self._everybody = 0
+        self._proven = 0
+        """The highest ``proven`` of all receivers."""
+        self._in_vain = False
+        """Whether a receiver waits for a packet in vain."""
         self.loss = expected_loss
         """Share of packets that the receiver with the most losses loses, as far as it is known or expected."""
         self._resend: list[int] = []
@@ -274,7 +278,7 @@ class RepairWindow:
             free = next(bit for bit in range(256) if not self._everybody >> bit & 1)
             peer = self._receivers[receiver] = Receiver(1 << free, now)
             self._everybody |= peer.bit
-            self._note_losses()
+            self._note_receivers()
         return peer
 
     def proven(self, receiver: int, number: int) -> None:
@@ -284,10 +288,7 @@ class RepairWindow:
             peer.proven = number
             if number <= START:
                 peer.lost.update(older for older, record in self._records.items() if older <= number and record.lives)
-
-    @property
-    def _proven(self) -> int:
-        return max((peer.proven for peer in self._receivers.values()), default=0)
+            self._note_receivers()
 
     def report(self, receiver: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
         """A receiver says what it has.
@@ -303,7 +304,6 @@ class RepairWindow:
         gap = now - peer.heard
         peer.interval += (gap - peer.interval) / 8
         peer.heard, peer.loss = now, loss
-        self._note_losses()
         sent_at = self._times.get(number)
         if sent_at is not None and number >= peer.newest:
             peer.delays.append(now - sent_at)
@@ -331,6 +331,7 @@ class RepairWindow:
                 if any(life.in_order for life in record.lives):
                     heappush(self._urgent, record.number)
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
+        self._note_receivers()
         if settled:
             for older in range(max(self._oldest, peer.settled), number - MAP + 1):
                 record = records.get(older)
@@ -345,7 +346,7 @@ class RepairWindow:
         peer = self._receivers.pop(receiver, None)
         if peer is not None:
             self._everybody &= ~peer.bit
-            self._note_losses()
+            self._note_receivers()
             for record in self._records.values():
                 record.confirmed &= ~peer.bit
 
@@ -374,8 +375,12 @@ class RepairWindow:
         self._retire(now)
         return bool(self._records)
 
-    def _note_losses(self) -> None:
-        self.loss = max((peer.loss for peer in self._receivers.values()), default=self._expected)
+    def _note_receivers(self) -> None:
+        """Take together what is known of the receivers; every new packet asks for that."""
+        peers = self._receivers.values()
+        self._proven = max((peer.proven for peer in peers), default=0)
+        self._in_vain = any(peer.waits >= 0 for peer in peers)
+        self.loss = max((peer.loss for peer in peers), default=self._expected)
         loss = min(self.loss, _MOST_LOSS)
         self._share = AHEAD * loss / (1 - loss) ** 3
 
@@ -425,11 +430,13 @@ class RepairWindow:
     @property
     def pressing(self) -> bool:
         """Whether ``urgent`` or ``over`` may have something."""
-        return bool(self._urgent) or any(peer.waits >= 0 for peer in self._receivers.values())
+        return bool(self._urgent) or self._in_vain
 
     def over(self, now: float, patience_s: float = 0.0) -> int:
         """The oldest packet that a receiver has waited for longer than so many s in vain: it is not repaired any more.
         -1 for none."""
+        if not self._in_vain:
+            return -1
         waits = [p.waits for p in self._receivers.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
         return min(waits, default=-1)
 
@@ -437,6 +444,7 @@ class RepairWindow:
         """A repair from which receivers learn that a packet is not repaired any more; None if there is none."""
         for peer in self._receivers.values():
             peer.waits, peer.waits_since = -1, inf
+        self._in_vain = False
         self._retire(now)
         if number < self._oldest:
             window = list(self._live(self._oldest, self._oldest, now))

@@ -30,8 +30,12 @@ _TYPES = {"int32": np.dtype("<i4"), "float64": np.dtype("<f8")}
 def flags() -> list[str]:
     """What setup.py compiles with."""
     tree = ast.parse((ROOT / "setup.py").read_text("utf-8"))
-    (given,) = (node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "COMPILE")  # type: ignore[attr-defined]
+    (given,) = (node.value for node in tree.body if isinstance(node, ast.Assign) and names(node) == ["COMPILE"])
     return list(ast.literal_eval(given))
+
+
+def names(node: ast.Assign) -> list[str]:
+    return [ast.unparse(target) for target in node.targets]
 
 
 @pytest.fixture(scope="module")
