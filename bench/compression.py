@@ -9,7 +9,7 @@ from bench.rows import Row
 from bench.yardstick import Cost, cost
 from gr_ros2.compression import LinkCodec
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.sim import Fleet, SimSettings
 from tests.recordings import DRIVES
 

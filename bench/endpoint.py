@@ -11,7 +11,7 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 
 PACKET_LEN, MESSAGES, REPEATS, LOSS = 64, 10_000, 5, 0.2
 MOST = {"sending": 800, "receiving": 600}

@@ -19,13 +19,13 @@ from typing import Literal
 from bench.rows import Row
 from bench.yardstick import turn_s
 from fuzz.loop import inputs
-from gr_ros2.config import TopicOptions
-from gr_ros2.errors import ReplayedError
+from gr_ros2.core.errors import ReplayedError
 from gr_ros2.link.events import Delivered, Rejected
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
 
 Kind = Literal["damaged", "damaged, sealed", "forged"]

@@ -20,8 +20,7 @@ from gnuradio import gr
 from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait
 from bench.rows import Row
 from bench.runs import DRIVE
-from gr_ros2.config import ChannelConfig, SourceConfig
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware.bag_files import read_bag
@@ -30,7 +29,8 @@ from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated
 from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.phy.window import WINDOW
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import ChannelConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
 
 SNR_DB = 20.0
 LEAST = 0.95

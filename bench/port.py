@@ -19,7 +19,7 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.base import MessageCallback
 from gr_ros2.phy.threads import shorten_switch_interval
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 
 PACKET_LEN, REPEATS = 64, 5
 PACKETS = 45_000

@@ -16,7 +16,7 @@ from gr_ros2.phy.ofdm_rate import RUNGS
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import scenario_from
 from gr_ros2.run.simulate import Offered, Simulation
-from gr_ros2.settings_file import find_registry
+from gr_ros2.settings.files import find_registry
 
 PACKET_LEN, MESSAGE_LEN = 220, 205
 SNRS_DB = range(31)

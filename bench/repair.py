@@ -16,12 +16,12 @@ from math import inf
 from typing import Any, Literal
 
 from bench.rows import Row
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 
 RATE = 75.0
 

@@ -12,11 +12,11 @@ from math import inf
 
 from bench.repair import RATE, losses, quantile
 from bench.rows import Row
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 
 CASES = {"1 MB, then 1 B": (1_000_000, 1), "five of 200 kB": (200_000,) * 5}
 LOSSES = (0.0, 0.05, 0.2)

@@ -10,8 +10,8 @@ from functools import partial
 
 from fuzz.loop import main, within
 from gr_ros2.compression import LinkCodec
-from gr_ros2.errors import CodecError
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.core.errors import CodecError
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.sim import Fleet, SimSettings
 from gr_ros2.sim.sensors import TYPES as SIMULATED
 

@@ -7,11 +7,11 @@ import random
 from collections.abc import Iterator
 
 from fuzz.loop import main, work
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Hello
 

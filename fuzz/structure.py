@@ -10,8 +10,8 @@ from functools import partial
 
 from fuzz.loop import main, within
 from gr_ros2.compression import LinkCodec
-from gr_ros2.errors import CodecError
-from gr_ros2.registry import Topic
+from gr_ros2.core.errors import CodecError
+from gr_ros2.settings.registry import Topic
 
 BASE, PER_BYTE = 500_000, 500
 """Lines of Python for an announcement and a message, and more for each byte of the message. A structure is prepared

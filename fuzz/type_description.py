@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from fuzz.loop import main, within
-from gr_ros2.errors import DescriptionError
+from gr_ros2.core.errors import DescriptionError
 from gr_ros2.middleware.type_descriptions import read_reply
 from tests.middleware.describing import CUSTOM, CUSTOM_TEXT, STORE, hash_of_text, reply, types_of
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import partial
 
 from fuzz.loop import main, within
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.wire import decode
 from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
 

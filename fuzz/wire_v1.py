@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from fuzz.loop import main
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Ask, Hello, Report
 from gr_ros2.wire.table import Row, read_table, write_table

@@ -18,8 +18,8 @@ FILES = dict(re.findall(r"^### [^\n]*`(\w+)\.py`\n.*?^```python\n(.*?)^```$", PA
 DIFFS = re.findall(r"^```diff\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 ASK = """
 from gr_ros2.cli.params import setting_keys
-from gr_ros2.config import SourceConfig, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.settings.config import SourceConfig, build
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.ros.parameters import parameters
 

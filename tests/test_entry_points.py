@@ -92,7 +92,7 @@ def test_a_broken_one_is_named_when_it_is_chosen_and_harms_nobody_else(folder: P
         folder,
         "-c",
         f"""
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.middleware import MIDDLEWARE
 assert {name!r} in MIDDLEWARE and MIDDLEWARE.load("memory") and MIDDLEWARE.load("echo")
 try:

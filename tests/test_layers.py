@@ -18,14 +18,12 @@ ROOT = Path(gr_ros2.__file__).resolve().parent
 MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py"))]
 
 LAYERS = (
-    {"errors"},
-    {"wire", "names", "yaml_bounds", "setting", "files", "service_rows"},
-    {"yaml_text", "config_errors", "topic_choice", "keys"},
-    {"config", "backends", "backlog", "guard", "boots", "path_finder"},
-    {"registry", "settings_file"},
+    {"core"},
+    {"wire", "state"},
+    {"settings"},
     {"link", "calls"},
     {"middleware", "compression"},
-    {"phy", "sim", "grc_path", "grc_python"},
+    {"phy", "sim", "grc"},
     {"medium"},
     {"gr"},
     {"radio"},
@@ -58,8 +56,8 @@ WITHOUT_BACKENDS = (
     "gr_ros2.wire",
     "gr_ros2.link",
     "gr_ros2.calls",
-    "gr_ros2.registry",
-    "gr_ros2.config",
+    "gr_ros2.settings.registry",
+    "gr_ros2.settings.config",
     "gr_ros2.compression",
     "gr_ros2.middleware",
     "gr_ros2.middleware.memory",
@@ -87,7 +85,7 @@ KNOW_THEIR_VERSION = (
 )
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
 COMPARES_WITH_VERSION_0 = ("race/race_settings.py",)
-SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "config", "registry"}
+SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "settings"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
 _GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}
@@ -102,7 +100,7 @@ def parsed(module: str) -> ast.Module:
 
 
 def part(module: str) -> str:
-    """``link`` of ``link/sender.py``, ``config`` of ``config.py``."""
+    """``link`` of ``link/sender.py``."""
     return module.split("/", maxsplit=1)[0].removesuffix(".py")
 
 
@@ -114,7 +112,7 @@ def imports(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "imports are absolute"
             assert node.module is not None
-            # `from gr_ros2 import errors` names a part too.
+            # `from gr_ros2 import core` names a part too.
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 

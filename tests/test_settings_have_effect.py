@@ -17,17 +17,17 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import make_endpoint
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode
 from gr_ros2.radio.ax25 import ui_header
 from gr_ros2.radio.framing import Kiss
-from gr_ros2.registry import Registry, Topic
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import simulate
-from gr_ros2.setting import AUTO, Setting, settings_of
+from gr_ros2.settings.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.fields import AUTO, Setting, settings_of
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from tests.gr.test_health import make, parts
@@ -155,7 +155,7 @@ effects(
     seal=sealed(),
     state=Elsewhere("tests/radio/test_version1.py"),
     robot_id=run("ros_source.robot_id=7"),
-    middleware=Elsewhere("tests/test_backends.py"),
+    middleware=Elsewhere("tests/core/test_backends.py"),
     domain_id=Elsewhere("tests/gr/test_source.py"),
     dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=run(OPTION + "odom.max_rate=5"),
@@ -187,7 +187,7 @@ effects(
     seal=sealed(),
     state=Elsewhere("tests/radio/test_version1.py"),
     robot_id=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
-    middleware=Elsewhere("tests/test_backends.py"),
+    middleware=Elsewhere("tests/core/test_backends.py"),
     domain_id=Elsewhere("tests/gr/test_sink.py"),
     dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=Elsewhere("tests/gr/test_sink.py"),

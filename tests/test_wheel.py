@@ -19,8 +19,8 @@ from pathlib import Path
 import gr_ros2
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.compression.dictionary import shipped
-from gr_ros2.settings_file import BUILTIN_DIR
-from gr_ros2.grc_path import example, grc_path
+from gr_ros2.settings.files import BUILTIN_DIR
+from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware.dds_library import load
 from gr_ros2.phy.kernels.library import loaded
 print(json.dumps({

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from math import inf
 
 from gr_ros2.calls.frames import MAX_DEADLINE_S, NO_DEADLINE, Frame, read_frame, write_frame
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 
 MAX_CALLS = 256
 """Calls that may wait for a reply: of this robot in all, and of each other robot."""

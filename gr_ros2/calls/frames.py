@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from struct import Struct
 
-from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError
+from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 
 NO_DEADLINE = 0.0
 """Deadline, in s, of a call that waits for its reply without limit."""

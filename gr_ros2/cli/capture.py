@@ -10,8 +10,8 @@ import struct
 from binascii import unhexlify
 from collections.abc import Iterable, Iterator
 
-from gr_ros2.config import MIN_PACKET_LEN, SourceConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.settings.config import MIN_PACKET_LEN, SourceConfig
 
 DEFAULT_PACKET_LEN = SourceConfig().packet_len
 

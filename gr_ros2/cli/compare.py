@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.report.compare import compare_grid, write_comparison
 from gr_ros2.report.page import read_runs
 from gr_ros2.report.table import as_table

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from gr_ros2.errors import GrRos2Error, RunError
+from gr_ros2.core.errors import GrRos2Error, RunError
 
 _LINE = 4096
 _MAX_CLIENTS = 32

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
-from gr_ros2.errors import BackendMissingError, ConfigError, RunError
+from gr_ros2.core.backends import uninterrupted
+from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard

@@ -17,9 +17,9 @@ from gr_ros2.cli.console import console
 from gr_ros2.compression import Dictionary, LinkCodec, load, shipped
 from gr_ros2.compression.dictionary import SHIPPED
 from gr_ros2.compression.train import learn
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 
 _HELD_BACK = 4
 """Every fourth message of a topic is kept for measuring."""

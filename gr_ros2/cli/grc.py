@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import click
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.grc_path import grc_path as block_folder
-from gr_ros2.grc_path import install as install_blocks
-from gr_ros2.grc_path import uninstall as uninstall_blocks
-from gr_ros2.grc_python import ask, grc_program, provide, withdraw
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.grc.path import grc_path as block_folder
+from gr_ros2.grc.path import install as install_blocks
+from gr_ros2.grc.path import uninstall as uninstall_blocks
+from gr_ros2.grc.python import ask, grc_program, provide, withdraw
 
 
 @click.command("grc-path")

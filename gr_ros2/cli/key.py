@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from gr_ros2.keys import new_key_file
+from gr_ros2.state.keys import new_key_file
 
 
 @click.group("key", context_settings={"help_option_names": ["-h", "--help"]})

@@ -13,23 +13,23 @@ import click
 from rich.console import Console
 from rich.status import Status
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import RowName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
-from gr_ros2.config import DEFAULT_MIDDLEWARE
-from gr_ros2.errors import ConfigError
-from gr_ros2.guard import Guard
+from gr_ros2.core.backends import uninterrupted
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.guard import Guard
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
-from gr_ros2.settings_file import portable_registry, settled
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
+from gr_ros2.settings.files import portable_registry, settled
+from gr_ros2.settings.yaml_text import yaml_text
 from gr_ros2.wire import BROADCAST
-from gr_ros2.yaml_text import yaml_text
 
 if TYPE_CHECKING:
     from gr_ros2.radio.robot_link import RobotLink

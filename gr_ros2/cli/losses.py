@@ -11,7 +11,7 @@ from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium.loss_table import PACKETS, STEP_DB, table_for
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario

@@ -17,7 +17,7 @@ import click
 
 from gr_ros2 import __version__
 from gr_ros2.cli.ending import BAD_INPUT, FAILED, INTERRUPTED, on_signals
-from gr_ros2.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
+from gr_ros2.core.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
 
 _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
 _GNU_RADIO = ("gnuradio", "pmt")

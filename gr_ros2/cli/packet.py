@@ -9,11 +9,11 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.capture import DEFAULT_PACKET_LEN, from_hex, packets_in
-from gr_ros2.config import MAX_PACKET_LEN, MIN_PACKET_LEN
-from gr_ros2.errors import ConfigError, WireError
-from gr_ros2.keys import read_key_file
+from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.v1.reader import Look, Reader
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import MAX_PACKET_LEN, MIN_PACKET_LEN
+from gr_ros2.settings.registry import Registry
+from gr_ros2.state.keys import read_key_file
 from gr_ros2.wire import BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
 
 _SHOWN = 16

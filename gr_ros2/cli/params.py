@@ -9,9 +9,9 @@ from typing import Any, get_type_hints
 import click
 from click.shell_completion import CompletionItem
 
-from gr_ros2.backends import BackendTable
-from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import BUILTIN_DIR
+from gr_ros2.core.backends import BackendTable
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.files import BUILTIN_DIR
 
 
 class Completed(click.ParamType):

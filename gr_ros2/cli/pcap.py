@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 
 if TYPE_CHECKING:

@@ -10,12 +10,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import OrAuto
-from gr_ros2.config import build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.race_settings import RaceSettings
 from gr_ros2.race.results import notes, race_grid, write_race
 from gr_ros2.race.runner import run_race
 from gr_ros2.report.table import as_table
+from gr_ros2.settings.config import build
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
 

@@ -17,17 +17,17 @@ from rich.console import Console
 from rich.table import Table
 
 from gr_ros2.cli.params import Completed, OrAuto
-from gr_ros2.config import DEFAULT_MIDDLEWARE, TopicOptions
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import INFRASTRUCTURE, checked_namespace, topic_fault
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.middleware.services import ServiceGraph
-from gr_ros2.names import INFRASTRUCTURE, checked_namespace, topic_fault
 from gr_ros2.record.positions import humble_types
-from gr_ros2.registry import MAX_TOPICS, Registry, Topic
-from gr_ros2.service_rows import OF_ACTION, ServiceRow, parts, rows_of
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, TopicOptions
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
+from gr_ros2.settings.service_rows import OF_ACTION, ServiceRow, parts, rows_of
 
 _NO_MESSAGES = {"srv": "a service", "action": "an action"}
 """Middle part of a type name other than ``msg``, and what has such types."""

@@ -8,7 +8,7 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.names import first
+from gr_ros2.core.names import first
 from gr_ros2.report.explain import repair_lines
 from gr_ros2.report.table import ledger_table, notes, summary_table
 from gr_ros2.run.replay import replay as replay_bag

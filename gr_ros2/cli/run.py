@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
@@ -21,6 +20,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
+from gr_ros2.core.backends import uninterrupted
 from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2.record.result import Result
 from gr_ros2.report.explain import explanation
@@ -30,7 +30,7 @@ from gr_ros2.run import runner
 from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),

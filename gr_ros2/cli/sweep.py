@@ -9,11 +9,11 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gr_ros2.backends import uninterrupted
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import INTERRUPTED
 from gr_ros2.cli.params import set_option
-from gr_ros2.errors import BackendMissingError, RunError
+from gr_ros2.core.backends import uninterrupted
+from gr_ros2.core.errors import BackendMissingError, RunError
 from gr_ros2.report.table import as_table
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.study.sweep.definition import builtin_sweeps, load_sweep, read_sweep

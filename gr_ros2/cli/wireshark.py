@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 DISSECTOR = Path(__file__).resolve().parent.parent / "wireshark" / "gr_ros2.lua"
 

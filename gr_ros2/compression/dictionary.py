@@ -25,7 +25,7 @@ from typing import Any
 from gr_ros2.compression.floats import CLASSES, KnownNumbers
 from gr_ros2.compression.prepared import Model
 from gr_ros2.compression.static_values import Words
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 FORMAT = 1
 SHIPPED = (1, 2)

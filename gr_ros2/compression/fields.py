@@ -43,7 +43,7 @@ from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, 
 from gr_ros2.compression.stamps import pop_stamp, push_stamp
 from gr_ros2.compression.static_values import Value, pop_static, push_static
 from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
-from gr_ros2.errors import DamagedError
+from gr_ros2.core.errors import DamagedError
 
 MAX_NUMBER = 8192
 """Bytes of the number part: the most that MAX_SLOTS values can need; a longer number is damage."""

@@ -29,8 +29,8 @@ from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Composite, Types, tree_of
 from gr_ros2.compression.structure import read_structure, write_structure
 from gr_ros2.compression.zstd_frames import Zstd
-from gr_ros2.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
-from gr_ros2.registry import Topic
+from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
+from gr_ros2.settings.registry import Topic
 from gr_ros2.wire import FORMATS
 
 CODECS = ("auto", "none", "fields", "zstd")

@@ -17,7 +17,7 @@ import numpy as np
 
 from gr_ros2.compression.layout import BULK, DOUBLE, MATRIX, QUATERNION, SINGLE, Layout, Slot
 from gr_ros2.compression.schema import BIG, Composite, Node, Repeat, Scalar
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 LARGEST = float(1 << 33)
 """Largest magnitude in steps; larger values stay unchanged."""

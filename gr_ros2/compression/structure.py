@@ -27,7 +27,7 @@ from gr_ros2.compression.schema import (
     Text,
     is_open,
 )
-from gr_ros2.errors import CodecError
+from gr_ros2.core.errors import CodecError
 
 MAX_BYTES = 1 << 24
 """Largest array of numbers, in bytes; no message is larger."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from gr_ros2.errors import DamagedError
+from gr_ros2.core.errors import DamagedError
 
 if sys.version_info >= (3, 14):
     from compression import zstd

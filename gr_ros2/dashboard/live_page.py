@@ -33,10 +33,10 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.dashboard.monitor import RadioView, RunMonitor
 from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_html, topics_html
 from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.settings.config import ChannelConfig
 
 AHEAD = 3
 """When a viewer is this number of pictures behind, it gets no new one."""

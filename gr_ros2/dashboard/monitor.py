@@ -13,15 +13,15 @@ from threading import Lock
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.config import ChannelConfig
+from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.dashboard.spectrum import Spectrum
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import Floats
-from gr_ros2.errors import GrRos2Error
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.record.result import Result
 from gr_ros2.run.observers import LiveLink, LiveRun
+from gr_ros2.settings.config import ChannelConfig
 
 TICK_S = 0.5
 """s between two snapshots."""

@@ -26,10 +26,10 @@ from bokeh.server.util import bind_sockets
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import RequestHandler
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.monitor import TICK_S, RunMonitor
-from gr_ros2.errors import ConfigError
 from gr_ros2.record.result import Result
 
 _LOOK_S = 0.1

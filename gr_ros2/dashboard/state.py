@@ -38,7 +38,7 @@ from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import Result, TopicResult
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.registry import Registry, Topic
 
 HISTORY_S = 180.0
 """Length of the shown curves and paths, s."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 
 Key = tuple[int, int]
 """Source id and topic id."""

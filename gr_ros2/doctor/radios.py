@@ -9,9 +9,9 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.doctor.finding import Finding
 from gr_ros2.doctor.programs import output_of
-from gr_ros2.errors import BackendMissingError
 from gr_ros2.radio import FRONT_ENDS
 
 USB = Path("/sys/bus/usb/devices")

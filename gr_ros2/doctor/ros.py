@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from gr_ros2.config import DEFAULT_MIDDLEWARE
+from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.names import INFRASTRUCTURE
 from gr_ros2.doctor.finding import Finding
-from gr_ros2.errors import ConfigError, GrRos2Error
 from gr_ros2.middleware import join_graph
 from gr_ros2.middleware.ros_graph import discovery_options, resolve_domain_id
-from gr_ros2.names import INFRASTRUCTURE
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
+from gr_ros2.settings.fields import AUTO
 
 ROS_ROOT = Path("/opt/ros")
 _LOOK_S = 3.0

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from queue import Empty, Queue
 from random import Random
 
-from gr_ros2.config import ChannelConfig, PhyConfig
+from gr_ros2.core.errors import BackendMissingError, GrRos2Error
 from gr_ros2.doctor.finding import Check, Finding
-from gr_ros2.errors import BackendMissingError, GrRos2Error
-from gr_ros2.grc_path import example, grc_path
+from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.radio.config import load_link
+from gr_ros2.settings.config import ChannelConfig, PhyConfig
 
 PACKETS = 8
 _BYTES = 64

@@ -19,7 +19,7 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, Outgoing, Request, Service
-from gr_ros2.errors import ConfigError, GrRos2Error, MiddlewareError
+from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.gr.ends import LOOP_GUARD, LiveEnd
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
@@ -29,8 +29,8 @@ from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.key import Key
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
-from gr_ros2.registry import CALLS_TYPE, Topic
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import CALLS_TYPE, Topic
 
 DEADLINE_S = 30.0
 """s that a call waits for its reply, unless ``deadline_s`` of its service says otherwise."""

@@ -19,10 +19,7 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gr_ros2.boots import RANDOM_BITS, BootFile
-from gr_ros2.config import SinkConfig, SourceConfig, build, refuse_without_effect
-from gr_ros2.errors import ConfigError
-from gr_ros2.keys import read_key_file
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
@@ -32,8 +29,11 @@ from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
-from gr_ros2.registry import Registry, Topic
-from gr_ros2.setting import Auto
+from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect
+from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.state.boots import RANDOM_BITS, BootFile
+from gr_ros2.state.keys import read_key_file
 from gr_ros2.wire import BROADCAST
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class Start:
     :param boot: number of this start, greater than all earlier numbers
     :param heard: the last packet heard from each other robot before this start, by robot id: boot number and packet
         number
-    :param save: stores ``heard``, see :class:`gr_ros2.boots.BootFile`
+    :param save: stores ``heard``, see :class:`gr_ros2.state.boots.BootFile`
     :param reports: whether the robots from which it receives can also receive from it
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`

@@ -15,9 +15,9 @@ from typing import Any, cast
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
+from gr_ros2.core.names import filled
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.type_definitions import DAMAGED, typestores
-from gr_ros2.names import filled
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 MAX_STATIC = 4096

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from gr_ros2.config import DiagnosticsConfig
 from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.settings.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
 

@@ -10,7 +10,7 @@ import logging
 import sys
 
 from gr_ros2.link import Received, Rejected, SentPacket
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import QOS_NAMES
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig, SourceConfig, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
@@ -25,8 +24,9 @@ from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Rung
 from gr_ros2.middleware import Middleware
-from gr_ros2.registry import MAX_TOPICS, Registry
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
 
 class RosLink(gr.hier_block2):  # type: ignore[misc]

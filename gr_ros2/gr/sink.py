@@ -19,14 +19,14 @@ from typing import Any, Protocol
 
 from gnuradio import gr
 
-from gr_ros2.config import SinkConfig, replaced
-from gr_ros2.errors import ConfigError, DescriptionError, GrRos2Error, SealError
+from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error, SealError
+from gr_ros2.core.guard import Guard
+from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.early import LOOK_S, EarlyMessages
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.guard import Guard
 from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.ledger_rows import LedgerRow
@@ -37,11 +37,11 @@ from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.names import topic_fault
 from gr_ros2.phy.pdus import PDUS, PduPort, packets_of, snr_db_of
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.registry import Registry, Topic, announced, check_outputs
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import SinkConfig, replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry, Topic, announced, check_outputs
 
 _SHORTEST_WAIT_S = 1e-3
 _CLOCK_DEPTH = 1
@@ -99,7 +99,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         observer that raises is not called again
     :param clock: s, monotonic
     :param end: endpoint of both directions, shared with a source; None: an endpoint that only receives is made
-    :param values: the fields of :class:`gr_ros2.config.SinkConfig`
+    :param values: the fields of :class:`gr_ros2.settings.config.SinkConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
 

@@ -20,14 +20,13 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
-from gr_ros2.config import SourceConfig, replaced
-from gr_ros2.errors import ConfigError, GrRos2Error
+from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.guard import Guard
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.topic_search import TopicSearch
-from gr_ros2.guard import Guard
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
@@ -39,10 +38,11 @@ from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import CREDIT, PduPort
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.registry import MAX_TOPICS, NewRow, Registry, Topic, normalize_type, options_of
-from gr_ros2.service_rows import ServiceRow, is_service, parts, rows_of
-from gr_ros2.setting import AUTO, Auto
-from gr_ros2.topic_choice import TopicChoice
+from gr_ros2.settings.config import SourceConfig, replaced
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import MAX_TOPICS, NewRow, Registry, Topic, normalize_type, options_of
+from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
+from gr_ros2.settings.topic_choice import TopicChoice
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
@@ -70,7 +70,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param ladder: the rungs of an adaptive rate (:attr:`gr_ros2.phy.Phy.ladder`). Each packet then is a PDU whose
         metadata names its ``rung``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
-    :param values: the fields of :class:`gr_ros2.config.SourceConfig`
+    :param values: the fields of :class:`gr_ros2.settings.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
 

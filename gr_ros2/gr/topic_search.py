@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import Middleware, TopicInfo
 from gr_ros2.middleware.graph_search import GraphSearch
 from gr_ros2.middleware.services import ServiceGraph

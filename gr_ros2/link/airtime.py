@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Generic, TypeVar
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 T = TypeVar("T")
 

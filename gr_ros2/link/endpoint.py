@@ -11,15 +11,15 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
-from gr_ros2.config import QueuePolicy, SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Rung
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
-from gr_ros2.registry import NewRow, Registry
+from gr_ros2.settings.config import QueuePolicy, SinkConfig, SourceConfig
+from gr_ros2.settings.registry import NewRow, Registry
 
 LIVE_SETTINGS = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
 """Settings of a sending half that may change at run time, the same in every version."""

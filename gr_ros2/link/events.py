@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from typing import Literal, NamedTuple
 
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.wire import Packet, TableRow
 
 

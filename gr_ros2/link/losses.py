@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from collections import Counter
 
-from gr_ros2.config import BurstLoss, ChannelConfig
+from gr_ros2.settings.config import BurstLoss, ChannelConfig
 
 
 class PduLosses:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from gr_ros2.registry import Topic
+from gr_ros2.settings.registry import Topic
 
 
 class MessageCodec(Protocol):

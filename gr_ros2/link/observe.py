@@ -1,8 +1,8 @@
 """Observers of a link. An observer cannot harm the link.
 
 Invariants: an observer receives every event in order until its first exception; that ends only this observer
-(:class:`gr_ros2.guard.Guard`), and the link and the other observers go on. An observer is called in the thread of the
-event. A slow observer has to be attached through a bounded queue (``gr_ros2.run.observers.RunObservers``).
+(:class:`gr_ros2.core.guard.Guard`), and the link and the other observers go on. An observer is called in the thread of
+the event. A slow observer has to be attached through a bounded queue (``gr_ros2.run.observers.RunObservers``).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Generic, Protocol, TypeVar
 
-from gr_ros2.guard import Guard
+from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 
 

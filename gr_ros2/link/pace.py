@@ -10,7 +10,7 @@ from collections import deque
 from math import inf
 
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
@@ -19,7 +19,7 @@ _INTERVALS = 15
 class Pace:
     """The pace of one sending half.
 
-    :param packet_rate: see :class:`gr_ros2.config.SourceConfig`
+    :param packet_rate: see :class:`gr_ros2.settings.config.SourceConfig`
     """
 
     def __init__(self, packet_rate: float | Auto) -> None:

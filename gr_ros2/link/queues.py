@@ -13,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from gr_ros2.config import QueuePolicy, TopicOptions
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import QueuePolicy, TopicOptions
+from gr_ros2.settings.fields import AUTO
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import exp, inf
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 GAIN_UP, GAIN_DOWN = 1.1, 1.03
 """How many times the present rung's goodput a faster rung, and a slower one, must promise to be taken."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from gr_ros2.config import SinkConfig
-from gr_ros2.errors import CodecError, WireError
+from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
@@ -18,8 +17,9 @@ from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.reassemble import Context, TopicReassembler
 from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.link.stats import ReceiverStats
-from gr_ros2.registry import Registry
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import SinkConfig
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.v0 import V0, Packet
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from gr_ros2.config import SourceConfig
 from gr_ros2.link.fragment import Outgoing, fragment_len
+from gr_ros2.settings.config import SourceConfig
 from gr_ros2.wire.v0 import V0
 
 

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Any
 
-from gr_ros2.config import SourceConfig, replaced
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
@@ -22,8 +21,9 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import TopicQueue
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.registry import Registry
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import SourceConfig, replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.v0 import V0, Entry, Packet
 

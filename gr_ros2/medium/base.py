@@ -16,8 +16,8 @@ from itertools import count, takewhile
 from math import inf
 from typing import NamedTuple
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.link.losses import PduLosses
+from gr_ros2.settings.config import ChannelConfig
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium.base import Medium, PathsAt
 from gr_ros2.medium.flowgraph import FlowgraphMedium
 from gr_ros2.medium.packets import PacketMedium

@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from math import inf
 
-from gr_ros2.config import replaced
 from gr_ros2.medium.base import Medium, Path, PathsAt, Reception, Transmission
 from gr_ros2.phy import Phy
+from gr_ros2.settings.config import replaced
 
 _BATCH_SEEDS = 7919
 """Distance between the seeds of two batches, so that no batch has the noise of a scenario with a neighbouring seed."""

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gr_ros2 import __version__
-from gr_ros2.config import BurstLoss, ChannelConfig, replaced
-from gr_ros2.errors import ConfigError, RunError
-from gr_ros2.files import replacing
+from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.core.files import replacing
 from gr_ros2.phy import Phy
+from gr_ros2.settings.config import BurstLoss, ChannelConfig, replaced
 
 BUILTIN_DIR = Path(__file__).resolve().parent.parent / "losses"
 """Folder of the tables that come with gr-ros2."""

@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.config import ChannelConfig, replaced
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.rate import Rung
 from gr_ros2.medium.base import Medium, Path, Paths, PathsAt, Reception, Transmission
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.medium.loss_table import LossCurve, packet_losses
 from gr_ros2.phy import Phy
+from gr_ros2.settings.config import ChannelConfig, replaced
 
 Floats = NDArray[np.float64]
 

@@ -19,11 +19,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.medium.base import Medium, Path, PathsAt, Reception, Transmission
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.phy import Phy
 from gr_ros2.phy.burst import BurstModem, Heard
+from gr_ros2.settings.config import ChannelConfig
 
 Samples = NDArray[np.complex64]
 Wide = NDArray[np.complex128]

@@ -13,14 +13,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.bag_files import BagContents, BagMessage, bag_contents, bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo
-from gr_ros2.registry import normalize_type
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import normalize_type
 
 __all__ = ["BagMessage", "BagMiddleware", "BagPublisher", "bag_definitions", "bag_topics", "read_bag"]
 

@@ -33,14 +33,14 @@ from rosbags.rosbag2 import Reader, metadata
 from rosbags.rosbag2.reader import DirectoryReader
 from ruamel.yaml import YAML
 
-from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_mcap import McapStorage
 from gr_ros2.middleware.bag_sqlite import SqliteStorage
 from gr_ros2.middleware.base import Qos, TopicInfo, finite
 from gr_ros2.middleware.ros_graph import check_topic
 from gr_ros2.middleware.type_definitions import same_type
-from gr_ros2.names import first
-from gr_ros2.registry import normalize_type
+from gr_ros2.settings.registry import normalize_type
 
 _CDR = "cdr"
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")

@@ -18,7 +18,7 @@ from rosbags.interfaces import Connection, QosDurability, QosHistory, QosLivelin
 from rosbags.interfaces import Qos as Profile
 from rosbags.rosbag2 import StoragePlugin
 
-from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware.bag_files import RecordedTopic, explained
 from gr_ros2.middleware.bag_mcap import BagWriter, TwoTimes
 from gr_ros2.middleware.base import Qos

@@ -17,7 +17,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from gr_ros2.errors import BagError
+from gr_ros2.core.errors import BagError
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 """By rosbag2's name; other names, such as its ``unknown``, mean that there is no definition."""

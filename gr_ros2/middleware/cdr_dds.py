@@ -15,7 +15,7 @@ import ctypes as c
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import dds_library
 from gr_ros2.middleware.base import Qos, finite
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.base import MessageCallback, Qos, TopicInfo, grouped
@@ -41,8 +41,8 @@ from gr_ros2.middleware.services import (
     ServerCallback,
     Witness,
 )
-from gr_ros2.registry import normalize_type
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import normalize_type
 
 _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
 _PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3

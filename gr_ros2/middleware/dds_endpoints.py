@@ -13,7 +13,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterable
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription
 from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter, Sample

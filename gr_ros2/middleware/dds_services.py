@@ -17,7 +17,7 @@ import threading
 from abc import abstractmethod
 from collections.abc import Hashable
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.cdr_dds import DdsError, DiscoveredEndpoint, RawReader, RawWriter
 from gr_ros2.middleware.services import (
     OTHER_RMW,

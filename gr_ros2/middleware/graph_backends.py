@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gr_ros2.backends import Backend, BackendTable
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.backends import Backend, BackendTable
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.base import Middleware
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 
 
 class GraphSearch(ABC):

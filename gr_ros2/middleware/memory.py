@@ -11,15 +11,15 @@ import threading
 from collections import deque
 from weakref import WeakValueDictionary
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered, refused_policies
 from gr_ros2.middleware.base import MessageCallback, Publisher, Qos, TopicInfo, grouped
 from gr_ros2.middleware.delivery import CallbackThread, QueuedSubscription
 from gr_ros2.middleware.memory_services import MemoryClient, MemoryServer, MemoryServices
 from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback, ServiceGraph
-from gr_ros2.registry import normalize_type
-from gr_ros2.setting import Auto
+from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.registry import normalize_type
 
 
 class _Graph:

@@ -11,8 +11,8 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from gr_ros2.errors import MiddlewareError
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.core.errors import MiddlewareError
+from gr_ros2.settings.fields import AUTO, Auto
 
 _environment = threading.Lock()
 

@@ -32,7 +32,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.adapt import Adaptation, Replays, compatible
 from gr_ros2.middleware.base import (
     JOIN_S,
@@ -54,8 +54,8 @@ from gr_ros2.middleware.services import (
     ServerCallback,
     Witness,
 )
-from gr_ros2.registry import normalize_type
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import normalize_type
 
 try:  # its name since Iron
     from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError

@@ -18,9 +18,9 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.names import check_node, check_topic
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import check_node, check_topic
+from gr_ros2.settings.fields import AUTO, Auto
 
 __all__ = [
     "DISCOVERY_TOPIC",

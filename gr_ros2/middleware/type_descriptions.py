@@ -18,7 +18,7 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gr_ros2.errors import DescriptionError
+from gr_ros2.core.errors import DescriptionError
 from gr_ros2.middleware.services import DESCRIPTION_TYPE
 from gr_ros2.middleware.type_definitions import DAMAGED
 

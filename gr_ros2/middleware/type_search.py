@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 
-from gr_ros2.errors import DescriptionError, GrRos2Error, MiddlewareError
+from gr_ros2.core.errors import DescriptionError, GrRos2Error, MiddlewareError
 from gr_ros2.middleware.graph_search import GraphSearch
 from gr_ros2.middleware.services import DESCRIPTION_TYPE, ServiceGraph
 from gr_ros2.middleware.type_definitions import ships

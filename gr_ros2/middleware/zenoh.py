@@ -25,7 +25,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription, TopicInfo, grouped
@@ -41,8 +41,8 @@ from gr_ros2.middleware.zenoh_graph import (
     tokens_of,
     topic_key,
 )
-from gr_ros2.registry import normalize_type
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import normalize_type
 
 _DEFAULTS = {
     "mode": '"peer"',

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from gr_ros2.backends import Backend, BackendTable
-from gr_ros2.config import PhyConfig
+from gr_ros2.core.backends import Backend, BackendTable
 from gr_ros2.phy.base import Phy
+from gr_ros2.settings.config import PhyConfig
 
 _GNURADIO = "GNU Radio 3.10 (apt install gnuradio)"
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import ChannelConfig, Kernels, build
-from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.core.errors import ConfigError, PhyError
 from gr_ros2.link.rate import Rung
+from gr_ros2.settings.config import ChannelConfig, Kernels, build
 
 if TYPE_CHECKING:
     from gr_ros2.phy.burst import BurstModem  # with GNU Radio

@@ -9,11 +9,11 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import PacketLoss
 from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
+from gr_ros2.settings.config import ChannelConfig
 
 
 class Branch(PacketPath, HierBlock):

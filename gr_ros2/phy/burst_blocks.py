@@ -28,7 +28,7 @@ from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 STOCK = "GNU Radio's blocks"
 """Text of ``runs_on`` for PHYs made of GNU Radio's own blocks."""

@@ -15,11 +15,11 @@ from typing import Any
 
 from gnuradio import channels, gr
 
-from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.pdus import PDUS
 from gr_ros2.phy.threads import ThreadState
+from gr_ros2.settings.config import ChannelConfig, replaced
 
 _SINUSOIDS = 16
 """Number of sinusoids that are added to one fading tap; GNU Radio's manual recommends 8 or more."""

@@ -21,7 +21,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.core.errors import BackendMissingError
 
 Bits = NDArray[np.uint8]
 Soft = NDArray[np.float32]

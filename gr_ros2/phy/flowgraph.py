@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from gnuradio import gr
 
-from gr_ros2.errors import PhyError
+from gr_ros2.core.errors import PhyError
 from gr_ros2.phy.base import SymbolSource
 from gr_ros2.phy.preferences import check_preferences
 from gr_ros2.phy.threads import start_flowgraph

@@ -11,7 +11,6 @@ import weakref
 from collections.abc import Sequence
 from typing import Any
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
@@ -21,6 +20,7 @@ from gr_ros2.phy.delay import PacketDelay
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.phy.window import CreditWindow
+from gr_ros2.settings.config import ChannelConfig
 
 
 class LoopbackLink(PacketPath, Flowgraph):

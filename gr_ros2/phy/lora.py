@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
@@ -24,7 +24,7 @@ from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.linear import parabola_peak
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 MAX_BURST = 1 << 22
 """Most samples of a burst; a longer burst would take more memory than small computers have."""

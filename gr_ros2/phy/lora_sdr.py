@@ -20,7 +20,7 @@ from gnuradio import filter, gr, pdu
 from gnuradio.fft import window
 from gnuradio.filter import firdes
 
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
 from gr_ros2.phy.burst_blocks import TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock

@@ -16,13 +16,13 @@ import numpy.typing as npt
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import PhyError
+from gr_ros2.core.errors import PhyError
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import PDUS, pdu_of
 from gr_ros2.phy.threads import run_flowgraph
+from gr_ros2.settings.config import ChannelConfig
 
 _PATIENCE_S = 60.0
 _POLL_S = 0.002

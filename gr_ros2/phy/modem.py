@@ -10,8 +10,8 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import Seconds
 from gr_ros2.phy.base import PacketPhy
+from gr_ros2.settings.config import Seconds
 
 BITS = 8
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.rate import Rung
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
@@ -21,7 +21,7 @@ from gr_ros2.phy.ofdm_modem import OfdmLadder, OfdmModem
 from gr_ros2.phy.ofdm_rate import RUNGS, rung_of
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 RungName = Literal["bpsk-cc", "qpsk-cc", "8psk-cc", "16qam-cc", "64qam-cc", "16qam", "64qam"]
 

@@ -17,7 +17,7 @@ from gnuradio import digital
 from gnuradio.digital import ofdm_txrx
 from numpy.typing import NDArray
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.length_word import WORD_BITS
 
 BITS = {"bpsk": 1, "qpsk": 2, "8psk": 3, "16qam": 4, "64qam": 6}

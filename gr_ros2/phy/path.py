@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gr_ros2.config import ChannelConfig, replaced
-from gr_ros2.errors import PhyError
+from gr_ros2.core.errors import PhyError
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy, SymbolSource
 from gr_ros2.phy.channel import Channel, PacketLoss
 from gr_ros2.phy.tap import Samples, Tap
+from gr_ros2.settings.config import ChannelConfig, replaced
 
 _LOOK = 1024
 """Samples of one snapshot of the received signal."""

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gr_ros2.errors import PhyError
+from gr_ros2.core.errors import PhyError
 
 TRIAL = """
 from gnuradio import blocks, fft, gr

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any, ClassVar
 
-from gr_ros2.backends import uninterrupted
-from gr_ros2.errors import PhyError
+from gr_ros2.core.backends import uninterrupted
+from gr_ros2.core.errors import PhyError
 
 SWITCH_INTERVAL_S = 5e-5
 """Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
@@ -54,7 +54,7 @@ from gr_ros2.phy.wifi_frames import (
     scrambler,
     training,
 )
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 _TX_KEY = "packet_len"
 """The length tag of the module's blocks, which cannot be changed."""

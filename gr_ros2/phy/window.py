@@ -12,7 +12,7 @@ from collections.abc import Callable
 import pmt
 from gnuradio import gr
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.pdus import CREDIT
 from gr_ros2.phy.threads import BlockThread
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 Stack = Literal["gr-ros2", "dds", "zenoh"]
 

@@ -19,7 +19,6 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link import ReceiverEvent, SenderEvent
@@ -32,7 +31,8 @@ from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
 from gr_ros2.race.tun import Tun, loopback_up
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
 
 DOMAINS = (1, 2)
 """DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""

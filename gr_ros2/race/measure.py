@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.race_settings import RaceRecording
 from gr_ros2.record.metrics import age, latency
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 
 Floats = npt.NDArray[np.float64]
 

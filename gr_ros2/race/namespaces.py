@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 
 T = TypeVar("T")
 

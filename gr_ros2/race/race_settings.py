@@ -15,14 +15,14 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import PacketLen, Packets, Sampled, Seconds, Text, Traffic
-from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import PacketLen, Packets, Sampled, Seconds, Text, Traffic
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire.v0 import V0

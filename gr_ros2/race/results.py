@@ -18,7 +18,7 @@ import pyarrow.parquet as pa_parquet
 from matplotlib.figure import Figure
 
 from gr_ros2 import __version__
-from gr_ros2.files import write_text, write_whole
+from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.race.contenders import CONTENDERS
 from gr_ros2.race.measure import COLUMNS, RaceCell, ahead, by_condition, shown, winners
 from gr_ros2.race.race_settings import dump

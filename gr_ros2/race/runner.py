@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.race.contenders import Contender, chosen
 from gr_ros2.race.endpoints import RacePublisher, RaceSubscriber, RaceTopic
 from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink

@@ -15,7 +15,7 @@ import struct
 import subprocess
 from pathlib import Path
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.race.namespaces import inside
 
 INTERFACE = "air0"

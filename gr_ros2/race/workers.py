@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from gr_ros2.errors import GrRos2Error, RunError
+from gr_ros2.core.errors import GrRos2Error, RunError
 from gr_ros2.race.namespaces import enter
 
 _START_S = 60.0

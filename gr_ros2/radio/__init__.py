@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from gr_ros2.backends import Backend, BackendTable
+from gr_ros2.core.backends import Backend, BackendTable
 
 
 @dataclass(frozen=True)

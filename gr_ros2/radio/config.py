@@ -13,14 +13,14 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import AnyLink, DiagnosticsConfig, Text, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
-from gr_ros2.registry import Registry, check_outputs
-from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.config import AnyLink, DiagnosticsConfig, Text, build
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.files import SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.registry import Registry, check_outputs
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
@@ -79,7 +79,8 @@ class LinkConfig(AnyLink):
         """Load the registry.
 
         :raises RegistryError: for a wrong file; the message names file, line and problem
-        :raises ConfigError: when the sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
+        :raises ConfigError: when the sink could not publish its topics, see
+            :func:`gr_ros2.settings.registry.check_outputs`
         """
         if not self.registry:
             return Registry.empty()

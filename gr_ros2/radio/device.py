@@ -17,13 +17,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, Count, Seconds, Text
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters, Hertz, SharedAir
 from gr_ros2.radio.stream_events import BURSTS_OUT, GapCounter
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.config import STRICT, Count, Seconds, Text
+from gr_ros2.settings.fields import AUTO, Auto
 
 TOLERANCE = 1e-4
 """Largest relative error of sample rate and frequency. The PHYs are made for clocks within 100 ppm."""

@@ -13,11 +13,11 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gr_ros2.config import DiagnosticsConfig
-from gr_ros2.errors import GrRos2Error
+from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.gr.health import LinkHealth, Status
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.type_definitions import typestore
+from gr_ros2.settings.config import DiagnosticsConfig
 
 DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 STATISTICS_TYPE = "std_msgs/msg/String"

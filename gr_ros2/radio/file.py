@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndCounters, FrontEndOptions
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
+from gr_ros2.settings.config import STRICT
 
 _STEP_S = 0.005
 _LONGEST_WAIT_S = 0.1

@@ -14,9 +14,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, Seconds, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import Phy
+from gr_ros2.settings.config import STRICT, Seconds, build
 
 AGAIN_MS = 1
 """Time after which GNU Radio calls a source without data again, ms; its default is 250 ms."""

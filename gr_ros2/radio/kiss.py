@@ -11,11 +11,11 @@ from typing import Annotated
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
 from gr_ros2.radio.ax25 import HEADER_LEN, Callsign, information, ui_header
 from gr_ros2.radio.framing import Kiss
 from gr_ros2.radio.packet_port import Connection, PacketFrontEnd
 from gr_ros2.radio.serial_device import StreamOptions, open_stream
+from gr_ros2.settings.config import STRICT
 
 _MAX_PORT = 15
 

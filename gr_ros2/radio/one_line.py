@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, FrontEndBackend
-from gr_ros2.setting import AUTO
-from gr_ros2.topic_choice import words_of
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.topic_choice import words_of
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.pdus import PDUS, octets, pdu_of
 from gr_ros2.phy.threads import BlockThread

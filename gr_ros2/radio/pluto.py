@@ -26,12 +26,12 @@ from gnuradio import blocks, iio
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
 from gr_ros2.radio.front_end import Hertz
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.config import STRICT
+from gr_ros2.settings.fields import AUTO, Auto
 
 SLOWEST, FASTEST = 521e3, 61.44e6
 """Range of the sample rate, samples/s. Below 2.083 million, GNU Radio's block loads a decimating filter by itself."""

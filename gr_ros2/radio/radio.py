@@ -12,8 +12,7 @@ from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.channel import PacketLoss
@@ -22,6 +21,7 @@ from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
+from gr_ros2.settings.config import ChannelConfig, build
 
 
 class Radio(PacketPath, HierBlock):
@@ -159,8 +159,8 @@ def make_radio(
     :param sample_rate: samples/s; ignored by a PHY without samples
     :param front_end: a name of ``gr_ros2.radio.FRONT_ENDS``
     :param phy_options: further settings of the PHY
-    :param channel: settings of :class:`gr_ros2.config.ChannelConfig`, for front ends without a radio. If they are
-        given, even empty, they can be changed while the radio runs
+    :param channel: settings of :class:`gr_ros2.settings.config.ChannelConfig`, for front ends without a radio. If they
+        are given, even empty, they can be changed while the radio runs
     :param record: SigMF recording to write of all samples received, '' = none
     :param options: settings of the front end
     :raises ConfigError: for an unknown name or setting, or a value out of range

@@ -14,7 +14,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-from gr_ros2.config import SinkConfig
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import own_settings
@@ -27,8 +26,9 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.radio import Radio
-from gr_ros2.registry import Registry
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.config import SinkConfig
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import Registry
 
 _log = logging.getLogger(__name__)
 

@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
 from gr_ros2.radio.framing import Cobs, Framing, Slip
 from gr_ros2.radio.packet_port import Connection, PacketFrontEnd
 from gr_ros2.radio.serial_device import StreamOptions, open_stream
+from gr_ros2.settings.config import STRICT
 
 _FRAMINGS: dict[str, type[Framing]] = {"cobs": Cobs, "slip": Slip}
 

@@ -13,11 +13,11 @@ import serial
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import SharedAir
 from gr_ros2.radio.packet_port import StreamConnection
+from gr_ros2.settings.config import STRICT
 
 _TCP = "tcp://"
 _CONNECT_S = 3.0

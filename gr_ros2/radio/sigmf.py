@@ -19,10 +19,10 @@ from gnuradio import gr
 from numpy.typing import NDArray
 
 from gr_ros2 import __version__
-from gr_ros2.backlog import Backlog
-from gr_ros2.errors import ConfigError, RadioError
-from gr_ros2.files import replacing
-from gr_ros2.guard import Guard, one_line
+from gr_ros2.core.backlog import Backlog
+from gr_ros2.core.errors import ConfigError, RadioError
+from gr_ros2.core.files import replacing
+from gr_ros2.core.guard import Guard, one_line
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
 

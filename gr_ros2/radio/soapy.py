@@ -7,11 +7,11 @@ from typing import Any
 
 from gnuradio import soapy
 
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.device import DeviceFrontEnd
 from gr_ros2.radio.soapy_sink import SoapySink
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
 
 _CHANNEL = 0
 

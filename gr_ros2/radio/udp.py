@@ -14,10 +14,10 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.radio.front_end import SharedAir
 from gr_ros2.radio.packet_port import Connection, PacketFrontEnd
+from gr_ros2.settings.config import STRICT
 
 _AT_ONCE = 64
 """Datagrams that are read before the connection is written again."""

@@ -12,12 +12,12 @@ from gnuradio import uhd
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT, Text
 from gr_ros2.phy import Phy
 from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
 from gr_ros2.radio.stream_events import UsrpEvents
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import STRICT, Text
+from gr_ros2.settings.fields import AUTO
 
 _CHANNEL = 0
 

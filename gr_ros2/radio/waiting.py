@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from gr_ros2.core.names import INFRASTRUCTURE
 from gr_ros2.middleware import TopicInfo
-from gr_ros2.names import INFRASTRUCTURE
 
 if TYPE_CHECKING:
     from gr_ros2.gr import RosSource

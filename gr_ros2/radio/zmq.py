@@ -30,12 +30,12 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import STRICT
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndCounters, FrontEndOptions
+from gr_ros2.settings.config import STRICT
 
 HEADER = struct.Struct("<4sIQd")
 """Magic, number of the sender (random at each start), number of the burst, samples/s. The samples follow as complex64,

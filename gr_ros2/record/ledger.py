@@ -18,7 +18,7 @@ from math import isnan, nan
 from threading import Lock
 from typing import get_args
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.link.events import (
     Accepted,
     AirKind,

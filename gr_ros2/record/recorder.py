@@ -18,7 +18,7 @@ from gr_ros2.record.path_error import path_error, rms_error
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
 from gr_ros2.record.trace import Floats, PacketLog, Trace, Track, make_trace
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.registry import Registry, Topic
 
 
 class Recorder:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.files import write_text, write_whole
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.record.result import Result, TopicResult, topic_numbers
 from gr_ros2.record.statistics import CONFIDENCE, Estimate, average
 

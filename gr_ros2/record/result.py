@@ -17,8 +17,8 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.files import write_text, write_whole
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.files import write_text, write_whole
 
 RESULT_FILE = "result.json"
 

@@ -24,8 +24,8 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
-from gr_ros2.errors import ConfigError
-from gr_ros2.files import write_whole
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.files import write_whole
 from gr_ros2.link.events import SentPacket
 from gr_ros2.record.ledger import TopicLedger
 

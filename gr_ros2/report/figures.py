@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.ledger_rows import row_order
 from gr_ros2.record.result import AirUse
 from gr_ros2.report.colours import AIR_COLOURS, COLOURS, row_colour

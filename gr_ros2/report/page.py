@@ -21,8 +21,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from gr_ros2 import __version__
-from gr_ros2.errors import ConfigError
-from gr_ros2.files import write_text, write_whole
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers

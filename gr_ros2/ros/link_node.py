@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from gr_ros2.errors import ConfigError, GrRos2Error
+from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.radio.config import load_link
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.waiting import Waiting

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass
 from typing import Any
 
-from gr_ros2.setting import Setting, members, settings_of
+from gr_ros2.settings.fields import Setting, members, settings_of
 
 Plain = bool | int | float | str | list[str] | None
 

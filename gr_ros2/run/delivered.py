@@ -15,14 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-from gr_ros2.errors import BagError, ConfigError
-from gr_ros2.files import make_folder
+from gr_ros2.core.errors import BagError, ConfigError
+from gr_ros2.core.files import make_folder
 from gr_ros2.link.events import Delivered
 from gr_ros2.middleware.bag_files import RecordedTopic, read_bag
 from gr_ros2.middleware.bag_recorder import BagChannel, BagRecorder
 from gr_ros2.middleware.base import Qos
-from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.registry import Registry
 
 
 class DeliveredBag:

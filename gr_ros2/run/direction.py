@@ -15,7 +15,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from gr_ros2.config import ChannelConfig, SinkConfig, SourceConfig, replaced
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
 from gr_ros2.link.endpoint import Endpoint
@@ -26,11 +25,12 @@ from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
-from gr_ros2.registry import Registry
 from gr_ros2.run.load import recorded_names, source_names
 from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig, replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry
 
 _QUIET_S = 0.3
 """A PHY is empty if nothing waits for it and it has given no packet for this time."""

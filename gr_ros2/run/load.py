@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gr_ros2.config import replaced
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy, configured
-from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.wire import Format
 

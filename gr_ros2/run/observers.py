@@ -12,16 +12,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from gr_ros2.backlog import Backlog
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import RunError
-from gr_ros2.guard import Guard
+from gr_ros2.core.backlog import Backlog
+from gr_ros2.core.errors import RunError
+from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.settings.registry import Registry
 
 if TYPE_CHECKING:  # they need GNU Radio, and a run in simulated time by packets does not
     from gr_ros2.gr import RosSource

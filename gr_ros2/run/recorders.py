@@ -11,9 +11,9 @@ from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import ReceiverResult
-from gr_ros2.registry import Registry
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.registry import Registry
 
 
 def make_recorder(
@@ -98,7 +98,7 @@ class FurtherRecorders:
         return self._observers[number - 1]
 
     def check(self) -> None:
-        """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.guard.Guard.check`"""
+        """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.core.guard.Guard.check`"""
         for guard in self._guards:
             guard.check()
 

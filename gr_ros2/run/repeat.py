@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from gr_ros2.config import ChannelConfig, replaced
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.config import ChannelConfig, replaced
 
 
 def repetitions(scenario: Scenario) -> Iterator[Scenario]:

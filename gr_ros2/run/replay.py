@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from gr_ros2.config import TopicOptions, replaced
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.core.errors import BagError, ConfigError
+from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
-from gr_ros2.names import first
-from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
 from gr_ros2.run.outcome import Outcome, Progress
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulated_runner import run_simulated
+from gr_ros2.settings.config import TopicOptions, replaced
+from gr_ros2.settings.registry import Registry
 
 _STORAGES: dict[str, Literal["mcap", "sqlite3"]] = {".mcap": "mcap", ".db3": "sqlite3"}
 """Storage of a single bag file, by its suffix. A path with any other suffix is a bag folder."""

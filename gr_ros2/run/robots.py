@@ -11,12 +11,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gr_ros2.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.gr.ends import Start
 from gr_ros2.link.rate import Rung
 from gr_ros2.medium.base import Path, Paths, PathsAt
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire import BROADCAST
 
 THERMAL_DBM_HZ = -174.0

@@ -15,10 +15,10 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-from gr_ros2.errors import BagError, ConfigError, MiddlewareError, RunError
-from gr_ros2.files import make_folder, write_whole
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
+from gr_ros2.core.files import make_folder, write_whole
+from gr_ros2.core.guard import Guard, one_line
 from gr_ros2.gr.ends import LiveEnd
-from gr_ros2.guard import Guard, one_line
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.link.v1.endpoint_settings import robot_of

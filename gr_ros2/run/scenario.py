@@ -16,7 +16,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import (
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.phy import PHY
+from gr_ros2.settings.config import (
     STRICT,
     AnyLink,
     ChannelConfig,
@@ -29,12 +32,9 @@ from gr_ros2.config import (
     build,
     replaced,
 )
-from gr_ros2.errors import ConfigError
-from gr_ros2.middleware import MIDDLEWARE
-from gr_ros2.phy import PHY
-from gr_ros2.registry import Registry, check_outputs
-from gr_ros2.setting import Auto
-from gr_ros2.settings_file import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire import BROADCAST
 
@@ -213,7 +213,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         """The registry of both ends.
 
         :raises RegistryError: when the file is wrong; names file, line and problem
-        :raises ConfigError: when a sink could not publish its topics, see :func:`gr_ros2.registry.check_outputs`
+        :raises ConfigError: when a sink could not publish its topics, see
+            :func:`gr_ros2.settings.registry.check_outputs`
         """
         registry = Registry.from_csv(self.registry)
         for way in self.directions():

@@ -20,7 +20,7 @@ from functools import lru_cache
 from math import inf
 from typing import Any
 
-from gr_ros2.errors import BagError, ConfigError, RunError
+from gr_ros2.core.errors import BagError, ConfigError, RunError
 from gr_ros2.gr.ends import Start, make_endpoint
 from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
@@ -34,10 +34,10 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
-from gr_ros2.registry import Registry
 from gr_ros2.run.load import make_phys, recorded_names, source_names
 from gr_ros2.run.robots import Halves, halves_of_robots, paths_at, start_of_run
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
 

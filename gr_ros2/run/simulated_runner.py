@@ -15,12 +15,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.guard import Guard
+from gr_ros2.core.guard import Guard
 from gr_ros2.link import ReceiverEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
-from gr_ros2.registry import Registry
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObservers
@@ -29,6 +28,7 @@ from gr_ros2.run.recorders import Ear, FurtherRecorders, make_recorder
 from gr_ros2.run.robots import ears_of, recorder_of
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import Simulation, pass_on
+from gr_ros2.settings.registry import Registry
 
 _REPORT_S = 0.05
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.driver import Driver
 from gr_ros2.sim.motion import RADIUS, TICK, State
 from gr_ros2.sim.roadmap import Roadmap

@@ -12,9 +12,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.base import Middleware, Publisher, Qos
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.transforms import TransformPublisher
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.queues import queue_for
 from gr_ros2.record.result import Result
 from gr_ros2.report.page import Run, read_runs

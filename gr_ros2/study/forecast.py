@@ -14,19 +14,19 @@ from typing import Any, get_args
 
 import numpy as np
 
-from gr_ros2.config import replaced
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.events import AirKind
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
-from gr_ros2.registry import Topic
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import Simulated, offered, simulate
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Topic
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from gr_ros2.errors import (
+from gr_ros2.core.errors import (
     CrcError,
     EncodeError,
     EntryBoundsError,

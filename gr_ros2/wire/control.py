@@ -9,7 +9,7 @@ from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
 
-from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError
+from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 
 _HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
 

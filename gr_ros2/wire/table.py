@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
+from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
 from gr_ros2.wire.format import QOS_NAMES
 
 _FORMAT = 1

@@ -12,7 +12,7 @@ from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
 
-from gr_ros2.errors import (
+from gr_ros2.core.errors import (
     CrcError,
     EncodeError,
     EntryBoundsError,

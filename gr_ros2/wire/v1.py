@@ -18,7 +18,7 @@ from struct import error as struct_error
 from typing import NamedTuple
 from zlib import crc32
 
-from gr_ros2.errors import (
+from gr_ros2.core.errors import (
     CrcError,
     EncodeError,
     EntryBoundsError,

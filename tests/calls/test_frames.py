@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.calls.frames import Frame, read_frame, write_frame
-from gr_ros2.errors import EncodeError, EntryBoundsError, EntryKindError, WireError
+from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, WireError
 
 numbers = {
     "dst_id": st.integers(0, 254),

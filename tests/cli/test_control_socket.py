@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.cli.control_socket import ControlSocket, folder, request, running_programs
-from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.core.errors import ConfigError, RunError
 from tests.waiting import PATIENCE_S, wait_for
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from gr_ros2.cli.dashboard import parse_place
 from gr_ros2.cli.main import run
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 
 
 @pytest.mark.parametrize(

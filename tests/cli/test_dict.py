@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from gr_ros2.cli.dict import group
 from gr_ros2.compression import load
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.core.errors import BagError, ConfigError
 from tests.compression.support import STORE, codec_for, simulated
 
 ODOMETRY = "nav_msgs/msg/Odometry"

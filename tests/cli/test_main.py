@@ -10,7 +10,7 @@ import pytest
 
 from gr_ros2 import __version__
 from gr_ros2.cli import main as command
-from gr_ros2.errors import BackendMissingError, BagError, ConfigError, CrcError, GrRos2Error, PhyError, RunError
+from gr_ros2.core.errors import BackendMissingError, BagError, ConfigError, CrcError, GrRos2Error, PhyError, RunError
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["-h"], []])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.cli.capture import packets_in
 from gr_ros2.cli.main import run
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.wire.control import Hello
 from gr_ros2.wire.v0 import V0, Entry, Packet

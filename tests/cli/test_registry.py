@@ -11,11 +11,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from gr_ros2.cli.main import run
 from gr_ros2.cli.registry import registry_csv, unfit
-from gr_ros2.config import TopicOptions
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Qos, TopicInfo
-from gr_ros2.registry import Registry
-from gr_ros2.service_rows import rows_of
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.service_rows import rows_of
 from tests.domains import domain
 from tests.waiting import wait_for
 

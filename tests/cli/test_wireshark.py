@@ -16,11 +16,11 @@ import pytest
 from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
-from gr_ros2.errors import ConfigError, WireError
+from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.events import Received, SentPacket
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.registry import Registry
 from gr_ros2.run.scenario import load_scenario
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, Packet
 from gr_ros2.wire.v1 import Header, crc, session_crc, write_header
 from gr_ros2.wire.v1 import decode as read
@@ -131,7 +131,7 @@ def test_topics_have_names_with_the_registry_and_times_and_directions_are_kept(r
     assert [topic.name for topic in Registry.from_csv(registry)] == ["/a", "odom"]
     vector = next(one for one in VECTORS["valid"] if any(entry["topic_id"] == 1 for entry in one["packet"]["entries"]))
     path = capture(tmp_path / "named.pcapng", [bytes.fromhex(vector["hex"])] * 2)
-    arguments = ["-o", f"gr_ros2.registry:{registry}", "-T", "fields"]
+    arguments = ["-o", f"gr_ros2.settings.registry:{registry}", "-T", "fields"]
     for field in ("gr_ros2.topic", "frame.interface_name", "frame.time_relative"):
         arguments += ["-e", field]
     rows = [line.split("\t") for line in tshark(path, *arguments).splitlines()]

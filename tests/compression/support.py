@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
-from gr_ros2.config import TopicOptions
-from gr_ros2.registry import Registry, Topic, normalize_type
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic, normalize_type
 from gr_ros2.sim import Fleet, SimSettings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

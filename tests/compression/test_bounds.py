@@ -17,7 +17,7 @@ from gr_ros2.compression.prepared import Prepared
 from gr_ros2.compression.schema import Types
 from gr_ros2.compression.train import learn
 from gr_ros2.compression.zstd_frames import Zstd, read_varint
-from gr_ros2.errors import DamagedError
+from gr_ros2.core.errors import DamagedError
 from tests.compression.support import codec_for
 
 HEADER = b"\0\1\0\0"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.compression import bulk
 from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
-from gr_ros2.errors import DamagedError
+from gr_ros2.core.errors import DamagedError
 
 special = st.sampled_from([math.inf, -math.inf, math.nan, -0.0])
 ranges = st.lists(st.floats(0, 100) | special, min_size=1, max_size=99)

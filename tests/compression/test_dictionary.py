@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from gr_ros2.compression import load, shipped
 from gr_ros2.compression.dictionary import SHIPPED
 from gr_ros2.compression.train import learn
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from tests.compression.support import Writer, codec_for, simulated
 
 DIGESTS = {

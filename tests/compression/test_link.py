@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.config import SinkConfig
 from gr_ros2.link import Delivered, Lost, Received, Receiver, ReceiverEvent
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.compression.support import simulated
 

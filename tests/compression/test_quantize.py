@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.compression.quantize import LARGEST, parse_steps
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from tests.compression.support import STORE, Writer, codec_for, simulated
 
 POSE = "geometry_msgs/msg/Pose"

@@ -19,10 +19,10 @@ from gr_ros2.compression.dictionary import shipped
 from gr_ros2.compression.floats import class_table
 from gr_ros2.compression.schema import tree_of
 from gr_ros2.compression.train import learn
-from gr_ros2.config import TopicOptions
-from gr_ros2.errors import CodecError
+from gr_ros2.core.errors import CodecError
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 from tests.compression import second_decoder as second
 from tests.compression.support import STORE, Writer
 from tests.recordings import HUSKY, SIMULATED, Drive

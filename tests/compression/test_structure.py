@@ -14,7 +14,7 @@ from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.schema import Composite, tree_of
 from gr_ros2.compression.structure import MAX_BYTES, MAX_DEPTH, read_structure, write_structure
 from gr_ros2.compression.zstd_frames import Zstd
-from gr_ros2.errors import CodecError
+from gr_ros2.core.errors import CodecError
 from tests.compression.support import STORE, Writer
 
 

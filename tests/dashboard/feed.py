@@ -6,11 +6,11 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.link import Receiver, Sender
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.record.positions import humble_types
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
 
 REGISTRY = Registry.from_rows({"at": "geometry_msgs/PointStamped", "raw": "my_msgs/Thing"})
 SRC = 4

@@ -23,10 +23,10 @@ from bokeh.document import Document
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard import admission
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
-from gr_ros2.errors import ConfigError
 from tests.waiting import PATIENCE_S, wait_for
 
 PULL = ('{"msgid": "1", "msgtype": "PULL-DOC-REQ"}', "{}", "{}")

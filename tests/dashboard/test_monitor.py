@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 
+from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.errors import RunError
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
 from tests.waiting import wait_for

@@ -15,10 +15,10 @@ pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 
 from bokeh.document import Document
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
-from gr_ros2.errors import ConfigError
 from tests.dashboard.feed import NAMES, REGISTRY, Feed, at
 from tests.waiting import PATIENCE_S
 

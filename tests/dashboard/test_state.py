@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gr_ros2.config import TopicOptions
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.link.events import Accepted, Announced, Delivered, SentPacket
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
-from gr_ros2.registry import Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Topic
 from gr_ros2.wire.table import Row
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
 from tests.link.v1.air import Robot, registry

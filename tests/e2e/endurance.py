@@ -16,7 +16,7 @@ from gnuradio import gr
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.middleware.support import STRING, message
 from tests.waiting import wait_for

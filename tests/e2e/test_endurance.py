@@ -11,14 +11,14 @@ import threading
 import pytest
 from gnuradio import gr
 
-from gr_ros2.config import SourceConfig
 from gr_ros2.gr import RosSource
 from gr_ros2.link import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.ofdm import OfdmPhy
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Probe
 from tests.middleware.support import STRING

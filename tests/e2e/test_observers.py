@@ -19,7 +19,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
-from gr_ros2.errors import ConfigError, CrcError, RunError
+from gr_ros2.core.errors import ConfigError, CrcError, RunError
 from gr_ros2.link.events import ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from gr_ros2.record.ledger import Ledger

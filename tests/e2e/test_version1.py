@@ -15,7 +15,7 @@ from gr_ros2.record.result import Result
 from gr_ros2.run.observers import LiveRun
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, scenario_from
-from gr_ros2.settings_file import find_registry
+from gr_ros2.settings.files import find_registry
 from gr_ros2.wire.control import Report
 from tests.domains import free_domains
 from tests.e2e.support import check_books, delivered_bag

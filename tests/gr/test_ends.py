@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, replaced
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import Graph, check_loop, read_registry, settings
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, replaced
+from gr_ros2.settings.registry import Registry
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
 

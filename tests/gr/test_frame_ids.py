@@ -17,8 +17,7 @@ from rosbags.typesys.store import Typestore
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.frame_ids import MAX_STATIC, TF_TYPE, FramePrefix, MergedTransforms, StaticTransforms, prefixed_frame
 from gr_ros2.link import Sender
@@ -27,7 +26,8 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Hears
 from tests.waiting import wait_for

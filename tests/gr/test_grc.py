@@ -24,15 +24,15 @@ from gnuradio import gr
 from gnuradio.grc.core.platform import Platform
 from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
 
-from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ros_link import make_link
-from gr_ros2.grc_path import example, grc_path
+from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
+from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.config import DiagnosticsConfig
 from gr_ros2.gr.health import Level, LinkHealth, Status
+from gr_ros2.settings.config import DiagnosticsConfig
 
 
 def stats(**changes: Any) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from gnuradio import gr
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link.events import Announced
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Hears
 from tests.middleware.describing import CUSTOM, message

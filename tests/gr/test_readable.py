@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from gr_ros2.errors import LengthError
+from gr_ros2.core.errors import LengthError
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.link import Received, Rejected, SentPacket
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import Entry, Packet
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})

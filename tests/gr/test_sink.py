@@ -18,14 +18,14 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import pmt
 from gnuradio import gr
 
-from gr_ros2.config import SourceConfig
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.latency import LatencySummary, LatencyWindow
 from gr_ros2.link import Delivered, Lost, Received, Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.registry import Registry
 from tests.gr.probe import Hears, Probe
 from tests.waiting import PATIENCE_S, wait_for
 

@@ -15,13 +15,13 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import pmt
 from gnuradio import gr
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.record.recorder import Recorder
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0
 from tests.domains import free_domains
 from tests.gr.probe import Hears, Probe

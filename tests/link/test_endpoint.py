@@ -7,9 +7,9 @@ from math import inf
 
 import pytest
 
-from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Delivered, Endpoint, EndpointV0, Lost, SenderEvent, SentPacket
+from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.link.engines import registry
 
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import pytest
 
-from gr_ros2.config import SinkConfig, build
 from gr_ros2.link import Delivered, Receiver
+from gr_ros2.settings.config import SinkConfig, build
 from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.link.engines import delivered, receiver, registry
 from tests.link.test_receiver import packet

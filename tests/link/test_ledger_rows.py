@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import gr_ros2
-from gr_ros2.errors import CodecError
+from gr_ros2.core.errors import CodecError
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow, row_order
 
 ROOT = Path(gr_ros2.__file__).parent

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.config import BurstLoss, ChannelConfig
 from gr_ros2.link.losses import GilbertElliott, PduLosses
+from gr_ros2.settings.config import BurstLoss, ChannelConfig
 
 COUNT = 200_000
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from gr_ros2.config import SinkConfig, SourceConfig, build
 from gr_ros2.link import Delivered, Receiver, Sender, SenderEvent, SentPacket
 from gr_ros2.link.events import SentEntry
+from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from tests.link.engines import registry
 
 MESSAGES = 50_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gr_ros2.errors import CrcError
+from gr_ros2.core.errors import CrcError
 from gr_ros2.link.events import Accepted, Delivered, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 

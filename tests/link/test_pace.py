@@ -7,7 +7,7 @@ from math import inf
 import pytest
 
 from gr_ros2.link.pace import Pace
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
 
 
 def test_without_rate_and_credits_packets_leave_at_once() -> None:

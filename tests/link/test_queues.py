@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import TopicOptions, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.queues import TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions, build
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.engines import sender
 from tests.link.v1.air import Robot

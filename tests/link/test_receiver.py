@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import TopicOptions
 from gr_ros2.link import Delivered, Lost, Rejected
+from gr_ros2.settings.config import TopicOptions
 from gr_ros2.wire.v0 import V0, Entry, Packet
 from tests.link.engines import delivered, drain, receiver, sender, take
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions, build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Accepted, Missed, Receiver, Refused, Sender, SenderEvent, SentPacket
 from gr_ros2.link.schedule import PaperScheduler
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.registry import Registry
 from tests.link.engines import delivered, drain, read, registry, sender, trace
 
 

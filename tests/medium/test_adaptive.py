@@ -10,8 +10,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.medium import Path as Way
 from gr_ros2.medium import make_medium
@@ -23,7 +22,8 @@ from gr_ros2.run.observers import RunObservers
 from gr_ros2.run.scenario import Scenario, scenario_from
 from gr_ros2.run.simulate import simulate
 from gr_ros2.run.simulated_runner import run_simulated
-from gr_ros2.settings_file import find_registry
+from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.settings.files import find_registry
 
 
 class Rungs:

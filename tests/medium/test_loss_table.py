@@ -11,11 +11,11 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.medium import loss_table
 from gr_ros2.medium.loss_table import LossTable, Point, measure, neighbours, packet_losses, setting_of, table_for
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.settings.config import ChannelConfig
 
 PACKETS = 200
 

@@ -10,11 +10,11 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium import Medium, Path, Reception, make_medium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.settings.config import ChannelConfig
 
 PACKET_LEN = 64
 

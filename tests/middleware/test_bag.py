@@ -13,7 +13,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 
-from gr_ros2.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, TopicInfo, bag_files, bag_recorder
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher, bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagRecorder

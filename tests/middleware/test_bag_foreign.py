@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.core.errors import BagError, ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, bag_topics, read_bag

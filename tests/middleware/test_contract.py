@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.errors import BackendMissingError, ConfigError, GrRos2Error, MiddlewareError
+from gr_ros2.core.errors import BackendMissingError, ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.middleware import MIDDLEWARE, Middleware, Qos
 from tests.domains import domain
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, message, same

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Qos, cdr_dds, ros_graph
 from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader

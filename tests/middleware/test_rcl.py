@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.rcl import node_of, ros_localhost_only, translated
-from gr_ros2.setting import Auto
+from gr_ros2.settings.fields import Auto
 
 NAME = "ROS_LOCALHOST_ONLY"
 

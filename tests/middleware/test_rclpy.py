@@ -23,14 +23,14 @@ import rclpy.node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header, String
 
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.rclpy import RclpyMiddleware, message_class
 from gr_ros2.middleware.services import Witness
 from gr_ros2.middleware.type_definitions import type_hash
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.setting import Auto
+from gr_ros2.settings.fields import Auto
 from tests.domains import domain
 from tests.waiting import PATIENCE_S, wait_for
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.errors import ConfigError, MiddlewareError
+from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware import Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.base import MessageCallback
 from gr_ros2.middleware.rclpy_services import MAX_PENDING, RclpyClient, RclpyParticipant, RclpyServer, service_class

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.type_definitions import (
     UNKNOWN,
@@ -17,7 +17,7 @@ from gr_ros2.middleware.type_definitions import (
     type_hash,
     typestores,
 )
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.fields import AUTO, Auto
 
 NAME = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 

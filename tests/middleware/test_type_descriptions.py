@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from gr_ros2.errors import DescriptionError
+from gr_ros2.core.errors import DescriptionError
 from gr_ros2.middleware.type_definitions import ships, type_hash
 from gr_ros2.middleware.type_descriptions import MAX_REPLY, hash_of, read_reply, request
 from tests.middleware.describing import (

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.type_definitions import type_hash
 from gr_ros2.middleware.zenoh_graph import (

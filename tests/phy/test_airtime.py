@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import pdu_of

@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.phy.test_loopback import make
 from tests.waiting import wait_for

@@ -11,10 +11,10 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import numpy as np
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.channel import Channel, PacketLoss, noise_voltage
 from gr_ros2.phy.ofdm import OfdmPhy
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

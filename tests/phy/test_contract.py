@@ -13,14 +13,14 @@ import numpy as np
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated, pdr, record
 from gr_ros2.phy.tap import SYMBOLS_SHOWN
 from gr_ros2.phy.theory import half_point
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

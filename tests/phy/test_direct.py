@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.errors import ConfigError, PhyError
+from gr_ros2.core.errors import ConfigError, PhyError
 from gr_ros2.phy import PHY
 
 

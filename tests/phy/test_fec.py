@@ -10,12 +10,12 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import BackendMissingError
+from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.fec import Codes
 from gr_ros2.phy.measure import deliver, pdr, record
 from gr_ros2.phy.theory import coded_success, half_point
+from gr_ros2.settings.config import ChannelConfig
 
 CODES = ("cc", "ldpc", "polar")
 

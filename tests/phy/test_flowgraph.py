@@ -12,11 +12,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import PhyError
+from gr_ros2.core.errors import PhyError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.measure import deliver, record
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import BackendMissingError, ConfigError, PhyError
+from gr_ros2.core.errors import BackendMissingError, ConfigError, PhyError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import PATIENCE_S, wait_for
 

@@ -15,8 +15,7 @@ import numpy as np
 import pmt
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.lora import LoraPhy
@@ -24,6 +23,7 @@ from gr_ros2.phy.lora_sdr import SdrFrame, whitening
 from gr_ros2.phy.measure import SampleRecording, deliver, record
 from gr_ros2.phy.pdus import pdu_of
 from gr_ros2.phy.threads import start_flowgraph
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

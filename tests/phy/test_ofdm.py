@@ -14,12 +14,12 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import numpy as np
 from gnuradio import blocks, gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.burst import BurstReceiver
 from gr_ros2.phy.measure import deliver, modulated, record
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.phy.ofdm_stock import SPINNING_NICE
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

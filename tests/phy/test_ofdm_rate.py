@@ -14,7 +14,7 @@ import pmt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import Heard, Samples
 from gr_ros2.phy.flowgraph import Flowgraph

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.core.errors import PhyError
 from gr_ros2.doctor import installed
-from gr_ros2.errors import PhyError
 from gr_ros2.phy import preferences
 
 NOWHERE = "/proc/none"

@@ -11,11 +11,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
 
-from gr_ros2.config import ChannelConfig
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.burst import BurstReceiver
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.theory import half_point
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.phy.test_burst import NAMES, bursts, delayed, noise
 from tests.waiting import wait_for

@@ -17,8 +17,7 @@ from gnuradio import blocks, gr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.config import ChannelConfig, SinkConfig, SourceConfig
-from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.link import Delivered, Receiver, Sender
 from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
@@ -27,7 +26,8 @@ from gr_ros2.phy.theory import half_point
 from gr_ros2.phy.threads import run_flowgraph
 from gr_ros2.phy.wifi import WifiOptions, WifiPhy, band_snr_db
 from gr_ros2.phy.wifi_frames import ENCODINGS, MAX_PACKET, DataFrames, Encoding, FrameDecoder, scrambler, training
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from tests.gr.probe import Probe

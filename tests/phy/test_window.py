@@ -8,7 +8,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import gr
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.window import CreditWindow
 from tests.gr.probe import Probe
 from tests.waiting import wait_for

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.race.measure import RaceCell
 from gr_ros2.race.namespaces import check_means
 

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.contenders import ADDRESSES, CONTENDERS, MTU, chosen, cyclone_uri, zenoh_config
 
 

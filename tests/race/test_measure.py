@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.measure import COLUMNS, Identity, Observed, by_condition, measure, shown, winners
 from gr_ros2.race.race_settings import RaceRecording

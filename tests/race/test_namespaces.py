@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.race.namespaces import Namespace, enter, inside
 from tests.race.support import needs_namespaces
 

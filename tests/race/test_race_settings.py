@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.config import build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.race.race_settings import SIM_TOPIC, RaceSettings, check, conditions, read_recording
+from gr_ros2.settings.config import build
 
 
 def write_bag(path: Path, topics: dict[str, list[bytes]], step_s: float = 0.1) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow.csv
 import pyarrow.parquet
 
-from gr_ros2.errors import RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.race.contenders import CONTENDERS
 from gr_ros2.race.race_settings import RaceRecording, RaceSettings
 from gr_ros2.race.results import WON, ahead_of_ours, notes, race_grid, race_markdown, write_race

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.race.namespaces import Namespace
 from gr_ros2.race.workers import Worker
 from tests.race.support import needs_namespaces

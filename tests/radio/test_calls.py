@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError, MiddlewareError, RegistryError
+from gr_ros2.core.errors import ConfigError, MiddlewareError, RegistryError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.registry import MAX_TOPICS, Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.registry import MAX_TOPICS, Registry
 from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller
 from tests.radio.calling_robots import Robots

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.config import build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import EXAMPLES_DIR, LinkConfig, link_from, load_link
+from gr_ros2.settings.config import build
 
 EXAMPLES = sorted(EXAMPLES_DIR.glob("link-*.yaml"))
 SMALL: dict[str, Any] = {

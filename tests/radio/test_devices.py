@@ -18,7 +18,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import gr
 
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.soapy import SoapyFrontEnd
@@ -194,7 +194,7 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
         text=True,
         cwd=ROOT,
     )
-    assert done.stderr.splitlines()[-1].startswith("gr_ros2.errors.RadioError: front_end soapy: ")
+    assert done.stderr.splitlines()[-1].startswith("gr_ros2.core.errors.RadioError: front_end soapy: ")
     assert re.search(said, done.stderr.splitlines()[-1])
     assert log.read_text().splitlines()[-1] == "tx closed"
 

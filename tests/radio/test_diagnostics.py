@@ -14,7 +14,6 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import DiagnosticsConfig
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -22,6 +21,7 @@ from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.diagnostics import DIAGNOSTICS_TYPE, STATISTICS_TYPE, Diagnostics
 from gr_ros2.radio.robot_link import RobotLink
+from gr_ros2.settings.config import DiagnosticsConfig
 from tests.domains import domain, free_domains
 from tests.waiting import wait_for
 

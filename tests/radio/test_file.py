@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.robot_link import RobotLink

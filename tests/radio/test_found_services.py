@@ -12,7 +12,7 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.middleware import Qos
 from gr_ros2.radio.waiting import Waiting
-from gr_ros2.service_rows import parts
+from gr_ros2.settings.service_rows import parts
 from tests.middleware.calling import Adder, Caller
 from tests.radio.calling_robots import Robots
 from tests.radio.fibonacci import CANCELED, FIBONACCI, FibonacciClient, FibonacciServer

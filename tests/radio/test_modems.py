@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.radio.radio import make_radio
 from tests.radio.cables import Direwolves, SerialCable, free_ports
 from tests.radio.robots import Robot

@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
-from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import portable_registry, settled
-from gr_ros2.yaml_text import yaml_text
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.files import portable_registry, settled
+from gr_ros2.settings.yaml_text import yaml_text
 
 GIVEN: dict[str, dict[str, Any]] = {
     "sim": {},

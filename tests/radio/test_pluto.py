@@ -17,7 +17,7 @@ import pytest
 
 pytest.importorskip("gnuradio.iio", reason="needs gr-iio")
 
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.radio.pluto import _stderr_deferred
 from gr_ros2.radio.robot_link import RobotLink
 from tests.radio.pluto import PHY, RX, Pluto

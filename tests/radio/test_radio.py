@@ -10,12 +10,12 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import gr
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import BackendMissingError, ConfigError, PhyError, RadioError
+from gr_ros2.core.errors import BackendMissingError, ConfigError, PhyError, RadioError
 from gr_ros2.phy.psk import PskPhy
 from gr_ros2.radio.radio import Radio, make_radio
 from gr_ros2.radio.sigmf import read_recording
 from gr_ros2.radio.sim import SimFrontEnd
+from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SenderEvent
 from gr_ros2.link.events import ReceiverEvent, SentPacket
 from gr_ros2.radio.robot_link import RobotLink

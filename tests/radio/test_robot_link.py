@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import BackendMissingError, ConfigError, RegistryError
+from gr_ros2.core.errors import BackendMissingError, ConfigError, RegistryError
 from gr_ros2.link import Delivered
 from gr_ros2.link.events import Accepted, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -61,7 +61,7 @@ def test_a_link_that_was_stopped_keeps_no_other_process_from_its_state(name: str
     front_end = (
         SIM if name == "sim" else {"name": "zmq", "bind": f"ipc://{tmp_path}/1", "connect": [f"ipc://{tmp_path}/2"]}
     )
-    code = "import sys; from gr_ros2.boots import BootFile; BootFile(sys.argv[1], 1.0, 0, sealed=False)"
+    code = "import sys; from gr_ros2.state.boots import BootFile; BootFile(sys.argv[1], 1.0, 0, sealed=False)"
     command = [sys.executable, "-c", code, str(tmp_path / "state")]
     with Robot(1, front_end, version=1, state=command[-1]):
         refused = subprocess.run(command, capture_output=True, check=False)

@@ -15,7 +15,7 @@ pytest.importorskip("gnuradio.uhd", reason="needs gr-uhd")
 import pmt
 from gnuradio import gr, uhd
 
-from gr_ros2.errors import RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.radio.bursts import LENGTH_TAG
 from gr_ros2.radio.robot_link import RobotLink
 from tests.radio.robots import RATE, Robot, config

@@ -11,10 +11,10 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.gr.health import LinkHealth
-from gr_ros2.keys import new_key_file
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import load_link
+from gr_ros2.state.keys import new_key_file
 from tests.domains import domain
 from tests.middleware.support import CUSTOM, LATCHED, message
 from tests.radio.robots import QOS, Robot

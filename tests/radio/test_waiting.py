@@ -42,7 +42,7 @@ def test_a_line_is_told_when_it_changes() -> None:
     from gr_ros2.gr import RosSource
     from gr_ros2.middleware.memory import MemoryMiddleware
     from gr_ros2.radio.waiting import ALL_THERE, Waiting
-    from gr_ros2.registry import Registry
+    from gr_ros2.settings.registry import Registry
     from tests.domains import domain
 
     with MemoryMiddleware(domain_id=domain(1)) as robot, MemoryMiddleware(domain_id=domain(1)) as ours:

@@ -17,7 +17,7 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 
 import zmq
 
-from gr_ros2.errors import ConfigError, RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy import PHY
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd, ZmqOptions

@@ -11,8 +11,8 @@ from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
-from gr_ros2.registry import Registry
 from gr_ros2.report.page import Run
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, Entry, Packet
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu"})

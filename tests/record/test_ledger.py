@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.config import SinkConfig, SourceConfig, TopicOptions
-from gr_ros2.errors import CrcError, PadError, RunError
+from gr_ros2.core.errors import CrcError, PadError, RunError
 from gr_ros2.link import Receiver, Sender
 from gr_ros2.link.events import Accepted, Delivered, Lost, Missed, Refused, Rejected, SenderEvent, SentEntry, SentPacket
 from gr_ros2.record.ledger import REORDER_WINDOW, Ledger, TopicLedger
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.v0 import Packet
 from tests.compression.support import Writer
 

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli.main import run
-from gr_ros2.errors import BagError
+from gr_ros2.core.errors import BagError
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.bag_recorder import BagRecorder
 from gr_ros2.middleware.base import Qos

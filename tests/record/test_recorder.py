@@ -6,11 +6,11 @@ import random
 
 import pytest
 
-from gr_ros2.config import SinkConfig, SourceConfig
 from gr_ros2.link import Receiver, Sender
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "fix": "sensor_msgs/NavSatFix", "raw": "my_msgs/Thing"})
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.result import Result, read_result, write_result
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as pa_parquet
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Accepted, Delivered, SentEntry, SentPacket
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.trace import PacketLog, Track, make_trace, read_trace, write_trace

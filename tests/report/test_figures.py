@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.report.figures import SENT_EVERY, latency_figure, ledger_figure, path_figure, save_figure
 
 ANGLE = np.linspace(0, 6, 501)

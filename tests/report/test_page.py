@@ -12,7 +12,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.report.page import read_runs, write_report
 from tests.record.runs import IMU, ODOM, make_run
 

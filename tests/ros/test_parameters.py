@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.config import ChannelConfig, SinkConfig, SourceConfig, build
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
-from gr_ros2.setting import meanings
-from gr_ros2.settings_file import parse_override, settled
+from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig, build
+from gr_ros2.settings.fields import meanings
+from gr_ros2.settings.files import parse_override, settled
 
 LINK = {
     "registry": "topics.csv",

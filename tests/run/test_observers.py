@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from gr_ros2.errors import LengthError
+from gr_ros2.core.errors import LengthError
 from gr_ros2.link.events import Accepted, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.observe import Observers
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
-from gr_ros2.registry import Registry
 from gr_ros2.run.observers import LateObservers, LiveRun
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
+from gr_ros2.settings.registry import Registry
 
 
 class RecordingObserver:

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.repetitions import REPETITIONS_FILE, run_folders, summarize
 from gr_ros2.record.result import Result
 from gr_ros2.report.page import read_runs

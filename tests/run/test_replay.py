@@ -12,7 +12,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from rosbags.highlevel import AnyReader
 
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.core.errors import BagError, ConfigError
 from gr_ros2.medium import loss_table
 from gr_ros2.middleware.bag_files import bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.bag_recorder import BagRecorder

@@ -17,7 +17,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import yaml
 
 from gr_ros2.cli.main import run as command
-from gr_ros2.errors import BagError, ConfigError
+from gr_ros2.core.errors import BagError, ConfigError
 from gr_ros2.middleware.bag_files import bag_definitions, bag_topics, read_bag
 from gr_ros2.middleware.type_definitions import UNKNOWN, definition
 from gr_ros2.run.replay import Replayed, replay

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.result import Result, read_result, write_result
 from gr_ros2.report.table import summary_grid
 from gr_ros2.run.robots import ears_of, paths_at

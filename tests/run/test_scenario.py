@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.run.scenario import builtin_scenarios, dump, load_scenario, scenario_from
-from gr_ros2.settings_file import parse_override
+from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.settings.files import parse_override
 
 BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
 

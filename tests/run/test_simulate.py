@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.config import ChannelConfig
-from gr_ros2.errors import ConfigError, RunError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
@@ -21,6 +20,7 @@ from gr_ros2.record.trace import Floats, Trace
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.run.simulate import EventLoop, Offered, Robot, Simulated, simulate
+from gr_ros2.settings.config import ChannelConfig
 
 
 class Sized:

@@ -17,8 +17,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from pydantic import TypeAdapter
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.errors import ConfigError
 from gr_ros2.link import EndpointV0
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.medium import loss_table

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.ledger_rows import ARRIVED
 from gr_ros2.record.result import Result, TopicResult, read_result, write_result
 from gr_ros2.report.table import ledger_grid, summary_grid
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, dump, load_scenario, scenario_from
-from gr_ros2.settings_file import find_registry
+from gr_ros2.settings.files import find_registry
 
 LOSS = 0.2
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from gr_ros2.config import build
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.settings.config import build
 from gr_ros2.sim import Fleet, SimMessage, SimSettings
 from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TURN_ACCELERATION
 from gr_ros2.sim.sensors import GRAVITY, TYPES

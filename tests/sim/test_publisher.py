@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from gr_ros2.errors import MiddlewareError
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.base import Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.sim import Fleet, SimPublisher, SimSettings
 from tests.waiting import PATIENCE_S, wait_for

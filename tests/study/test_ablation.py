@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.result import read_result
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.study.ablation import run_variants, variants, worth_grid

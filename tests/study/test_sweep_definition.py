@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.run.scenario import dump
 from gr_ros2.study.sweep.definition import builtin_sweeps, load_sweep, read_sweep
 from tests.study.sweeps import plan, write_sweep_file

@@ -18,7 +18,7 @@ pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[swee
 import dask
 import distributed
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.result import Result, TopicResult
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario

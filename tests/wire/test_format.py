@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import CrcError, EncodeError, LengthError, VersionError
+from gr_ros2.core.errors import CrcError, EncodeError, LengthError, VersionError
 from gr_ros2.wire import FORMATS, Format, decode, format_of
 from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import GrRos2Error
+from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.wire import (
     CrcError,
     EncodeError,

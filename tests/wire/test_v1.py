@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import EncodeError, WireError
+from gr_ros2.core.errors import EncodeError, WireError
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Ask, Heard, Hello, Report
 from gr_ros2.wire.table import Row, read_table, write_table

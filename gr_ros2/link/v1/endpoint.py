@@ -17,8 +17,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.config import QueuePolicy
-from gr_ros2.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
+from gr_ros2.core.errors import ConfigError, EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.endpoint import check_live
 from gr_ros2.link.events import (
     AirKind,
@@ -47,8 +46,9 @@ from gr_ros2.link.v1.outbox import Filling, Outbox
 from gr_ros2.link.v1.repair import Life, Repair, RepairMode, RepairWindow, Sent
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
 from gr_ros2.link.v1.talk import Talk
-from gr_ros2.registry import NewRow, Registry
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import QueuePolicy
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import NewRow, Registry
 from gr_ros2.wire.control import (
     CAN_HEAR,
     ECHO_LEN,

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gr_ros2.config import SinkConfig, SourceConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
-from gr_ros2.setting import AUTO, Auto
+from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
 
 NOBODY = -1

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from math import inf
 from zlib import crc32
 
-from gr_ros2.errors import CodecError, WireError
+from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
@@ -29,7 +29,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.reassembly import Partial, Reassembly
 from gr_ros2.link.v1.repair import MAP, PROMPT, SPAN
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import REPORT_LEN, Control, Report, reportable
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import read_table

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 
-from gr_ros2.errors import (
+from gr_ros2.core.errors import (
     CrcError,
     EntryKindError,
     GrRos2Error,

@@ -27,7 +27,6 @@ from heapq import heapify, heappop, heappush
 from math import inf
 from zlib import crc32
 
-from gr_ros2.config import QueuePolicy
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
@@ -39,8 +38,9 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.repair import GROUP, Life
-from gr_ros2.registry import CALLS_TYPE, Registry, Topic
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.config import QueuePolicy
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
 from gr_ros2.wire.table import Row as TableRow
 from gr_ros2.wire.table import write_table

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gr_ros2.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
+from gr_ros2.core.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
 from gr_ros2.link.v1.endpoint_settings import MIN_PACKET_LEN
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer

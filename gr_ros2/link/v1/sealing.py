@@ -23,8 +23,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gr_ros2.errors import ConfigError, CrcError, TagError
-from gr_ros2.keys import KEY_LEN
+from gr_ros2.core.errors import ConfigError, CrcError, TagError
+from gr_ros2.state.keys import KEY_LEN
 from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
 
 SealMode = Literal["none", "authenticate", "encrypt"]

@@ -6,12 +6,12 @@ the C++ code has no dependencies, starts no threads and uses neither Python nor 
 
 from __future__ import annotations
 
-from gr_ros2.config import Kernels
 from gr_ros2.phy.burst import BurstModem
 from gr_ros2.phy.fec import GNU_RADIO, Decoders
 from gr_ros2.phy.kernels.codes import CompiledDecoders
 from gr_ros2.phy.kernels.library import loaded
 from gr_ros2.phy.kernels.modem import CompiledModem
+from gr_ros2.settings.config import Kernels
 
 
 def fastest(modem: BurstModem, kernels: Kernels) -> BurstModem:

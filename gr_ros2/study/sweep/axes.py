@@ -10,7 +10,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 from gr_ros2.record.statistics import Estimate
-from gr_ros2.setting import AUTO
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.study.sweep.definition import SweepCell, SweepPlan, label
 from gr_ros2.study.sweep.summaries import ALL, Summary
 

@@ -25,11 +25,11 @@ from distributed.client import FuturesCancelledError
 from distributed.scheduler import KilledWorker
 
 from gr_ros2 import __version__
-from gr_ros2.errors import ConfigError, GrRos2Error, RunError
+from gr_ros2.core.errors import ConfigError, GrRos2Error, RunError
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, dump, scenario_from
-from gr_ros2.settings_file import BUILTIN_DIR, find_registry
+from gr_ros2.settings.files import BUILTIN_DIR, find_registry
 from gr_ros2.study.sweep.store import without_registry
 
 RUNS_PER_PROCESS = 200

@@ -17,14 +17,14 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.config import ChannelConfig, Text, build, read_yaml, replaced
-from gr_ros2.errors import BackendMissingError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Experiment, Scenario, Time, dump, load_scenario
-from gr_ros2.setting import AUTO
-from gr_ros2.settings_file import BUILTIN_DIR as SCENARIO_DIR
-from gr_ros2.settings_file import find_registry
+from gr_ros2.settings.config import ChannelConfig, Text, build, read_yaml, replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.files import BUILTIN_DIR as SCENARIO_DIR
+from gr_ros2.settings.files import find_registry
 
 BUILTIN_DIR = Path(__file__).resolve().parents[2] / "sweeps"
 """Folder of the built-in sweeps."""

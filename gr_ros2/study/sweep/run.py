@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.study.sweep.cluster import Failed, local_workers, remote_workers, run_all
 from gr_ros2.study.sweep.definition import SweepPlan

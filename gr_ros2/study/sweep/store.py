@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2 import __version__
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.result import Result, read_result, write_result
 from gr_ros2.run.scenario import Scenario, dump
 

@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 
-from gr_ros2.files import write_whole
+from gr_ros2.core.files import write_whole
 from gr_ros2.record.result import Result, topic_numbers
 from gr_ros2.record.statistics import Estimate, average, share
 from gr_ros2.record.trace import write_csv

@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 
 KEY = bytes(range(32))
 SLOT_S = 1 / 75

@@ -9,10 +9,10 @@ from rosbags.typesys import get_types_from_msg
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.link_codec import ANNOUNCED
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Lost, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.table import Row
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.v1.air import SLOT_S, Air, Robot

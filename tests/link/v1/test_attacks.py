@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from gr_ros2.config import TopicOptions
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Gone, Rejected
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Seal, SealMode, subkey
+from gr_ros2.settings.config import TopicOptions
 from gr_ros2.wire.control import Report
 from gr_ros2.wire.v1 import Header, Part, Standing, body_room, write_body, write_header, write_standing
 from tests.link.v1.air import KEY, Air, Robot, registry

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from bench.repair_backlog import CASES, LOSSES, OLDER, run
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.v1.endpoint import GIVE_UP_S
+from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import Air, Robot, registry
 
 FIFO = TopicOptions(queue="fifo", reliability="reliable")

@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 
 from fuzz.loop import work
-from gr_ros2.errors import ReplayedError
+from gr_ros2.core.errors import ReplayedError
 from gr_ros2.link.events import Rejected
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint import Endpoint

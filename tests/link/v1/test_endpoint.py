@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from gr_ros2.config import TopicOptions
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
 from gr_ros2.link.v1.endpoint import GIVE_UP_S
 from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, MAX_TOPICS, Part, body_room, read_header
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import WAITED, Hold, Period
-from gr_ros2.registry import Registry, Topic
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 
 AIRTIME = 0.013
 PERIOD = 1 / 35

@@ -9,10 +9,10 @@ from collections import Counter, deque
 import pytest
 
 from bench.hostile import GROWTH, Kind, attack
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.repair import GROUP
-from gr_ros2.registry import Registry
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
 from tests.link.v1.air import SLOT_S, Robot, registry
 

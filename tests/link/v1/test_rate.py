@@ -6,7 +6,7 @@ from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.rate import Rung
 from gr_ros2.link.v1.endpoint import GIVE_UP_S, Endpoint
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.registry import Registry
+from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.control import Report
 

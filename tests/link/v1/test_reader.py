@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fuzz.loop import inputs
-from gr_ros2.errors import WireError
+from gr_ros2.core.errors import WireError
 from gr_ros2.link.v1.reader import Look, Reader
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.wire.control import Hello, Report

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.errors import ConfigError, WireError
+from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, Trailer, subkey
 from gr_ros2.wire.v1 import Header, write_header
 

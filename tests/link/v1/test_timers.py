@@ -14,8 +14,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gr_ros2.config import TopicOptions
 from gr_ros2.link.events import Delivered
+from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import SLOT_S, Robot, registry
 
 _STEPS = st.lists(

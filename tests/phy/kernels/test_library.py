@@ -14,11 +14,11 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 
-from gr_ros2.config import PhyConfig
-from gr_ros2.errors import ConfigError
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY, configured, kernels
 from gr_ros2.phy.kernels import library
 from gr_ros2.phy.kernels.modem import CompiledModem
+from gr_ros2.settings.config import PhyConfig
 from tests.phy.kernels.support import VARIANTS, variant
 
 ROOT = Path(__file__).resolve().parents[3]

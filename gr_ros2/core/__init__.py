@@ -1,0 +1,1 @@
+"""What everything may use: errors, names, files, back-end tables, guards."""

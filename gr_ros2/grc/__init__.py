@@ -1,0 +1,1 @@
+"""Descriptions of the blocks for GNU Radio Companion, and how it finds them."""

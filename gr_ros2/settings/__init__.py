@@ -1,0 +1,1 @@
+"""Every setting: its fields, its texts and files, the registry of topics, and the choice of topics."""

@@ -1,0 +1,639 @@
+"""Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
+
+Invariants: each name is introduced by one dataclass, and other dataclasses inherit it; a derived value is written
+``auto``; durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the
+value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import (
+    checked_frame_form,
+    checked_merged_topic,
+    checked_namespace,
+    checked_namespace_form,
+    checked_topic_form,
+)
+from gr_ros2.settings.fields import AUTO, Auto, OnlyIn, settings_of
+from gr_ros2.settings.problems import explain
+from gr_ros2.settings.topic_choice import checked_words, words_of
+from gr_ros2.settings.yaml_bounds import read_bounded
+from gr_ros2.settings.yaml_text import parse_yaml
+from gr_ros2.state.keys import checked_key_file
+from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
+
+MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
+MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
+
+STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
+_T = TypeVar("_T")
+
+PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
+RobotId = Annotated[int, Field(ge=0, le=BROADCAST - 1)]
+DomainId = Annotated[int, Field(ge=0, le=232)]
+SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Text = Annotated[str, Field(min_length=1)]
+Namespace = Annotated[str, AfterValidator(checked_namespace)]
+NamespaceForm = Annotated[str, AfterValidator(checked_namespace_form)]
+TopicForm = Annotated[str, Field(min_length=1), AfterValidator(checked_topic_form)]
+MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
+FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
+QosClass = Literal["default", "latency", "bulk"]
+QueuePolicy = Literal["latest", "fifo", "deadline"]
+WireVersion = Literal[0, 1]
+Repairs = Literal["idle", "thrifty", "off"]
+Kernels = Literal["auto", "numpy"]
+
+DEFAULT_MIDDLEWARE = "dds"
+"""Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Named:
+    """What has a name.
+
+    :param name: what results, tables and errors call it
+    """
+
+    name: Text
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Seeded:
+    """What draws random numbers.
+
+    :param seed: of everything random in it; the same seed draws the same numbers
+    """
+
+    seed: Count = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Populated:
+    """What robots take part in.
+
+    :param robots: how many, or the settings of each
+    """
+
+    robots: Any = ()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Traffic(Seeded):
+    """What a link is given to carry.
+
+    :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
+    :param duration_s: s during which messages are submitted; 0 = no limit: as long as the recording
+    :param drain_s: s the link may go on delivering after that
+    """
+
+    source: str = "sim"
+    duration_s: Seconds = 15.0
+    drain_s: Seconds = 2.0
+
+    @model_validator(mode="after")
+    def _sim_or_bag(self) -> Traffic:
+        if self.source != "sim" and not self.source.removeprefix("bag:").strip():
+            raise ValueError(f"source = {self.source!r}: the path of the bag is missing; write bag:PATH")
+        if self.source != "sim" and not self.source.startswith("bag:"):
+            raise ValueError(f"source = {self.source!r}: write sim or bag:PATH")
+        return self
+
+    @property
+    def bag_path(self) -> Path | None:
+        """The recording to play, None when the simulator is the source."""
+        return None if self.source == "sim" else Path(self.source.removeprefix("bag:").strip()).expanduser()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Sampled:
+    """What has samples.
+
+    :param sample_rate: samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told
+    """
+
+    sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Packets:
+    """What sends packets.
+
+    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
+    """
+
+    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Agreed(Packets):
+    """What all ends of a link have to agree on.
+
+    :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
+    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
+    :param key: file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one,
+        sealed packets alone are taken
+    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
+    :param state: file that counts this robot's starts and says what was heard before a restart; '' keeps it in the
+        user's state folder
+    """
+
+    registry: Annotated[Text, Field(title="Registry CSV")]
+    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 1
+    key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
+    seal: Annotated[Literal["encrypt", "authenticate"], OnlyIn(1)] = "encrypt"
+    state: Annotated[str, OnlyIn(1), Field(title="State file")] = ""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Queued:
+    """What keeps messages waiting.
+
+    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded, auto (of one topic)
+        takes the source's
+    """
+
+    queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TopicOptions(Queued):
+    """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
+
+    :param qos: class of its packets, the two QoS bits of the header
+    :param reliability: auto adapts the subscription to the publishers found
+    :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
+    :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``; of a
+        transient-local topic also how many messages late robots and late subscribers get, auto 1
+    :param publish_as: topic name at the sink, ``{src_id}`` allowed; auto takes ``namespace_format``
+    :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
+        ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
+        publishers' QoS (docs/explanation/scheduling.md)
+    :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
+        publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
+    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000
+    :param max_rate: messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited
+    :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
+    :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
+    """
+
+    qos: QosClass = "default"
+    reliability: Literal["reliable", "best_effort"] | Auto = AUTO
+    durability: Literal["volatile", "transient_local"] | Auto = AUTO
+    depth: Count | Auto = AUTO
+    publish_as: TopicForm = AUTO
+    queue: Annotated[QueuePolicy | Auto, OnlyIn(1)] = AUTO
+    deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
+    weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    codec: str = AUTO
+    quantize: str = ""
+
+    @model_validator(mode="after")
+    def _deadline(self) -> TopicOptions:
+        if self.queue == "deadline" and self.deadline_s in (0, AUTO):
+            raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class EndConfig(Agreed):
+    """What both ends of a link have.
+
+    :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
+    :param robot_id: the robot's own id on the wire, 0..254. auto: a source takes the last run of digits of its
+        namespace; a sink takes that of the source beside it, and hears everything where there is none, or where the
+        front end loops back. A sink that has one drops and counts its own packets and those for others
+    :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
+    :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
+    :param dictionaries: files of dictionaries of your own, made by `gr-ros2 dict train`; the same at both ends
+    :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
+    :param debug: readable log of headers, topic ids and entries
+    """
+
+    registry: Annotated[str, Field(title="Registry CSV")] = ""
+    robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
+    middleware: str = DEFAULT_MIDDLEWARE
+    domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
+    dictionaries: tuple[str, ...] = ()
+    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
+    debug: Annotated[bool, Field(title="Debug log")] = False
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> EndConfig:
+        refuse_without_effect(self, self.version)
+        for name, options in self.topic_options.items():
+            refuse_without_effect(options, self.version, f"topic_options.{name}.")
+        if self.seal != "encrypt" and not self.key:
+            raise ValueError(f"seal = {self.seal!r}: nothing is sealed without a key; set key")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SourceConfig(Queued, EndConfig):
+    """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
+
+    :param topics: which topics are sent: names, in which * and ? stand for others; auto = every topic of the namespace;
+        -NAME leaves out. Of the registry, where there is one ([] = all); otherwise, with version 1, of the ROS graph,
+        which says type and QoS ([] = none)
+    :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
+        call; this needs both directions of a link
+    :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
+    :param dst_id: destination id, 255 broadcast
+    :param min_fragment: k_min, lower bound on an entry's payload, bytes
+    :param greedy: several entries of one topic in a packet, back to back
+    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
+    :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
+    :param hop: initial hop count (TTL) 0..15
+    :param packet_rate: packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number
+        is a limit beside that; 0 = every packet at once, whatever the PHY grants, as the paper has it
+    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded
+    :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
+    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
+        joins fragments of different messages)
+    :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
+        version 1 only while no robot reports, and up to 32 times as long while none is heard that could be
+    :param compression: code every message, which a receiver sees by itself; auto = with version 1, which the paper's
+        version 0 leaves off
+    :param repair: what idle air is spent on: idle = all of it on what may have been lost, thrifty = as
+        much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
+    :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
+    """
+
+    topics: Annotated[
+        tuple[str, ...],
+        BeforeValidator(lambda given: words_of(given) if isinstance(given, str) else given),
+        AfterValidator(checked_words),
+    ] = ()
+    services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
+    namespace: Namespace = ""
+    dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
+    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, title="Smallest fragment (bytes)")] = 16
+    greedy: Annotated[bool, OnlyIn(0)] = False
+    flush_timeout_s: Annotated[Seconds, OnlyIn(0)] = 0.0
+    subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
+    hop: Annotated[int, OnlyIn(0), Field(ge=0, le=15, title="Hop limit (hops)")] = 1
+    packet_rate: Annotated[
+        Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
+    ] = AUTO
+    queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
+    backpressure: bool = False
+    entry_ids: Annotated[Literal["sequential", "random"], OnlyIn(0), Field(title="Entry IDs")] = "sequential"
+    repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
+    compression: bool | Auto = AUTO
+    repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
+    expected_loss: Annotated[float, OnlyIn(1), Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
+
+    @field_validator("repair", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: object) -> object:
+        """YAML 1.1 reads an unquoted ``off`` as false."""
+        return "off" if value is False else value
+
+    @model_validator(mode="after")
+    def _fits(self) -> SourceConfig:
+        least = self.wire_format.min_packet_len
+        if self.packet_len < least:
+            raise ValueError(f"packet_len = {self.packet_len}: version {self.version} needs at least {least}")
+        most = self.wire_format.single_entry_payload(self.packet_len)
+        if self.min_fragment > most:
+            raise ValueError(
+                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; at most {most}"
+            )
+        return self
+
+    @property
+    def wire_format(self) -> Format:
+        """The wire format of the version in which packets are written."""
+        return format_of(self.version)
+
+    @property
+    def compresses(self) -> bool:
+        """Whether messages are coded: as ``compression`` says, or as the version has it."""
+        return self.version != 0 if self.compression == AUTO else self.compression
+
+    def src_id(self) -> int:
+        """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
+
+        :raises ConfigError: when ``auto`` finds no digits or a number of 255 or more
+        """
+        if self.robot_id != AUTO:
+            return self.robot_id
+        runs = re.findall(r"[0-9]+", self.namespace)
+        if not runs:
+            raise ConfigError(f"robot_id = auto: namespace {self.namespace!r} has no digits; set robot_id to 0..254")
+        if int(runs[-1]) >= BROADCAST:
+            raise ConfigError(
+                f"robot_id = auto: {int(runs[-1])} from namespace {self.namespace!r} is not below 255; "
+                "set robot_id to 0..254"
+            )
+        return int(runs[-1])
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SinkConfig(EndConfig):
+    """ROS Sink (the paper, section 4.4).
+
+    :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
+    :param publisher_depth: QoS depth of the publishers, 0 unbounded
+    :param reassembly_timeout_s: s an incomplete message is kept
+    :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
+        it does, until that one is repaired or given up by its sender
+    :param max_age_s: s for which a sealed message may have been withheld on its way (with a key), or it is not taken;
+        auto: 15 for calls and topics with a deadline or lifespan, any time for others; 0 = any time
+    :param max_sources: senders served at a time; packets of further ones are counted and dropped
+    :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
+    :param max_bytes: fragments held in all
+    :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
+    :param frame_prefix: before every frame name of a message, ``{src_id}`` is the sender; '' leaves messages as sent
+    :param merge_tf: topic on which the transforms of all senders come out too, and their static ones, latched, on this
+        + ``_static``; needs ``frame_prefix``; '' off
+    """
+
+    namespace_format: NamespaceForm = "/rx_robot_{src_id}"
+    publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
+    reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
+    hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
+    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
+    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
+    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
+    max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
+    use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
+    frame_prefix: FrameForm = ""
+    merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
+
+    @model_validator(mode="after")
+    def _frames_stay_apart(self) -> SinkConfig:
+        if self.merge_tf and not self.frame_prefix:
+            raise ValueError(
+                f"merge_tf = {self.merge_tf!r}: frames of several robots would be mixed up; set frame_prefix, "
+                "for instance to 'robot_{src_id}/'"
+            )
+        return self
+
+    @property
+    def merged_topics(self) -> tuple[str, ...]:
+        """The topics of ``merge_tf``: moving and static transforms; () where it is off."""
+        return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
+
+
+@dataclass(frozen=True, config=STRICT)
+class BurstLoss:
+    """Losses that come in bursts: the two-state model of Gilbert and Elliott, one step per packet.
+
+    The mean share of lost packets and the mean length of a stay in the bad state are :attr:`mean_loss` and
+    ``1 / p_bad_to_good`` packets.
+
+    :param p_good_to_bad: probability that the packet after one in the good state finds the bad one, 0..1
+    :param p_bad_to_good: the other way round, above 0..1
+    :param loss_good: probability that a packet is lost in the good state, 0..1
+    :param loss_bad: the same in the bad state, 0..1
+    """
+
+    p_good_to_bad: Probability
+    p_bad_to_good: Annotated[float, Field(gt=0, le=1)]
+    loss_good: Probability = 0.0
+    loss_bad: Probability = 1.0
+
+    @property
+    def share_bad(self) -> float:
+        """Long-run share of packets that find the bad state, 0..1."""
+        return self.p_good_to_bad / (self.p_good_to_bad + self.p_bad_to_good)
+
+    @property
+    def mean_loss(self) -> float:
+        """Long-run share of packets that are lost, 0..1."""
+        return self.share_bad * self.loss_bad + (1 - self.share_bad) * self.loss_good
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ChannelConfig(Seeded):
+    """The simulated channel between transmitter and receiver (docs/reference/channels.md).
+
+    ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
+    act on packets, whatever the PHY.
+
+    :param snr_db: mean burst power over noise power in the sampled band, dB, -50..100; null = no noise
+    :param frequency_offset: carrier frequency offset, fraction of the sample rate, -0.5..0.5
+    :param epsilon: sample clock ratio, 1.0 = none, 0.99..1.01
+    :param taps: complex impulse response at the sample rate
+    :param doppler_hz: Rayleigh fading with this maximum Doppler shift, Hz; every tap fades by itself; 0 = none
+    :param packet_loss: probability that a packet is dropped between PHY and sink, 0..1
+    :param burst_loss: losses in bursts; null = none
+    :param outages: [from_s, to_s) during which nothing passes, s since the run began, in order of time
+    :param seed: of noise, fading and losses; in a scenario that of the scenario unless it is set
+    """
+
+    snr_db: Annotated[
+        Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None, Field(title="Signal-to-noise ratio (dB)")
+    ] = None
+    frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5, title="Frequency offset (share of the sample rate)")] = (
+        0.0
+    )
+    epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
+    taps: Annotated[tuple[complex, ...], Field(min_length=1)] = (1.0 + 0.0j,)
+    doppler_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
+    burst_loss: BurstLoss | None = None
+    outages: tuple[tuple[Seconds, Seconds], ...] = ()
+
+    @model_validator(mode="after")
+    def _outages_in_order(self) -> ChannelConfig:
+        before = 0.0
+        for begin, end in self.outages:
+            if not before <= begin < end:
+                raise ValueError(
+                    f"outages: [{begin:g}, {end:g}] ends before it begins, or begins before the one before it has "
+                    "ended; write [from_s, to_s] in order of time"
+                )
+            before = end
+        return self
+
+    def on_samples(self) -> dict[str, Any]:
+        """The settings that act on samples and are not at their defaults, by name."""
+        default = ChannelConfig()
+        names = ("snr_db", "frequency_offset", "epsilon", "taps", "doppler_hz")
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(default, name)}
+
+    @property
+    def loses_packets(self) -> bool:
+        """Whether anything here drops whole packets."""
+        return bool(self.packet_loss or self.burst_loss or self.outages)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class PhyConfig(Sampled, Named):
+    """Which physical layer, and how fast.
+
+    :param name: a name of ``gr_ros2.phy.PHY``
+    :param headroom: capacity over offered load where sample_rate is auto; a recording counts with one message per
+        second at least
+    :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
+        numpy = the reference, several times slower
+    :param options: settings of that PHY
+    """
+
+    name: str = "ofdm"
+    headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    kernels: Kernels = AUTO
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OverChannel:
+    """What crosses a channel.
+
+    :param channel: what lies between transmitter and receiver
+    """
+
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Sending:
+    """What sends.
+
+    :param ros_source: the sending block
+    """
+
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OneWay(Sending, OverChannel):
+    """One direction: the block that sends, what lies between, and the block that receives.
+
+    :param ros_sink: the receiving block
+    """
+
+    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class AnyLink(OneWay, Agreed, Named):
+    """What an experiment and a robot's end of a real link have in common.
+
+    :param name: what results, tables and errors call it; the file's name unless it is set
+    :param registry: CSV path, relative to the YAML file (on the command line: to the current directory), or the name of
+        a built-in one such as `table4`; the same at every robot
+    :param phy: which physical layer, and how fast; the same at every robot
+    :param localhost_only: DDS stays on the loopback interface; auto takes what the environment of ROS says
+    """
+
+    phy: PhyConfig = Field(default_factory=PhyConfig)
+    localhost_only: bool | Auto = AUTO
+
+
+@dataclass(frozen=True, config=STRICT)
+class DiagnosticsConfig:
+    """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
+
+    :param period_s: s between two messages, 0 = none at all
+    :param window_s: s over which rates and losses are taken, 1 or more
+    :param packet_loss_warn: share of packets lost, 0..1; 0 = never, as for all limits
+    :param packet_loss_error: the same for an error
+    :param message_loss_warn: share of messages lost, 0..1
+    :param message_loss_error: the same for an error
+    :param latency_warn_s: s from a message's stamp to its publication here, median of the newest
+    :param latency_error_s: the same for an error
+    :param age_warn_s: s since the stamp of a topic's newest message (where it has none, since its publication)
+    :param age_error_s: the same for an error
+    :param silence_warn_s: s without any packet, once there was one
+    :param silence_error_s: the same for an error
+    :param queue_warn: share of ``queue_depth`` that waits to be sent, 0..1
+    """
+
+    period_s: Seconds = 1.0
+    window_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+    packet_loss_warn: Probability = 0.1
+    packet_loss_error: Probability = 0.5
+    message_loss_warn: Probability = 0.1
+    message_loss_error: Probability = 0.5
+    latency_warn_s: Seconds = 1.0
+    latency_error_s: Seconds = 5.0
+    age_warn_s: Seconds = 0.0
+    age_error_s: Seconds = 0.0
+    silence_warn_s: Seconds = 3.0
+    silence_error_s: Seconds = 10.0
+    queue_warn: Probability = 0.8
+
+
+def refuse_without_effect(config: Any, version: int, where: str = "") -> None:
+    """Refuse settings that only the other version of the wire format has. At their defaults they are taken.
+
+    :param config: an object of a settings class
+    :param version: the version that runs
+    :param where: what the names of the settings begin with in the error
+    :raises ValueError: naming setting, value and version
+    """
+    for setting in settings_of(type(config)):
+        value = getattr(config, setting.name)
+        if setting.version not in (None, version) and value != setting.default:
+            raise ValueError(
+                f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out, or set "
+                f"version: {setting.version}"
+            )
+
+
+def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
+    """Make a configuration object from a mapping.
+
+    :param cls: one of the dataclasses above, or one composed of them
+    :param where: name of the settings in errors, for instance the file name
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where or cls.__name__}: expected keys and values, found {values!r}")
+    try:
+        return TypeAdapter(cls).validate_python(dict(values))
+    except ValidationError as error:
+        raise ConfigError(explain(cls, error.errors(), where)) from error
+
+
+def replaced(config: _T, **changes: Any) -> _T:
+    """A configuration with some settings changed, validated again.
+
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
+    return build(type(config), {**current, **changes})
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """One YAML file as a mapping.
+
+    :raises ConfigError: when it cannot be read, is not a mapping, has a key twice, or exceeds the limits of
+        :mod:`gr_ros2.settings.yaml_bounds`; names file and line
+    """
+    try:
+        text = read_bounded(Path(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
+    values = parse_yaml(text, str(path))
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}")
+    return values

@@ -1,0 +1,112 @@
+"""Describes errors in settings in one line: key, value, what is allowed, and what the key is for.
+
+Invariant: a value that a union refuses gives one complaint, however many members the union has.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
+
+from gr_ros2.settings.fields import AUTO, members, settings_of
+
+_KINDS = {
+    "bool": "true or false",
+    "complex": "a number such as 0.5 or 0.5+0.2j",
+    "dataclass": "keys and values",
+    "dict": "keys and values",
+    "float": "a number",
+    "int": "a whole number",
+    "list": "a list",
+    "string": "a text",
+    "tuple": "a list",
+}
+"""The expected kind of value in words, by pydantic's name of the error."""
+_LIKE_AUTO: tuple[Any, ...] = (None, -1, 0, "", [])
+"""Values that elsewhere often mean what ``auto`` means here."""
+
+
+def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
+    """Complaints of pydantic in one line.
+
+    :param cls: the settings class
+    :param items: ``ValidationError.errors()``
+    :param where: name of the settings in errors, for instance the file name
+    """
+    prefix = f"{where}: " if where else ""
+    places: dict[tuple[str, ...], list[Any]] = {}
+    owners = {}
+    for item in items:
+        keys, owner = _place(cls, item["loc"])
+        places.setdefault(keys, []).append(item)
+        owners[keys] = owner
+    # A wrong value at the top level that several parts inherit is reported once, not for every part.
+    top = [(keys, group[0]["input"]) for keys, group in places.items() if len(keys) == 1]
+    groups = {
+        keys: group for keys, group in places.items() if len(keys) == 1 or (keys[-1:], group[0]["input"]) not in top
+    }
+    complaints = {keys: _complaint(keys, owners[keys], group) for keys, group in groups.items()}
+    # What both ends of a link share is refused at the first one.
+    once = {text.removeprefix(f"{'.'.join(keys)}: "): text for keys, text in reversed(complaints.items())}
+    return "; ".join(prefix + text for text in reversed(once.values()))
+
+
+def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[Any] | None]:
+    """The keys that lead to a place, and the settings class of the last key. A union member's name is not a key."""
+    keys: list[str] = []
+    owner: Any = None
+    kinds: tuple[Any, ...] = (cls,)
+    for part in loc:
+        kinds = tuple(kind for kind in kinds if kind is not type(None))
+        if len(kinds) > 1:
+            kinds = ()  # pydantic does not say which member it is in a form that can be used here
+            continue
+        owner = kinds[0] if kinds and is_dataclass(kinds[0]) else None
+        keys.append(str(part))
+        if owner is not None:
+            kinds = members(get_type_hints(owner, include_extras=True).get(part))
+        else:
+            kinds = members(get_args(kinds[0])[-1]) if kinds and get_origin(kinds[0]) in (dict, Mapping) else ()
+    return tuple(keys), owner
+
+
+def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[Any]) -> str:
+    """The complaint about one place."""
+    key, item = ".".join(keys), group[0]
+    if not key:
+        return str(item["msg"]).removeprefix("Value error, ")
+    known = () if owner is None else tuple(field.name for field in fields(owner))
+    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        return f"unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
+    setting = next((found for found in settings_of(owner) if found.name == keys[-1]), None) if owner else None
+    purpose = re.split(r"[.;](?: |$)", setting.meaning.replace("``", ""))[0] if setting else ""  # its first sentence
+    purpose = f" ({purpose})" if purpose else ""
+    if item["type"] in ("missing", "missing_argument"):
+        return f"{key} is missing{purpose}"
+    secret = keys[-1] == "key"  # a key by mistake must not be shown
+    value = "" if secret or isinstance(item["input"], Mapping) else f" = {item['input']!r}"
+    if setting is not None and setting.derives and not isinstance(item["input"], bool) and item["input"] in _LIKE_AUTO:
+        return f"{key}{value}: write {AUTO}{purpose}"
+    ranges = [_asked(one, purpose) for one in group if one["type"] != "literal_error"][:1]
+    choices = [f"must be {_either(setting.choices)}"] if setting is not None and setting.choices else []
+    return f"{key}{value}: {', or '.join([*ranges, *choices]).replace(', or must be', ', or')}"
+
+
+def _either(choices: Sequence[Any]) -> str:
+    *others, last = map(repr, choices)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _asked(item: Any, purpose: str) -> str:
+    """What pydantic expects, in our words.
+
+    :param purpose: what the setting is for; it is given if the value is of the wrong kind
+    """
+    kind, _, problem = item["type"].partition("_")
+    if kind in _KINDS and problem in ("type", "parsing", "str_parsing", "from_float"):
+        return f"must be {_KINDS[kind]}{purpose}"
+    message = str(item["msg"]).removeprefix("Value error, ")
+    asked = re.fullmatch(r"\w+ should (.+?)(?: after validation.*)?", message)
+    return f"must {asked[1]}" if asked else f"{message[0].lower()}{message[1:]}"
