@@ -21,7 +21,7 @@ from tests.domains import free_domains
 from tests.middleware.support import STRING, message
 from tests.waiting import wait_for
 
-MESSAGES, WARM_UP, BATCH = 200_000, 50_000, 1_000
+MESSAGES, WARM_UP, BATCH = 200_000, 80_000, 1_000
 WINDOW_BYTES = 1_000_000
 """For packets that are remembered. A dictionary of the 30,000 that the default allows is copied every 57,000 packets;
 each copy may leave 2.6 MB of the heap unused."""

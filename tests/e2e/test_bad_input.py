@@ -154,7 +154,8 @@ def garbage(seed: int, good: bytes) -> Iterator[object]:
         yield pdu(bytes(flipped))
 
 
-def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost() -> None:
+@pytest.mark.parametrize("version", [0, 1])
+def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost(version: int) -> None:
     sending, receiving = free_domains()
     registry = Registry.from_rows({"chatter": STRING})
     with ExitStack() as stack:
@@ -164,10 +165,16 @@ def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost() -> None:
         ]
         heard: list[bytes] = []
         source = RosSource(
-            registry, middleware=graphs[1], robot_id=1, packet_len=PACKET_LEN, queue_depth=0, subscriber_depth=0
+            registry,
+            middleware=graphs[1],
+            robot_id=1,
+            version=version,
+            packet_len=PACKET_LEN,
+            queue_depth=0,
+            subscriber_depth=0,
         )
         stack.callback(source.close)
-        sink = RosSink(registry, middleware=graphs[2], packet_len=PACKET_LEN, publisher_depth=1000)
+        sink = RosSink(registry, middleware=graphs[2], version=version, packet_len=PACKET_LEN, publisher_depth=1000)
         stack.callback(sink.close)
         sink.announce(1, [0])
         broken, tap = Probe(), Probe()
@@ -193,10 +200,12 @@ def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost() -> None:
         wait_for(lambda: sink.handled == len(thrown) + len(tap.messages), "all of the garbage")
         stats = sink.stats()
     assert all(same(got, one, 3) for got, one in zip(heard, sent, strict=True))
-    counted = sum(stats["rejected"].values()) + stats["not_a_pair"] + stats["not_u8"]
+    counted = sum((stats["rejected"] + stats["dropped"]).values()) + stats["not_a_pair"] + stats["not_u8"]
     assert counted == len(thrown)
-    assert set(stats["rejected"]) <= {"length", "crc", "version", "no_entries", "entry_bounds", "pad", "total", "index"}
-    assert stats["rejected"]["length"] == 6
+    if not version:
+        reasons = {"length", "crc", "version", "no_entries", "entry_bounds", "pad", "total", "index"}
+        assert set(stats["rejected"]) <= reasons
+        assert stats["rejected"]["length"] == 6
     assert stats["handler_failed"] == stats["publish_failed"] == 0
     assert stats["packets"] == len(tap.messages)
 
