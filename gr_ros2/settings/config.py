@@ -364,7 +364,7 @@ class SinkConfig(EndConfig):
     :param max_age_s: s for which a sealed message may have been withheld on its way (with a key), or it is not taken;
         auto: 15 for calls and topics with a deadline or lifespan, any time for others; 0 = any time
     :param max_sources: senders served at a time; packets of further ones are counted and dropped
-    :param max_source_bytes: fragments held per sender; the oldest incomplete message goes first
+    :param max_source_bytes: memory per sender, in version 1 a quarter for incomplete messages; the oldest goes first
     :param max_bytes: fragments held in all
     :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
     :param frame_prefix: before every frame name of a message, ``{src_id}`` is the sender; '' leaves messages as sent
@@ -378,7 +378,7 @@ class SinkConfig(EndConfig):
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
     max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
-    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 32_000_000
+    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 72_000_000
     max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""

@@ -50,7 +50,7 @@ class Settings:
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO
     repeat_s: float = 10.0
-    max_source_bytes: int = 32_000_000
+    max_source_bytes: int = 72_000_000
     max_sources: int = 16
     packet_rate: float | Auto = AUTO
     queue_depth: int = 100
