@@ -107,7 +107,7 @@ def test_a_setting_is_one_field(tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("__pycache__", "scenarios", "losses", "examples")
     for folder in ("gr_ros2", "tools", "docs/reference"):
         shutil.copytree(REPOSITORY / folder, tmp_path / folder, ignore=ignored)
-    config = tmp_path / "gr_ros2" / "config.py"
+    config = tmp_path / "gr_ros2" / "settings" / "config.py"
     text = config.read_text(encoding="utf-8")
     for diff in DIFFS:
         before, added = (line[1:] for line in diff.splitlines())

@@ -25,7 +25,7 @@ from gr_ros2.middleware.dds_library import load
 from gr_ros2.phy.kernels.library import loaded
 print(json.dumps({
     "package": str(Path(gr_ros2.__file__).parent),
-    "blocks": sorted(path.name for path in grc_path().iterdir()),
+    "blocks": sorted(path.name for path in grc_path().iterdir() if path.name != "__pycache__"),
     "examples": sorted(path.name for path in example("topics.csv").parent.iterdir()),
     "scenarios": sorted(path.name for path in BUILTIN_DIR.iterdir()),
     "dissector": DISSECTOR.read_text(),

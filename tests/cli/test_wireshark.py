@@ -131,7 +131,7 @@ def test_topics_have_names_with_the_registry_and_times_and_directions_are_kept(r
     assert [topic.name for topic in Registry.from_csv(registry)] == ["/a", "odom"]
     vector = next(one for one in VECTORS["valid"] if any(entry["topic_id"] == 1 for entry in one["packet"]["entries"]))
     path = capture(tmp_path / "named.pcapng", [bytes.fromhex(vector["hex"])] * 2)
-    arguments = ["-o", f"gr_ros2.settings.registry:{registry}", "-T", "fields"]
+    arguments = ["-o", f"gr_ros2.registry:{registry}", "-T", "fields"]
     for field in ("gr_ros2.topic", "frame.interface_name", "frame.time_relative"):
         arguments += ["-e", field]
     rows = [line.split("\t") for line in tshark(path, *arguments).splitlines()]
