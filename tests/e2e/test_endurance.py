@@ -44,7 +44,7 @@ def submissions(seed: int) -> list[tuple[int, bytes, float]]:
 
 
 def engine_packets(seed: int) -> list[bytes]:
-    config = SourceConfig(robot_id=1, packet_len=64, packet_rate=400.0, queue_depth=0)
+    config = SourceConfig(robot_id=1, version=0, packet_len=64, packet_rate=400.0, queue_depth=0)
     registry = Registry.from_rows({"a": STRING, "b": STRING, "c": STRING})
     sender = Sender(registry, config, rng=random.Random(seed))
     packets: list[bytes] = []
@@ -62,7 +62,14 @@ def block_packets(seed: int) -> list[bytes]:
     registry = Registry.from_rows({"a": STRING, "b": STRING, "c": STRING})
     with MemoryMiddleware(domain_id=free_domains(1)[0]) as graph:
         source = RosSource(
-            registry, middleware=graph, robot_id=1, packet_len=64, subscriber_depth=0, queue_depth=0, seed=seed
+            registry,
+            middleware=graph,
+            robot_id=1,
+            version=0,
+            packet_len=64,
+            subscriber_depth=0,
+            queue_depth=0,
+            seed=seed,
         )
         publishers = [graph.advertise(f"/{name}", STRING, Qos(depth=0)) for name in "abc"]
         for topic_id, payload, _ in submissions(5):
@@ -91,7 +98,7 @@ def test_equal_seeds_give_equal_packets() -> None:
 
 def test_engine_and_block_agree_on_the_order_of_packets() -> None:
     registry = Registry.from_rows({"a": STRING, "b": STRING, "c": STRING})
-    sender = Sender(registry, SourceConfig(robot_id=1, packet_len=64, queue_depth=0), rng=random.Random(7))
+    sender = Sender(registry, SourceConfig(robot_id=1, version=0, packet_len=64, queue_depth=0), rng=random.Random(7))
     for topic_id, payload, _ in submissions(5):
         sender.submit(topic_id, payload, 0.0)
     expected = []
