@@ -227,5 +227,5 @@ def test_a_port_that_nobody_reads_is_said_and_counted(caplog: pytest.LogCaptureF
         stack.callback(flowgraph.stop)
         unread.message_port_pub(pmt.intern("credit"), pmt.from_long(1))
         publisher.publish(message(1))
-        wait_for(lambda: source.stats()["unread"] == 1, "the packet to be counted")
+        wait_for(lambda: source.stats()["unread"] >= 1, "packets to be counted")
     assert "nothing reads message port `pdus`; connect it" in caplog.text
