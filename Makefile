@@ -5,7 +5,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test quick bench lint format examples grc wheel deb release setup setup-dev clean
+.PHONY: demo test quick bench lint format examples pictures grc wheel deb release setup setup-dev clean
 
 demo: setup
 	$(BIN)/gr-ros2 demo
@@ -27,6 +27,9 @@ lint: setup-dev
 format: setup-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+pictures: setup-dev
+	$(BIN)/python tools/write-pictures
 
 examples: setup-dev
 	tools/compile-examples $(BIN)/python

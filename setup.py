@@ -110,6 +110,7 @@ setup(
             "scenarios/*",
             "sweeps/*",
             "losses/*",
+            "losses/*/*",
             "report/templates/*",
             "dashboard/templates/*",
             "compression/dictionaries/*",

@@ -24,6 +24,8 @@ BENCHMARKS = {
     "hostile": "bench.hostile",
     "port": "bench.port",
     "live": "bench.live",
+    "live_image": "bench.live_image",
+    "constants": "bench.constants",
     "direct": "bench.runs",
     "fast": "bench.runs",
     "ofdm": "bench.runs",
@@ -36,11 +38,13 @@ BENCHMARKS = {
     "drive": "bench.phys",
     "beside": "bench.phys",
     "stop": "bench.stop",
+    "reopen": "bench.reopen",
     "compression": "bench.compression",
     "sweep": "bench.sweep",
+    "mac": "bench.mac",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "rate", "drive", "sweep", "hostile")
+LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac")
 """Many minutes: only when named."""
 
 

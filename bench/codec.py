@@ -6,7 +6,7 @@ import time
 
 from bench.rows import Row
 from bench.yardstick import cost
-from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
 PACKET_LEN, PACKETS, REPEATS = 64, 20_000, 9
 MOST = 100
@@ -15,7 +15,7 @@ MOST = 100
 
 def codec() -> list[Row]:
     """Encode and decode of the same packets, one after the other."""
-    packets = [Packet(1, 255, n & 255, 1, (Entry(0, n & 255, 0, 1, bytes(51)),)) for n in range(PACKETS)]
+    packets = [PacketV0(1, 255, n & 255, 1, (EntryV0(0, n & 255, 0, 1, bytes(51)),)) for n in range(PACKETS)]
 
     def each() -> float:
         begin = time.thread_time()

@@ -7,8 +7,9 @@ import time
 
 from bench.rows import Row
 from bench.yardstick import cost
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.settings.registry import Registry
@@ -33,10 +34,10 @@ def transfer() -> tuple[float, float]:
     """Packets/s of processor time of the sending and of the receiving end."""
     keys = Keys((bytes(32),), "encrypt")
     topics = Registry.from_rows({"odom": "nav_msgs/Odometry"})
-    sender = Endpoint(topics, Settings(1, packet_len=PACKET_LEN, repair="idle"), boot=5, keys=keys)
-    receiver = Endpoint(None, Settings(2, packet_len=PACKET_LEN), boot=6, keys=keys)
-    sender.use_credit()
-    receiver.use_credit()
+    sender = EndpointV1(topics, Settings(1, packet_len=PACKET_LEN, repair="idle"), boot=5, keys=keys)
+    receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN), boot=6, keys=keys)
+    sender.pace.use_credit()
+    receiver.pace.use_credit()
     rng = random.Random(1)
     payloads = [rng.randbytes(45) for _ in range(256)]
     clock = time.thread_time
@@ -46,26 +47,26 @@ def transfer() -> tuple[float, float]:
     now = 0.0
     while submitted < MESSAGES:
         # Slots are done in turns of 50 so that reading the clock costs nothing beside them.
-        outgoing: list[tuple[bytes, float]] = []
+        outgoing: list[tuple[ReceivedPacket, float]] = []
         begin = clock()
         for slot in range(50):
             now += 1 / PACKETS_S
             if slot % 2:
-                sender.submit(0, payloads[submitted & 255], now)
+                sender.messages.submit(0, payloads[submitted & 255], now)
                 submitted += 1
-            sender.credit()
-            data = sender.next_packet(now)
-            if data is not None:
-                outgoing.append((data, now))
+            sender.pace.credit()
+            sent = sender.next_packet(now)
+            if sent is not None:
+                outgoing.append((ReceivedPacket(sent.data, now), now))
         packets[0] += len(outgoing)
         spent[0] += clock() - begin
-        heard = [(data, at) for data, at in outgoing if rng.random() >= LOSS]
+        heard = [packet for packet in outgoing if rng.random() >= LOSS]
         begin = clock()
-        for data, at in heard:
-            delivered += sum(isinstance(event, Delivered) for event in receiver.receive(data, at))
+        for arrival, at in heard:
+            delivered += sum(isinstance(event, Delivered) for event in receiver.receive(arrival, at))
         answers = []
         for _ in range(12):
-            receiver.credit()
+            receiver.pace.credit()
             answer = receiver.next_packet(now)
             if answer is not None:
                 answers.append(answer)
@@ -74,7 +75,7 @@ def transfer() -> tuple[float, float]:
         spent[1] += clock() - begin
         begin = clock()
         for answer in answers:
-            sender.receive(answer, now)
+            sender.receive(ReceivedPacket(answer.data), now)
         sender.handle_timeout(now)
         packets[0] += len(answers)
         spent[0] += clock() - begin

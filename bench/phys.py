@@ -61,8 +61,8 @@ def drive_packets() -> list[bytes]:
     for message in read_bag(DRIVE.path, list(ids)):
         now = message.stamp_ns * 1e-9
         sender.submit(ids[message.topic], message.payload, now)
-        while (packet := sender.next_packet(now)) is not None:
-            packets.append(packet)
+        while (sent := sender.next_packet(now)) is not None:
+            packets.append(sent.data)
     return packets
 
 

@@ -1,7 +1,7 @@
-"""The adaptive rate of `ofdm` beside each of its rungs alone, in simulated time: at constant SNRs, and where it fades.
+"""The adaptive rate of `ofdm` beside each of its rates alone, in simulated time: at constant SNRs, and where it fades.
 
 Messages fill one packet of 220 B each. The receiver reports over a way back of its own, whose reports come 5 ms after
-their airtime. A rung alone is the same link with a ladder of this one rung.
+their airtime. An MCS alone is the same link with a table of this one MCS.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from bench.rows import Row
 from gr_ros2.link.events import Delivered
-from gr_ros2.phy.ofdm_rate import RUNGS
+from gr_ros2.phy.ofdm_rate import RATES
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import scenario_from
 from gr_ros2.run.simulate import Offered, Simulation
@@ -21,7 +21,7 @@ from gr_ros2.settings.files import find_registry
 PACKET_LEN, MESSAGE_LEN = 220, 205
 SNRS_DB = range(31)
 FASTEST = 1400.0
-"""messages/s, more than the fastest rung carries."""
+"""messages/s, more than the fastest MCS carries."""
 WARM_UP_S, MEASURED_S = 1.0, 3.0
 MEANS_DB, DOPPLER_HZ, FADING_S = (10.0, 15.0), 2.0, 20.0
 LATE_S = 2.0
@@ -34,10 +34,10 @@ PDR = 0.99
 NEAR, GAIN = 0.9, 1.5
 
 
-def carried(rungs: tuple[str, ...], channel: dict[str, float], load: float, seconds: float) -> tuple[float, float]:
+def carried(rates: tuple[str, ...], channel: dict[str, float], load: float, seconds: float) -> tuple[float, float]:
     """Messages delivered per second after the warm-up, and share of the messages delivered within ``LATE_S``.
 
-    :param rungs: names of the rungs from which the rate is chosen
+    :param rates: names of the rates from which the rate is chosen
     :param load: messages/s offered
     """
     scenario = scenario_from(
@@ -48,7 +48,7 @@ def carried(rungs: tuple[str, ...], channel: dict[str, float], load: float, seco
             "version": 1,
             "packet_len": PACKET_LEN,
             "ros_source": {"robot_id": 1, "queue_depth": 1000, "topic_options": {"odom": {"queue": "fifo"}}},
-            "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive", "rungs": rungs}},
+            "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive", "rates": rates}},
             "channel": channel,
             "ros_sink": {"hold_s": HOLD_S if not channel.get("doppler_hz") else 1.0},
             "reports": {"delay_s": 0.005},
@@ -73,21 +73,21 @@ def messages(load: float, seconds: float) -> Iterator[Offered]:
 
 
 def constant() -> list[tuple[int, float, dict[str, float]]]:
-    """For each SNR in dB: messages/s delivered with the adaptive rate, and with each rung alone."""
+    """For each SNR in dB: messages/s delivered with the adaptive rate, and with each MCS alone."""
     seconds = WARM_UP_S + MEASURED_S
     found = []
     for snr_db in SNRS_DB:
-        alone = {name: carried((name,), {"snr_db": snr_db}, FASTEST, seconds)[0] for name in RUNGS}
-        found.append((snr_db, carried(tuple(RUNGS), {"snr_db": snr_db}, FASTEST, seconds)[0], alone))
+        alone = {name: carried((name,), {"snr_db": snr_db}, FASTEST, seconds)[0] for name in RATES}
+        found.append((snr_db, carried(tuple(RATES), {"snr_db": snr_db}, FASTEST, seconds)[0], alone))
     return found
 
 
-def most(rungs: tuple[str, ...], mean_db: float) -> float:
+def most(rates: tuple[str, ...], mean_db: float) -> float:
     """The highest load, messages/s, of which at least ``PDR`` is delivered in the fading channel."""
     within = 0.0
     for load in LOADS:
         fading = [{"snr_db": mean_db, "doppler_hz": DOPPLER_HZ, "seed": seed} for seed in (1, 2)]
-        pdr = min(carried(rungs, channel, load, FADING_S)[1] for channel in fading)
+        pdr = min(carried(rates, channel, load, FADING_S)[1] for channel in fading)
         if pdr < PDR:
             break
         within = load
@@ -95,21 +95,21 @@ def most(rungs: tuple[str, ...], mean_db: float) -> float:
 
 
 def rate() -> list[Row]:
-    """The adaptive rate against the best of its rungs."""
+    """The adaptive rate against the best of its rates."""
     rows = []
     for snr_db, adaptive, alone in constant():
         best = max(alone, key=alone.__getitem__)
         if alone[best]:
             note = f"{adaptive:.0f} messages/s; best {best}, {alone[best]:.0f}"
             rows.append(
-                Row(f"rate at {snr_db} dB, of the best rung's", adaptive / alone[best], "", "≥", NEAR, "{:.2f}", note)
+                Row(f"rate at {snr_db} dB, of the best MCS's", adaptive / alone[best], "", "≥", NEAR, "{:.2f}", note)
             )
     for mean_db in MEANS_DB:
-        loads = {name: most((name,), mean_db) for name in RUNGS}
+        loads = {name: most((name,), mean_db) for name in RATES}
         best = max(loads, key=loads.__getitem__)
-        adaptive = most(tuple(RUNGS), mean_db)
+        adaptive = most(tuple(RATES), mean_db)
         note = f"{adaptive:.0f} messages/s at PDR ≥ {PDR}; best {best}, {loads[best]:.0f}"
-        what = f"rate, Rayleigh {DOPPLER_HZ:g} Hz, {mean_db:g} dB, of the best rung's"
+        what = f"rate, Rayleigh {DOPPLER_HZ:g} Hz, {mean_db:g} dB, of the best MCS's"
         gain = adaptive / loads[best] if loads[best] else float("inf")
         rows.append(Row(what, gain, "", "≥", GAIN, "{:.2f}", note))
     return rows

@@ -16,8 +16,9 @@ from math import inf
 from typing import Any, Literal
 
 from bench.rows import Row
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.settings.config import TopicOptions
@@ -106,7 +107,7 @@ def run(
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or TopicOptions())])
     events: list[SenderEvent] = []
     common = {"packet_len": packet_len}
-    sender = Endpoint(
+    sender = EndpointV1(
         registry,
         Settings(1, repair=repair, hears=back is not None, **common),  # type: ignore[arg-type]
         boot=1000,
@@ -114,14 +115,14 @@ def run(
         observer=events.append,
     )
     ends = [
-        Endpoint(None, Settings(2 + n, hears=back is not None, **common), boot=2000, keys=keys)  # type: ignore[arg-type]
+        EndpointV1(None, Settings(2 + n, hears=back is not None, **common), boot=2000, keys=keys)  # type: ignore[arg-type]
         for n in range(receivers)
     ]
     forward = [losses(seed * 1000 + n, loss, burst) for n in range(receivers)]
     backward = [losses(seed * 1000 + 500 + n, back or 0.0, burst) for n in range(receivers)]
-    sender.use_credit()
+    sender.pace.use_credit()
     for end in ends:
-        end.use_credit()
+        end.pace.use_credit()
     rng = random.Random(seed)
     count = 1 if once else int(seconds * hz)
     offset = rng.random() / hz
@@ -138,15 +139,15 @@ def run(
         now = index * slot
         index += 1
         while n < count and times[n] <= now:
-            sender.submit(0, payloads[n], times[n])
+            sender.messages.submit(0, payloads[n], times[n])
             n += 1
-        if sender.out_of_credit:
-            sender.credit()
-        data = sender.next_packet(now)
+        if sender.pace.out_of_credit:
+            sender.pace.credit()
+        sent = sender.next_packet(now)
         for number, end in enumerate(ends):
             lost = next(forward[number])
-            if data is not None and not lost:
-                for event in [*end.receive(data, now + slot), *end.handle_timeout(now + slot)]:
+            if sent is not None and not lost:
+                for event in [*end.receive(ReceivedPacket(sent.data), now + slot), *end.handle_timeout(now + slot)]:
                     if isinstance(event, Delivered):
                         serial = serials[event.payload]
                         assert serial > latest[number], "out of order, or twice"
@@ -154,11 +155,11 @@ def run(
                         arrived[number].append((now + slot, serial))
                         complete += 1
             if back is not None:
-                if end.out_of_credit:
-                    end.credit()
+                if end.pace.out_of_credit:
+                    end.pace.credit()
                 answer = end.next_packet(now)
                 if answer is not None and not next(backward[number]):
-                    sender.receive(answer, now + slot)
+                    sender.receive(ReceivedPacket(answer.data), now + slot)
         sender.handle_timeout(now)
         if complete == count * receivers and outcome.done == inf:
             outcome.done, outcome.sent_until = now + slot, sum(sender.sent.air.values())

@@ -22,8 +22,9 @@ from typing import Any
 from bench.repair import losses
 from bench.rows import Row
 from gr_ros2.gr.ends import message_codec
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, load_scenario
@@ -151,11 +152,11 @@ def run(
     forward, backward = losses(seed * 1000, loss, burst), losses(seed * 1000 + 500, loss, burst)
     air: Counter[str] = Counter()
     common = {"packet_len": packet_len, "hears": back, "queue_depth": source.queue_depth}
-    sender = Endpoint(case.registry, Settings(1, repair=AUTO, **common), boot=1000)  # type: ignore[arg-type]
-    receiver = Endpoint(None, Settings(2, **common), boot=2000)  # type: ignore[arg-type]
-    receiver.use_credit()
-    sender.use_credit()
-    sender.credit()
+    sender = EndpointV1(case.registry, Settings(1, repair=AUTO, **common), boot=1000)  # type: ignore[arg-type]
+    receiver = EndpointV1(None, Settings(2, **common), boot=2000)  # type: ignore[arg-type]
+    receiver.pace.use_credit()
+    sender.pace.use_credit()
+    sender.pace.credit()
     messages = iter(case.messages)
     coming = next(messages, None)
     until = case.messages[-1].t
@@ -168,24 +169,24 @@ def run(
             line = times[coming.topic_id]
             serials.setdefault((coming.topic_id, coming.payload), []).append(len(line))
             line.append(coming.t)
-            sender.submit(coming.topic_id, coming.payload, coming.t)
+            sender.messages.submit(coming.topic_id, coming.payload, coming.t)
             coming = next(messages, None)
-        data = sender.next_packet(now)
-        if data is not None:
-            sender.credit()
+        sent = sender.next_packet(now)
+        if sent is not None:
+            sender.pace.credit()
             air["sent"] += 1
         lost = next(forward)
-        if data is not None and not lost:
-            for event in [*receiver.receive(data, after), *receiver.handle_timeout(after)]:
+        if sent is not None and not lost:
+            for event in [*receiver.receive(ReceivedPacket(sent.data), after), *receiver.handle_timeout(after)]:
                 if isinstance(event, Delivered):
                     known = serials[event.topic_id, event.payload]
                     arrived[event.topic_id].append((after, known.pop(0) if len(known) > 1 else known[0]))
         if back:
-            if receiver.out_of_credit:
-                receiver.credit()
+            if receiver.pace.out_of_credit:
+                receiver.pace.credit()
             answer = receiver.next_packet(now)
             if answer is not None and not next(backward):
-                sender.receive(answer, after)
+                sender.receive(ReceivedPacket(answer.data), after)
         sender.handle_timeout(now)
     air.update(sender.sent.air)
     topics = [

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from fuzz.loop import main
 from gr_ros2.calls import Calls, Offer, Request, Service
 from gr_ros2.calls.engine import MAX_CALLS
-from gr_ros2.calls.frames import Frame, read_frame, write_frame
+from gr_ros2.calls.frames import CallFrame, read_frame, write_frame
 
 _OWN, _BOOT = 2, 20
 _OFFERS = {5: Offer("/robot_2/add", 1.0), 6: Offer("/robot_2/map")}
@@ -42,8 +42,8 @@ def steps(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def corpus() -> list[bytes]:
     """Scripts of requests, of replies, and of both."""
-    requests = [write_frame(Frame(_OWN, _BOOT, n + 1, b"payload", 5 + n % 3, n % 4)) for n in range(40)]
-    replies = [write_frame(Frame(_OWN, _BOOT, n // 2 + 1, b"payload")) for n in range(40)]
+    requests = [write_frame(CallFrame(_OWN, _BOOT, n + 1, b"payload", 5 + n % 3, n % 4)) for n in range(40)]
+    replies = [write_frame(CallFrame(_OWN, _BOOT, n // 2 + 1, b"payload")) for n in range(40)]
     scripts = []
     for frames in (requests, replies, [*requests[:20], *replies], requests * 2):
         heads = [bytes((n * 37 % 256,)) for n in range(len(frames))]

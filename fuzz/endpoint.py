@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 from fuzz.loop import main, work
 from gr_ros2.core.errors import WireError
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import v1
@@ -28,8 +29,8 @@ _SETTINGS = Settings(9, packet_len=PACKET_LEN, max_sources=3, max_source_bytes=8
 
 def endpoint(data: bytes) -> None:
     """A script of packets: each a byte that says how long to wait and whether the CRC is right, then its bytes."""
-    end = Endpoint(_TOPICS, _SETTINGS, boot=7)
-    end.use_credit()
+    end = EndpointV1(_TOPICS, _SETTINGS, boot=7)
+    end.pace.use_credit()
     now = 0.0
     latest: dict[tuple[int, int, int], tuple[int, int]] = {}
     for wait, boot, body in steps(data):
@@ -37,9 +38,10 @@ def endpoint(data: bytes) -> None:
         packet = body + (b"\0" * 4 if boot is None else v1.crc(body, v1.session_crc(boot, _turns(end, body))))
 
         def take(packet: bytes = packet, now: float = now) -> tuple[list[ReceiverEvent], bytes | None]:
-            events = end.receive(packet, now) + end.handle_timeout(now)
-            end.credit()
-            return events, end.next_packet(now)
+            events = end.receive(ReceivedPacket(packet), now) + end.handle_timeout(now)
+            end.pace.credit()
+            sent = end.next_packet(now)
+            return events, None if sent is None else sent.data
 
         lines, (events, answer) = work(take)
         assert lines < MOST_LINES, f"{lines} lines"
@@ -55,12 +57,12 @@ def endpoint(data: bytes) -> None:
             assert neighbour.inbox.held <= _SETTINGS.max_source_bytes
 
 
-def _turns(end: Endpoint, body: bytes) -> int:
+def _turns(end: EndpointV1, body: bytes) -> int:
     """How often the number of a forged packet has wrapped around: as its hello says, or as the receiver takes it."""
     try:
         header = v1.read_header(body + bytes(v1.CRC_LEN), PACKET_LEN)
-        if header.qos == v1.QOS_STANDING and (standing := v1.read_standing(body, header.size, len(body))).clear:
-            entries = v1.read_body(body[header.size + standing.size :], v1.body_room(PACKET_LEN))
+        if header.qos == v1.QOS_REPAIR and (repair := v1.read_repair_header(body, header.size, len(body))).clear:
+            entries = v1.read_body(body[header.size + repair.size :], v1.body_room(PACKET_LEN))
             return next((entry.turns for entry in entries if isinstance(entry, Hello)), 0)
         neighbour = end.neighbours.get(header.src_id)
         return 0 if neighbour is None else neighbour.number(header.number) >> 16
@@ -79,15 +81,15 @@ def corpus() -> list[bytes]:
     rng = random.Random(2)
     scripts = []
     for robot_id, boot in ((1, 11), (2, 22), (9, 11)):
-        sender = Endpoint(_TOPICS, Settings(robot_id, packet_len=PACKET_LEN, packet_rate=75), boot=boot)
+        sender = EndpointV1(_TOPICS, Settings(robot_id, packet_len=PACKET_LEN, packet_rate=75), boot=boot)
         packets = []
         for number in range(60):
             if number % 3 == 0:
-                sender.submit(number // 3 % 3, rng.randbytes(rng.choice((4, 30, 100))), number / 75)
-            packet = sender.next_packet(number / 75)
-            if packet is not None:
+                sender.messages.submit(number // 3 % 3, rng.randbytes(rng.choice((4, 30, 100))), number / 75)
+            sent = sender.next_packet(number / 75)
+            if sent is not None:
                 head = rng.choice((0, 1, 2, 3)) | (8 if boot == 22 else 0)
-                packets.append(bytes((head,)) + packet[: -v1.CRC_LEN])
+                packets.append(bytes((head,)) + sent.data[: -v1.CRC_LEN])
         scripts.append(packets)
     shuffled = rng.sample(scripts[0], len(scripts[0]))
     thinned = [packet for packet in scripts[1] if rng.random() < 0.7]
@@ -98,16 +100,17 @@ def corpus() -> list[bytes]:
 def jumps() -> list[bytes]:
     """A sender of boot 11 that goes through all numbers that there are."""
 
-    def packet(low: int, standing: v1.Standing | None, *entries: v1.Entry) -> bytes:
-        header = v1.Header(0 if standing is None else v1.QOS_STANDING, False, 1, low & 0xFFFF)
-        data = v1.write_header(header) + (b"" if standing is None else v1.write_standing(standing))
+    def packet(low: int, repair: v1.RepairHeader | None, *entries: v1.EntryV1) -> bytes:
+        header = v1.Header(0 if repair is None else v1.QOS_REPAIR, False, 1, low & 0xFFFF)
+        data = v1.write_header(header) + (b"" if repair is None else v1.write_repair_header(repair))
         return bytes((2,)) + (data + v1.write_body(entries, v1.body_room(PACKET_LEN))).ljust(_STEP - 1, b"\0")
 
     far = [
-        packet(7, v1.Standing(3, clear=True), Hello(11, turns, 1, 0)) for turns in (0, 0xFFFF, 0xFFFF_FFFE, 0xFFFF_FFFF)
+        packet(7, v1.RepairHeader(3, clear=True), Hello(11, turns, 1, 0))
+        for turns in (0, 0xFFFF, 0xFFFF_FFFE, 0xFFFF_FFFF)
     ]
     steps = [packet(number * 32_000, None) for number in range(1, 20)]
-    chain = [packet(number, v1.Standing(number % 128, 3)) for number in range(20, 300)]
+    chain = [packet(number, v1.RepairHeader(number % 128, 3)) for number in range(20, 300)]
     return [far[0], *steps, *chain, packet(300, None), *far, *steps]
 
 

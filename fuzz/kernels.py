@@ -40,10 +40,10 @@ def stream(setting: int) -> tuple[Any, frozenset[bytes], Samples]:
     draw = random.Random(setting)
     packets = [draw.randbytes(PACKET_LEN) for _ in range(BURSTS)]
     parts = [np.zeros(150, np.complex64)]
-    rungs = phy.running_modem.rungs
+    rates = phy.running_modem.rates
     for number, packet in enumerate(packets):
-        rung = rungs[2 * number % len(rungs)]
-        parts += [rung.modulate(packet), np.zeros(phy.gap, np.complex64)]
+        mcs = rates[2 * number % len(rates)]
+        parts += [mcs.modulate(packet), np.zeros(phy.gap, np.complex64)]
     whole = np.concatenate([*parts, np.zeros(300, np.complex64)])
     if phy.receiver_taps is not None:
         whole = np.convolve(whole, phy.receiver_taps)
@@ -81,7 +81,7 @@ def anywhere(modem: Any, samples: Samples, start: int) -> None:
             if reading is not None and reading.soft is None:
                 assert reading.end > len(samples)
             elif reading is not None:
-                assert len(reading.soft) >= modem.rungs[reading.rung].frames.bits(reading.length)
+                assert len(reading.soft) >= modem.rates[reading.mcs].frames.bits(reading.length)
 
 
 def steps(data: bytes) -> Iterator[tuple[int, float, int]]:

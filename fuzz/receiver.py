@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import partial
 
 from fuzz.loop import main, within
-from gr_ros2.link import Delivered, Lost, Receiver, ReceiverEvent, Rejected, Sender
+from gr_ros2.link import Delivered, Lost, ReceivedPacket, Receiver, ReceiverEvent, Rejected, Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import with_crc, without_crc
@@ -35,7 +35,7 @@ def _hear(data: bytes) -> None:
     for wait, intact, body in steps(data):
         now += wait
         packet = with_crc(body) if intact else body + b"\0\0"
-        events += engine.receive(packet, now)
+        events += engine.receive(ReceivedPacket(packet), now)
         given += 1
         assert engine.held_bytes <= _CONFIG.max_bytes
         timeout = engine.next_timeout()
@@ -66,8 +66,8 @@ def corpus() -> list[bytes]:
         for number in range(30):
             sender.submit(number % 3, rng.randbytes(rng.choice((4, 30, 100))), 0.0)
         packets = []
-        while (packet := sender.next_packet(0.0)) is not None:
-            packets.append(bytes([rng.randrange(4)]) + without_crc(packet))
+        while (sent := sender.next_packet(0.0)) is not None:
+            packets.append(bytes([rng.randrange(4)]) + without_crc(sent.data))
         scripts.append(packets)
     shuffled = rng.sample(scripts[0], len(scripts[0]))
     thinned = [packet for packet in scripts[1] if rng.random() < 0.7]

@@ -9,7 +9,7 @@ from functools import partial
 from fuzz.loop import main, within
 from gr_ros2.core.errors import WireError
 from gr_ros2.wire import decode
-from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0, with_crc, without_crc
 
 BASE, PER_BYTE = 300, 2
 """Lines of Python that a packet may take, and more for each byte of it."""
@@ -48,8 +48,8 @@ def corpus() -> list[bytes]:
     rng = random.Random(1)
     found = [b"", bytes(5), bytes(12), bytes(64)]
     for count in range(1, 16):
-        entries = [Entry(n % 16, n, 0, 1 + n, rng.randbytes(n)) for n in range(count)]
-        found.append(without_crc(V0.encode(Packet(1, 255, count, 1, tuple(entries), qos=count % 3), 300)))
+        entries = [EntryV0(n % 16, n, 0, 1 + n, rng.randbytes(n)) for n in range(count)]
+        found.append(without_crc(V0.encode(PacketV0(1, 255, count, 1, tuple(entries), qos=count % 3), 300)))
     return found
 
 

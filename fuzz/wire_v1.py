@@ -8,8 +8,8 @@ from fuzz.loop import main
 from gr_ros2.core.errors import WireError
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Ask, Hello, Report
-from gr_ros2.wire.table import Row, read_table, write_table
-from gr_ros2.wire.v1 import BROADCAST, Header, Packet, Part, Standing, decode, encode
+from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
+from gr_ros2.wire.v1 import BROADCAST, Header, PacketV1, Part, RepairHeader, decode, encode
 
 BOOT = 1_700_000_000
 
@@ -44,16 +44,21 @@ def corpus() -> list[bytes]:
     found = [b"", bytes(5), bytes(12), b"\x10" + bytes(63)]
     parts = [Part(n, rng.randbytes(n + 1), n * 9, n * 300, bool(n % 2)) for n in range(1, 8)]
     for count in range(8):
-        source = Packet(Header(count % 3, False, 1, count, *((3, 1) if count % 2 else ())), tuple(parts[:count]))
+        source = PacketV1(Header(count % 3, False, 1, count, *((3, 1) if count % 2 else ())), tuple(parts[:count]))
         found.append(encode(source, 300, BOOT, fixed=count < 4)[: -v1.CRC_LEN])
     hello = Hello(BOOT, 0, v1.TAG_LEN, 99, ((1, 2), (3, 4)))
     control = (hello, Ask(1, b"\xf0\1"), Report(1, 2, 3, 1 << 63, True, 12))
-    found.append(encode(Packet(Header(3, False, 2, 7), control, Standing(5, clear=True)), 80, BOOT)[: -v1.CRC_LEN])
+    found.append(
+        encode(PacketV1(Header(3, False, 2, 7), control, RepairHeader(5, clear=True)), 80, BOOT)[: -v1.CRC_LEN]
+    )
     for mask in (1, 0xFF, 0x101, (1 << 127) - 3):
-        standing = v1.read_standing(v1.write_standing(Standing(9, mask, True)), 0, 20)
-        repair = Packet(Header(3, False, 2, 7), (), standing, rng.randbytes(40))
-        found.append(encode(repair, 80, BOOT)[: -v1.CRC_LEN])
-    rows = [Row(0, "odom", "nav_msgs/msg/Odometry", 1, True), Row(239, "map", "nav_msgs/msg/OccupancyGrid", 2)]
+        repair = v1.read_repair_header(v1.write_repair_header(RepairHeader(9, mask, True)), 0, 20)
+        combination = PacketV1(Header(3, False, 2, 7), (), repair, rng.randbytes(40))
+        found.append(encode(combination, 80, BOOT)[: -v1.CRC_LEN])
+    rows = [
+        AnnouncedTopic(0, "odom", "nav_msgs/msg/Odometry", 1, True),
+        AnnouncedTopic(239, "map", "nav_msgs/msg/OccupancyGrid", 2),
+    ]
     found.append(write_table(rows))
     return found
 

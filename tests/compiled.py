@@ -19,7 +19,8 @@ def compiled(config: pytest.Config, source: Path, name: str, options: Sequence[s
     :param options: of ``g++``; those behind the source are libraries (``-l…``)
     """
     number = hashlib.sha256(source.read_bytes() + repr(options).encode()).hexdigest()[:16]
-    folder = Path(config.cache.mkdir("compiled")) / f"{source.stem}-{number}"
+    folder = config.rootpath / ".pytest_cache" / "compiled" / f"{source.stem}-{number}"
+    folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait until one has made it
         if not folder.exists():

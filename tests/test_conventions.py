@@ -1,13 +1,19 @@
-"""What holds of every test: it says what it expects, and expects nothing of the machine's speed."""
+"""What holds of every test and of the names of classes.
+
+A test says what it expects, and expects nothing of the machine's speed. A class has its name to itself.
+"""
 
 from __future__ import annotations
 
 import ast
+from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
 TESTS = Path(__file__).parent
+PACKAGE = TESTS.parent / "gr_ros2"
 EXPECTING = {"raises", "fail", "wait_for"}
 """Calls that fail a test which does not see what it expects; so do helpers named ``check…``."""
 
@@ -143,3 +149,26 @@ def test_what_a_slow_machine_does_not_break_is_left_alone(text: str) -> None:
 def test_a_test_without_an_assertion_is_found() -> None:
     helped, alone = "def helper(): assert 1\ndef test_one(): helper()", "def test_two(): wait_for(print)"
     assert silent(ast.parse(f"{helped}\n{alone}\ndef test_three(): print()")) == ["test_three"]
+
+
+def shared(modules: Iterable[tuple[str, ast.Module]]) -> dict[str, list[str]]:
+    """Names of classes that several modules define, with these modules: a public name of any two modules, a private
+    one of two modules of one folder."""
+    found: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    for module, tree in modules:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                folder = module.split("/", maxsplit=1)[0] if node.name.startswith("_") else ""
+                found[folder, node.name].append(module)
+    return {name: modules for (_, name), modules in found.items() if len(modules) > 1}
+
+
+def test_a_class_has_its_name_to_itself() -> None:
+    paths = sorted(PACKAGE.rglob("*.py"))
+    assert shared((str(path.relative_to(PACKAGE)), ast.parse(path.read_text())) for path in paths) == {}
+
+
+def test_two_classes_of_one_name_are_found() -> None:
+    one, two = ast.parse("class Pace: ...\nclass _End: ..."), ast.parse("class Pace: ...\nclass _End: ...")
+    assert shared([("a/one.py", one), ("b/two.py", two)]) == {"Pace": ["a/one.py", "b/two.py"]}
+    assert set(shared([("a/one.py", one), ("a/two.py", two)])) == {"Pace", "_End"}

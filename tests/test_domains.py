@@ -7,6 +7,7 @@ from itertools import cycle
 
 import pytest
 
+from gr_ros2.core.errors import MiddlewareError
 from tests import domains
 from tests.domains import domain, free_domains, give_back
 
@@ -19,7 +20,7 @@ def only(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
 def test_a_domain_is_handed_out_again_only_when_it_was_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     (number,) = free_domains(1)
     only(monkeypatch, number)
-    with pytest.raises(RuntimeError, match="in use"):
+    with pytest.raises(MiddlewareError, match="in use"):
         free_domains(1)
     give_back()
     assert free_domains(1) == [number]
@@ -31,7 +32,7 @@ def test_a_domain_that_a_program_uses_is_not_handed_out(monkeypatch: pytest.Monk
     only(monkeypatch, number)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("", 7400 + 250 * number + 12))  # its second participant
-        with pytest.raises(RuntimeError, match="in use"):
+        with pytest.raises(MiddlewareError, match="in use"):
             free_domains(1)
 
 

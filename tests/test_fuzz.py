@@ -15,6 +15,7 @@ import fuzz.calls
 import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
+import fuzz.mac
 import fuzz.receiver
 import fuzz.structure
 import fuzz.type_description
@@ -26,6 +27,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import fuzz.framing
 import fuzz.kernels
+import fuzz.medium
 import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
@@ -34,6 +36,7 @@ HARNESSES = {
     "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
+    "mac": (fuzz.mac.mac, fuzz.mac.corpus),
     "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "structure": (fuzz.structure.structure, fuzz.structure.corpus),
@@ -41,6 +44,7 @@ HARNESSES = {
     "control_socket": (fuzz.control_socket.control_socket, fuzz.control_socket.corpus),
     "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
+    "medium": (fuzz.medium.medium, fuzz.medium.corpus),
     "wifi": (fuzz.wifi.wifi, fuzz.wifi.corpus),
 }
 COUNTS = {
@@ -48,6 +52,7 @@ COUNTS = {
     "wire_v1": 20_000,
     "endpoint": 400,
     "receiver": 1_500,
+    "mac": 400,
     "calls": 4_000,
     "compression": 2_000,
     "structure": 1_500,

@@ -22,6 +22,7 @@ LAYERS = (
     {"wire", "state"},
     {"settings"},
     {"link", "calls"},
+    {"mac"},
     {"middleware", "compression"},
     {"phy", "sim", "grc"},
     {"medium"},
@@ -38,7 +39,7 @@ LAYERS = (
 
 MAY_PRINT = {"cli", "ros"}
 
-PURE = {"wire", "link", "calls"}
+PURE = {"wire", "link", "mac", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
@@ -56,6 +57,7 @@ WITHOUT_BACKENDS = (
     "gr_ros2.wire",
     "gr_ros2.link",
     "gr_ros2.calls",
+    "gr_ros2.mac",
     "gr_ros2.settings.registry",
     "gr_ros2.settings.config",
     "gr_ros2.compression",
@@ -82,9 +84,13 @@ KNOW_THEIR_VERSION = (
     "link/partials.py",
     "link/sequence.py",
     "link/v1/",
+    "mac/",
+    "link/reader.py",
 )
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
 COMPARES_WITH_VERSION_0 = ("race/race_settings.py",)
+FACTORY = "gr/ends.py"
+"""The module outside ``link`` that makes the endpoint of a version."""
 SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "settings"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
@@ -187,8 +193,15 @@ def test_nothing_but_its_engines_knows_a_version_of_the_wire_format(module: str)
     assert known or set(inside) <= public
 
 
+@pytest.mark.parametrize("module", [module for module in MODULES if part(module) not in {"wire", "link"}])
+def test_one_factory_knows_the_engine_of_a_version(module: str) -> None:
+    """All others work with the two sides of an Endpoint (``link/endpoint.py``)."""
+    engines = [name for name in imports(parsed(module)) if name.startswith("gr_ros2.link.v1")]
+    assert (engines != []) == (module == FACTORY)
+
+
 @pytest.mark.parametrize(
-    "module", [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith("link/v1/")]
+    "module", [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith(("link/v1/", "link/reader.py"))]
 )
 def test_no_width_of_a_field_stands_outside_of_the_wire(module: str) -> None:
     """``x & 255``, ``x % 256``, ``randrange(256)``, ``x << 4``: written by who knows that a field has 8 or 4 bits."""
@@ -253,3 +266,9 @@ for name in {wanted!r}:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_picture_of_the_architecture_shows_these_layers() -> None:
+    page = (ROOT.parent / "docs" / "explanation" / "architecture.md").read_text("utf-8")
+    shown = page.split("lies below it:", maxsplit=1)[1].split("```", maxsplit=1)[0]
+    assert [set(layer.split()) for layer in shown.split("│")] == [*LAYERS]

@@ -90,13 +90,13 @@ def withheld(**sink: Any) -> list[bytes]:
     """Messages that are taken of sealed packets which somebody held back for 5 s."""
     take = end_settings(None, SinkConfig(robot_id=2, **sink), hears=True)
     one = Robot(1, registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
-    two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s)
+    two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s, max_ages=take.max_ages)
     air = Air(one, two)
     air.run(2.0)
     air.lost = lambda sender, _: sender is one
     before = len(air.recorded)
     for number in range(10):
-        one.end.submit(0, b"late %d" % number, air.now)
+        one.end.messages.submit(0, b"late %d" % number, air.now)
         air.run(0.1)
     held = [data for sender, data in air.recorded[before:] if sender is one]
     air.robots = [two]
@@ -139,7 +139,9 @@ effects(
     deadline_s=run(OPTION + "scan.deadline_s=0.2"),
     weight=run(OPTION + "odom.weight=1"),
     max_rate=run(OPTION + "odom.max_rate=5"),
+    max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
     codec=run(OPTION + "odom.codec=zstd"),
+    keep_s=Elsewhere("tests/link/v1/test_latest_state.py"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
     reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, "reports={}", scenario="paper-ofdm-paced"),
@@ -157,6 +159,7 @@ effects(
     robot_id=run("ros_source.robot_id=7"),
     middleware=Elsewhere("tests/core/test_backends.py"),
     domain_id=Elsewhere("tests/gr/test_source.py"),
+    commands=run("ros_source.commands=[]", OPTION + "cmd_vel={qos: auto}"),
     dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=run(OPTION + "odom.max_rate=5"),
     debug=Elsewhere("tests/gr/test_source.py"),
@@ -176,6 +179,7 @@ effects(
     repeat_s=run("ros_source.repeat_s=0.5"),
     compression=run("ros_source.compression=false"),
     repair=run("ros_source.repair='off'", scenario="paper-ofdm-paced"),
+    beacon_s=Elsewhere("tests/link/v1/test_commands.py"),
     expected_loss=run("ros_source.expected_loss=0.6", LOSSY, "ros_source.repair=thrifty", scenario="paper-ofdm-paced"),
 )
 effects(
@@ -192,6 +196,7 @@ effects(
     dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
     topic_options=Elsewhere("tests/gr/test_sink.py"),
     debug=Elsewhere("tests/gr/test_readable.py"),
+    commands=Elsewhere("tests/link/v1/test_commands.py"),
     namespace_format=Elsewhere("tests/gr/test_sink.py"),
     publisher_depth=Elsewhere("tests/gr/test_sink.py"),
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
@@ -250,6 +255,19 @@ effects(
     doppler_hz=Elsewhere("tests/phy/test_channel.py"),
 )
 effects(
+    "Channel of a scenario",
+    carrier_hz=Elsewhere("tests/medium/test_propagation.py"),
+    decorrelation_m=Elsewhere("tests/medium/test_positions.py"),
+    exponent=Elsewhere("tests/medium/test_propagation.py"),
+    height_m=Elsewhere("tests/medium/test_propagation.py"),
+    model=Elsewhere("tests/medium/test_propagation.py"),
+    noise_figure_db=Elsewhere("tests/run/test_robots.py"),
+    shadowing_db=Elsewhere("tests/medium/test_positions.py"),
+    tx_power_dbm=Elsewhere("tests/medium/test_positions.py"),
+    walls_db=Elsewhere("tests/medium/test_positions.py"),
+    **{"from": Elsewhere("tests/medium/test_positions.py")},
+)
+effects(
     "PHY",
     name=run("phy.name=psk", "phy.options={}"),
     sample_rate=run("phy.sample_rate=200000"),
@@ -272,6 +290,14 @@ effects(
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
     reports=run("reports={}", LOSSY),
+    airtime=run("airtime=eu869.4"),
+)
+effects(
+    "Airtime",
+    band=run("airtime.band=eu868"),
+    duty_cycle=run("airtime.duty_cycle=0.1"),
+    window_s=run("airtime.window_s=10", "airtime.duty_cycle=0.1"),
+    max_burst_s=run("airtime.max_burst_s=0.2"),
 )
 effects(
     "Reports",
@@ -291,6 +317,7 @@ effects(
     seal=BOTH_ENDS["seal"],
     state=BOTH_ENDS["state"],
     localhost_only=LOCAL,
+    own_domains=Elsewhere("tests/run/test_domains.py"),
     description=Elsewhere("tests/run/test_scenario.py"),
     repetitions=Elsewhere("tests/run/test_repeat.py"),
     time=Elsewhere("tests/run/test_simulated_runner.py"),
@@ -301,6 +328,7 @@ effects(
 for part in ("channel", "ros_source", "ros_sink"):
     EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
+effects("Scenario", medium=Elsewhere("tests/run/test_medium_access.py"))
 effects(
     "Robot",
     ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),
@@ -315,8 +343,12 @@ effects(
     ros_source=EFFECTS["Scenario", "ros_source"],
     ros_sink=EFFECTS["Scenario", "ros_sink"],
     phy=EFFECTS["Scenario", "phy"],
+    airtime=EFFECTS["Scenario", "airtime"],
+    medium=EFFECTS["Scenario", "medium"],
     localhost_only=LOCAL,
     front_end=Elsewhere("tests/radio/test_devices.py"),
+    transmit=Elsewhere("tests/radio/test_permission.py"),
+    open=Elsewhere("tests/radio/test_permission.py"),
     record=Elsewhere("tests/radio/test_radio.py"),
     diagnostics=Elsewhere("tests/radio/test_diagnostics.py"),
 )
@@ -374,7 +406,7 @@ for name in ("match_s", "drain_s", "seed"):
 elsewhere(
     "PHY `ofdm`",
     phy_ofdm="gap lengths fec payload_modulation fft_len carriers pilots scramble detection_threshold",
-    phy_ofdm_rate="cp_len rate rungs",
+    phy_ofdm_rate="cp_len rate rates",
 )
 elsewhere("PHY `gfsk`", phy_contract="gap lengths", phy_burst="fec sps bt")
 elsewhere("PHY `psk`", phy_contract="gap lengths", phy_burst="fec sps rolloff", phy_snr="modulation")
@@ -389,7 +421,7 @@ elsewhere(
 elsewhere("PHY `modem`", phy_modem="bit_rate overhead_bytes overhead_s")
 for name in ("sim", "zmq", "file", "soapy", "uhd", "pluto", "kiss", "serial", "udp"):
     elsewhere(f"Front end `{name}`", radio_devices="guard_s")
-elsewhere("Front end `zmq`", radio_zmq="bind connect burst_queue")
+elsewhere("Front end `zmq`", radio_zmq="bind connect burst_queue", radio_medium="medium_process")
 elsewhere("Front end `file`", radio_file="write read speed repeat")
 for name in ("soapy", "uhd"):
     elsewhere(
@@ -411,13 +443,13 @@ elsewhere(
 EFFECTS["Front end `pluto`", "buffer_rx"] = Hardware("gr-iio hands it to a Pluto as it is")
 for name in ("kiss", "serial", "udp"):
     elsewhere(f"Front end `{name}`", radio_devices="half_duplex")
-elsewhere("Front end `kiss`", radio_modems="device baud callsign")
+elsewhere("Front end `kiss`", radio_modems="device baud callsign", radio_packet_radios="backoff_s")
 effects(
     "Front end `kiss`",
     destination=lambda: (ui_header("GRROS2", "AA1AA"), ui_header("OTHERS", "AA1AA")),
     tnc_port=lambda: (Kiss(64, Counter(), port=0).frame(b"x"), Kiss(64, Counter(), port=1).frame(b"x")),
 )
-elsewhere("Front end `serial`", radio_modems="device baud framing")
+elsewhere("Front end `serial`", radio_modems="device baud framing", radio_packet_radios="rssi backoff_s")
 elsewhere("Front end `udp`", radio_modems="listen send_to")
 
 
@@ -450,6 +482,8 @@ def other(setting: Setting) -> Any:
         return "somewhere"
     if isinstance(setting.default, bool):
         return not setting.default
+    if isinstance(setting.default, tuple):
+        return ("other",)
     choices = [choice for choice in setting.choices if choice not in (setting.default, AUTO)]
     if choices:
         return choices[0]
@@ -488,7 +522,7 @@ def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
     with pytest.raises(ConfigError, match="greedy cannot change while running; these can: packet_rate, dst_id"):
         end.reconfigure(greedy=True)
     end.reconfigure(queue_depth=3)
-    assert end.depth(0) == 3
+    assert end.messages.depth(0) == 3
 
 
 def test_a_seal_needs_a_key_and_a_shared_setting_is_refused_once() -> None:

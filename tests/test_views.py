@@ -94,6 +94,18 @@ def test_foxglove_shows_the_same_and_every_panel_is_laid_out() -> None:
     assert {"globalVariables", "userNodes", "playbackConfig"} <= set(FOXGLOVE)
 
 
+def test_the_layout_of_a_live_link_names_what_it_publishes() -> None:
+    layout = json.loads((EXAMPLES / "link-foxglove.json").read_text())
+    panels = layout["configById"]
+    assert {name.partition("!")[0] for name in panels} == {"DiagnosticSummary", "DiagnosticStatusPanel", "RawMessages"}
+    parts = [panels[f"DiagnosticStatusPanel!{part}"]["selectedName"] for part in ("receiver", "transmitter")]
+    assert parts == [
+        "gr_ros2_link_1: receiver",
+        "gr_ros2_link_1: transmitter",
+    ]  # as tests/radio/test_diagnostics.py has
+    assert panels["RawMessages!counters"]["topicPath"] == "/gr_ros2_link_1/statistics"
+
+
 @pytest.mark.slow
 def test_a_run_publishes_all_of_it_in_frames_that_lead_to_the_map(tmp_path: Path) -> None:
     (number,) = free_domains(1)

@@ -30,7 +30,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from math import inf
 
-from gr_ros2.calls.frames import MAX_DEADLINE_S, NO_DEADLINE, Frame, read_frame, write_frame
+from gr_ros2.calls.frames import MAX_DEADLINE_S, NO_DEADLINE, CallFrame, read_frame, write_frame
 from gr_ros2.core.errors import WireError
 
 MAX_CALLS = 256
@@ -57,7 +57,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Outgoing:
+class OutgoingFrame:
     """A frame to be sent. It is useless after ``lifespan_s`` seconds; infinity means that there is no limit."""
 
     data: bytes
@@ -137,7 +137,7 @@ class Calls:
 
     def call(
         self, service: Service, token: Hashable, payload: bytes, *, deadline_s: float, now: float
-    ) -> Outgoing | None:
+    ) -> OutgoingFrame | None:
         """Make a call.
 
         :param token: given back with the reply
@@ -154,8 +154,8 @@ class Calls:
         deadline_s = deadline_s if deadline_s <= MAX_DEADLINE_S else NO_DEADLINE
         expires = now + deadline_s if deadline_s else inf
         self._made[self._number] = _Made(service, token, expires)
-        frame = Frame(robot, boot, self._number, payload, service.service_id, deadline_s)
-        return Outgoing(write_frame(frame), deadline_s or inf)
+        frame = CallFrame(robot, boot, self._number, payload, service.service_id, deadline_s)
+        return OutgoingFrame(write_frame(frame), deadline_s or inf)
 
     def withdrawn(self, robot: int, service_ids: Iterable[int]) -> None:
         """A robot no longer has these services. Calls of them will not be answered."""
@@ -164,7 +164,7 @@ class Calls:
 
     # ---- calls of other robots
 
-    def reply(self, ticket: int, payload: bytes, now: float) -> Outgoing | None:
+    def reply(self, ticket: int, payload: bytes, now: float) -> OutgoingFrame | None:
         """The server here has replied to a request.
 
         :return: what to send; None if nobody waits for it any more
@@ -175,7 +175,9 @@ class Calls:
             self.counters["late"] += 1
             return None
         self.counters[f"replied:{served.name}"] += 1
-        return Outgoing(write_frame(Frame(served.robot, served.boot, served.number, payload)), served.expires - now)
+        return OutgoingFrame(
+            write_frame(CallFrame(served.robot, served.boot, served.number, payload)), served.expires - now
+        )
 
     # ---- frames
 
@@ -218,7 +220,7 @@ class Calls:
         return len(self._made), len(self._served)
 
     def _request(
-        self, sender: tuple[int, int], frame: Frame, offers: Mapping[int, Offer], now: float
+        self, sender: tuple[int, int], frame: CallFrame, offers: Mapping[int, Offer], now: float
     ) -> Request | Answer | None:
         robot, boot = sender
         newest, last = self._last.get(robot, (-1, 0))
@@ -238,7 +240,7 @@ class Calls:
         self._served[self._ticket] = _Served(name, robot, boot, frame.number, expires)
         return Request(self._ticket, frame.service_id, frame.payload)
 
-    def _answer(self, sender: tuple[int, int], frame: Frame) -> Request | Answer | None:
+    def _answer(self, sender: tuple[int, int], frame: CallFrame) -> Request | Answer | None:
         made = self._made.get(frame.number)
         if made is None or (made.service.robot, made.service.boot) != sender:
             return self._dropped("late")

@@ -22,7 +22,7 @@ _DEADLINES_PER_S = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class CallFrame:
     """A request or a reply.
 
     :param dst_id: robot for which it is, 0..254
@@ -45,7 +45,7 @@ class Frame:
         return self.service_id >= 0
 
 
-def write_frame(frame: Frame) -> bytes:
+def write_frame(frame: CallFrame) -> bytes:
     """The bytes of a frame.
 
     :raises EncodeError: a field out of range
@@ -61,7 +61,7 @@ def write_frame(frame: Frame) -> bytes:
     return head + _TAIL.pack(frame.service_id, max(tenths, 1) if frame.deadline_s else 0) + frame.payload
 
 
-def read_frame(data: bytes) -> Frame:
+def read_frame(data: bytes) -> CallFrame:
     """The frame of these bytes.
 
     :raises WireError: EntryBoundsError (cut off) or EntryKindError (neither a request nor a reply, or a field that
@@ -73,10 +73,10 @@ def read_frame(data: bytes) -> Frame:
     if kind not in (_REQUEST, _REPLY) or dst_id == 255 or not number:
         raise EntryKindError(f"kind {kind}, robot {dst_id} or number {number} in a frame of a call")
     if kind == _REPLY:
-        return Frame(dst_id, dst_boot, number, data[_HEAD.size :])
+        return CallFrame(dst_id, dst_boot, number, data[_HEAD.size :])
     if len(data) < _HEAD.size + _TAIL.size:
         raise EntryBoundsError(f"a request ends at byte {len(data)}")
     service_id, tenths = _TAIL.unpack_from(data, _HEAD.size)
     if service_id >= 240:
         raise EntryKindError(f"service {service_id} in a request")
-    return Frame(dst_id, dst_boot, number, data[_HEAD.size + _TAIL.size :], service_id, tenths / _DEADLINES_PER_S)
+    return CallFrame(dst_id, dst_boot, number, data[_HEAD.size + _TAIL.size :], service_id, tenths / _DEADLINES_PER_S)

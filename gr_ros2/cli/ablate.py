@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import SCENARIO, set_option
+from gr_ros2.cli.params import SCENARIO, set_option, written_line
 from gr_ros2.report.compare import write_comparison
 from gr_ros2.report.table import as_table
 from gr_ros2.run.scenario import Scenario
@@ -35,4 +35,4 @@ def ablate(
     grid = worth_grid(runs)
     written = write_comparison(runs, out, [grid])
     console.print(as_table(grid))
-    console.print(f"Written: {written[0]} and {len(written) - 1} files beside it", soft_wrap=True)
+    console.print(written_line(written), soft_wrap=True)

@@ -5,7 +5,7 @@ only its user may enter. A client sends one line of JSON and gets one line back.
 
 Invariants: no other user can connect. The socket of a killed program answers no more, and the next client removes it. A
 request never delays the program. Whatever a client sends or does not send, the next client gets an answer. Every wait
-has a deadline. At most one line is kept from each side.
+has a deadline. At most one line is kept from each side, of at most ``_LINE`` and ``_ANSWER`` bytes.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from typing import Any
 from gr_ros2.core.errors import GrRos2Error, RunError
 
 _LINE = 4096
+"""Most bytes of a request."""
+_ANSWER = 1 << 20
+"""Most bytes of an answer, such as the status of a link of 240 topics."""
 _MAX_CLIENTS = 32
 """Most clients at a time. When one more connects, the client that connected first is disconnected."""
 _REQUEST_S = 2.0
@@ -121,6 +124,7 @@ class ControlSocket:
                 time.sleep(_PAUSE_S)
             return True
         connection.setblocking(False)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ANSWER)
         if len(self._clients) >= _MAX_CLIENTS:
             self._disconnect(next(iter(self._clients)))
         client = self._clients[connection] = _Client(connection, time.monotonic() + _REQUEST_S)
@@ -239,4 +243,4 @@ def _ask(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
         client.settimeout(_WAIT_S)
         client.connect(str(path))
         client.sendall(json.dumps(query).encode() + b"\n")
-        return parse(receive(client, _LINE, deadline, b"\n"))
+        return parse(receive(client, _ANSWER, deadline, b"\n"))

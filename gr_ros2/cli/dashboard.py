@@ -6,9 +6,10 @@ import logging
 import socket
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -36,13 +37,21 @@ dashboard_option = click.option(
 
 
 @contextmanager
-def audience(where: str | None, console: Console, name: str, *, instruments: bool = True) -> Iterator[LateObservers]:
+def audience(
+    where: str | None,
+    console: Console,
+    name: str,
+    *,
+    instruments: bool = True,
+    answers: Mapping[str, Callable[[Any], Any]] = MappingProxyType({}),
+) -> Iterator[LateObservers]:
     """The observers of a run or a link: a dashboard from the start if ``where`` is given, or later when
     `gr-ros2 dashboard` asks for one.
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for clients that search for it
     :param instruments: see :class:`gr_ros2.run.observers.RunObserver`
+    :param answers: what clients may ask beside that, by name; called with the value given, in a thread of its own
     :raises ConfigError: when the dashboard cannot be served at this place
     :raises BackendMissingError: when the package that draws it is not installed
     """
@@ -59,14 +68,16 @@ def audience(where: str | None, console: Console, name: str, *, instruments: boo
                 urls.append(dashboard.url)
             return urls[0]
 
+        def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
+            known = {key: answers[key](value) for key, value in asked.items() if key in answers}
+            return known or {"url": serve(str(asked["address"]), int(asked["port"]))}
+
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)
         # The control socket closes before the dashboards, so that no client can ask for another one then.
         with ExitStack() as control_socket:
             try:
-                control_socket.enter_context(
-                    ControlSocket(name, lambda asked: {"url": serve(str(asked["address"]), int(asked["port"]))})
-                )
+                control_socket.enter_context(ControlSocket(name, answer))
             except (OSError, RunError) as error:
                 _log.warning("`gr-ros2 dashboard` cannot find this program (%s)", error)
             yield seen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
-from rich.status import Status
+from rich.live import Live
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
@@ -19,11 +20,14 @@ from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import RowName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.cli.ping import check
+from gr_ros2.cli.status import PING, STATUS, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.guard import Guard
+from gr_ros2.core.systemd import notify
 from gr_ros2.middleware import MIDDLEWARE
-from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
@@ -36,6 +40,8 @@ if TYPE_CHECKING:
     from gr_ros2.run.observers import LiveRun
 
 _SHOW_S = 0.5
+_LOOK_S = 3.0
+"""s after which the graph has told most of what is on it."""
 
 
 def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
@@ -45,7 +51,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path), required=False)
 @click.option("--robot", type=click.IntRange(0, BROADCAST - 1), help="Without CONFIG: number of this robot.")
-@click.option("--radio", type=RowName(FRONT_ENDS), help="Without CONFIG: what carries the packets.")
+@click.option("--radio", type=RowName(FRONT_ENDS, PRESETS), help="Without CONFIG: what carries the packets.")
 @_flag("listen", metavar="ADDRESS")
 @_flag("peer", metavar="ADDRESS", multiple=True)
 @_flag("device", metavar="ARGS")
@@ -58,6 +64,11 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.option("--middleware", type=RowName(MIDDLEWARE), help=f"Joins the ROS graph; default: {DEFAULT_MIDDLEWARE}.")
 @click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
+@click.option("--transmit/--listen-only", default=None, help="A radio may send here, or only receives.")
+@click.option("--open", "is_open", is_flag=True, help="A radio may send without a key, for anybody to read and forge.")
+@click.option(
+    "--check", "checks", is_flag=True, help="Say what this end and the others have, and what does not match; then end."
+)
 @set_option(LinkConfig)
 @dashboard_option
 @pcap_option
@@ -71,6 +82,9 @@ def link(
     middleware: str | None,
     save: Path | None,
     duration: float | None,
+    transmit: bool | None,
+    is_open: bool,
+    checks: bool,
     overrides: tuple[str, ...],
     dashboard: str | None,
     pcap: Path | None,
@@ -78,10 +92,15 @@ def link(
 ) -> int:
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph.
 
-    The YAML file CONFIG describes the link. Without it, --robot and --radio do.
+    The YAML file CONFIG describes the link. Without it, --robot and --radio do. The signal SIGUSR1 stops sending at
+    once, SIGUSR2 begins again.
     """
     if middleware is not None:
         overrides = (f"ros_source.middleware={middleware}", f"ros_sink.middleware={middleware}", *overrides)
+    if transmit is not None:
+        overrides = (f"transmit={str(transmit).lower()}", *overrides)
+    if is_open:
+        overrides = ("open=true", *overrides)
     given = {name.replace("_", "-"): value for name, value in flags.items() if value not in (None, ())}
     if config is not None:
         unused = [
@@ -100,19 +119,27 @@ def link(
         with uninterrupted():  # GNU Radio may be loaded
             values = one_line(robot, radio, registry, given, topics)
         settings = _in_one_line(values, overrides, save)
+    if checks:
+        return check(settings, duration)
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
         from gr_ros2.radio.robot_link import RobotLink
         from gr_ros2.run.observers import RunObservers
 
     console = make_console()
-    with audience(dashboard, console, settings.name) as clients, capture(pcap) as captures, ExitStack() as stack:
+    answers: dict[str, Callable[[Any], Any]] = {}
+    with ExitStack() as stack:
+        clients = stack.enter_context(audience(dashboard, console, settings.name, answers=answers))
+        captures = stack.enter_context(capture(pcap))
         run_observers = RunObservers([clients, *captures], threaded=True)
         stack.callback(run_observers.run_ended, None)
         running = RobotLink(settings, observer=run_observers, instrumented=True)
         stack.callback(running.stop)
+        for number, on in ((signal.SIGUSR1, False), (signal.SIGUSR2, True)):
+            signal.signal(number, lambda *_, on=on: running.transmit(on=on))
         try:
             running.start()
+            answers |= {STATUS: lambda _: running.stats(), PING: lambda robot: running.ping(int(robot))}
             run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
@@ -154,6 +181,7 @@ def _live(running: RobotLink) -> LiveRun:
         sources={source.src_id: source},
         links=(running.radio,),
         ledger=None,
+        received_as=running.sink.name_here,
     )
 
 
@@ -162,32 +190,59 @@ def _opening(running: Any) -> str:
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
     runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
-    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{runs_on}; Ctrl-C ends it"
+    on_air = f", sends {front_end.on_air(running.config.front_end_options)}" if front_end.has_radio else ""
+    on_air = on_air if running.sends else ", only receives"
+    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{on_air}{runs_on}; Ctrl-C ends it"
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:
-    """Print what runs and what it waits for, with one status line until the time is over or the link has finished."""
+    """Print what runs and what it waits for, with a live table, or plain lines where there is no terminal,
+    until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import Waiting
 
     guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     guarded(say, _opening(running))
     if running.remark:
         guarded(say, running.remark)
+    notify("READY=1")
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal
     waiting = Waiting(running.source)
-    with Status("", console=console) if live else ExitStack() as status:
+    with Live("", console=console, auto_refresh=False) if live else ExitStack() as shows:
         shown = time.monotonic()
+        told: set[str] = set()
+        look_at = shown + _LOOK_S
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
+            notify("WATCHDOG=1")
             if (waits_for := waiting.look()) is not None:
                 guarded(say, waits_for)
-            if isinstance(status, Status):
-                guarded(status.update, status_line(running.stats()))
+            if now >= look_at:
+                look_at = now + LOG_S
+                for line in running.findings():
+                    if line not in told:
+                        told.add(line)
+                        guarded(say, line)
+            if isinstance(shows, Live):
+                guarded(partial(shows.update, refresh=True), tables(running.stats()))
             elif time.monotonic() - shown >= LOG_S:
                 shown = time.monotonic()
                 guarded(say, status_line(running.stats()))
+
+
+def airtime_words(account: Mapping[str, Any]) -> str:
+    """What a link says about how much it may send; '' where nothing limits it."""
+    words = [] if account["transmits"] else ["sending is off"]
+    if "spent_s" in account and account["allowed_s"] < account["window_s"]:
+        words.append(
+            f"sent {account['spent_s']:.3g} of {account['allowed_s']:.3g} s allowed in {account['window_s']:g} s"
+        )
+        if account["waits_s"] > 1:
+            words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
+    if account.get("unsaved"):
+        words.append("its airtime account cannot be stored")
+    return ", ".join(words)
 
 
 def status_line(stats: Mapping[str, Any]) -> str:
@@ -201,6 +256,8 @@ def status_line(stats: Mapping[str, Any]) -> str:
         sent = f"nothing sent, no publisher on {missing[0]}" + (f" and {len(missing) - 1} more" if missing[1:] else "")
     received = f"received {given} messages in {sink['packets']} packets" if sink["packets"] else "nobody heard"
     parts = [f"{stats['uptime_s']:.0f} s", sent, received]
+    if airtime := airtime_words(stats["airtime"]):
+        parts.append(airtime)
     if sink["packet_loss_est"]:
         parts.append(f"about {sink['packet_loss_est']} packets lost")
     if stats["phy"]["snr_db"] is not None:

@@ -10,7 +10,7 @@ import click
 
 from gr_ros2.cli.capture import DEFAULT_PACKET_LEN, from_hex, packets_in
 from gr_ros2.core.errors import ConfigError, WireError
-from gr_ros2.link.v1.reader import Look, Reader
+from gr_ros2.link.reader import Dissection, Reader
 from gr_ros2.settings.config import MAX_PACKET_LEN, MIN_PACKET_LEN
 from gr_ros2.settings.registry import Registry
 from gr_ros2.state.keys import read_key_file
@@ -75,7 +75,7 @@ def decode_packets(
 
 
 def _is_version_1(data: bytes) -> bool:
-    return data[:1].hex().startswith("1")
+    return data[:1].hex().startswith(("1", "9"))  # 9: with a block for medium access
 
 
 def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[bytes, int]]:
@@ -109,27 +109,29 @@ def _lines(packet: Packet, packet_len: int, registry: Registry | None) -> Iterat
         yield f"  entry {index}: {_of_topic(entry, _name(entry.topic_id, registry))}"
 
 
-def _looked_at(look: Look, data: bytes, reader: Reader, registry: Registry | None) -> Iterator[str]:
+def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry | None) -> Iterator[str]:
     """The lines of a packet of version 1."""
-    header, standing = look.header, look.standing
+    header, repair = look.header, look.repair
     addressed = header.dst_id != BROADCAST
     to = f"dst {header.dst_id}, hop {header.hop}" if addressed else f"dst {header.dst_id} (broadcast)"
-    if standing is None:
+    if repair is None:
         kind, what = f"source, qos {QOS_NAMES[header.qos]}", f"number {look.number}"
-    elif standing.mask:
+    elif repair.mask:
         kind = "repair"
-        count, first = standing.mask.bit_count(), look.number - standing.mask.bit_length() + 1
-        what = f"row {standing.row}, of {count} packets in {first}..{look.number}"
-        what += ", nothing older is worth repairing" if standing.oldest else ""
+        count, first = repair.mask.bit_count(), look.number - repair.mask.bit_length() + 1
+        what = f"row {repair.row}, of {count} packets in {first}..{look.number}"
+        what += ", nothing older is worth repairing" if repair.oldest else ""
     else:
-        kind, what = "control", f"at number {look.number}, row {standing.row}"
+        kind, what = "control", f"at number {look.number}, row {repair.row}"
     if look.hidden:
         content = f"{len(look.hidden)} bytes encrypted: {_preview(look.hidden)}"
-    elif standing is not None and standing.mask:
+    elif repair is not None and repair.mask:
         content = f"{len(look.combined)} bytes combined: {_preview(look.combined)}"
     else:
         content = f"{len(look.entries)} entries"
     yield f"{len(data)} bytes, version 1, {kind}, src {header.src_id}, {to}, {what}, {content}, {look.check}"
+    if look.access is not None:
+        yield f"  medium access: {look.access.describe()}"
     announced = reader.topics.get(header.src_id, {})
     for index, entry in enumerate(look.entries):
         message = look.message(index)

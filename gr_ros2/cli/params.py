@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, get_type_hints
 
 import click
@@ -57,18 +59,18 @@ class OrAuto(click.ParamType):
 
 
 class RowName(Completed):
-    """A name in a table of back-ends. The table checks the name later, when the row is loaded."""
+    """A name in a table of back-ends, or of ``more``. It is checked later, when the row is loaded."""
 
     name = "name"
 
-    def __init__(self, table: BackendTable[Any]) -> None:
-        self._table = table
+    def __init__(self, table: BackendTable[Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+        self._rows = {**table.own, **more}
 
     def candidates(self) -> Iterable[CompletionItem]:
-        return (CompletionItem(name, help=row.summary) for name, row in self._table.own.items())
+        return (CompletionItem(name, help=row.summary) for name, row in self._rows.items())
 
 
-class Setting(Completed):
+class SettingParam(Completed):
     """`KEY=VALUE`. The shell completes the key.
 
     :param settings: class of the configuration that has the key
@@ -90,7 +92,7 @@ def setting_keys(settings: type[Any], prefix: str = "") -> Iterator[str]:
         if is_dataclass(kinds[field.name]):
             yield from setting_keys(kinds[field.name], f"{prefix}{field.name}.")
         else:
-            yield prefix + field.name
+            yield prefix + field.name.removesuffix("_")  # of a name that Python keeps for itself
 
 
 def set_option(settings: type[Any], what: str = "one setting") -> Callable[[Any], Any]:
@@ -101,8 +103,18 @@ def set_option(settings: type[Any], what: str = "one setting") -> Callable[[Any]
     return click.option(
         "--set",
         "overrides",
-        type=Setting(settings),
+        type=SettingParam(settings),
         multiple=True,
         metavar="KEY=VALUE",
         help=f"Change {what}, dots between keys.",
     )
+
+
+pictures_option = click.option(
+    "--pictures", is_flag=True, help="Also the figures as PNG and SVG, and every number as CSV and Parquet."
+)
+
+
+def written_line(files: Sequence[Path]) -> str:
+    """What was written: the page, and how much beside it."""
+    return f"Written: {files[0]}" + (f" and {len(files) - 1} files beside it" if files[1:] else "")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from math import log
+from pathlib import Path
+from shlex import quote
 
 import click
 from rich import box
@@ -12,22 +15,63 @@ from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.study.forecast import Advice, Effect, Forecast, Planner
+from gr_ros2.study.forecast import Advice, Cut, Effect, Forecast, Planner
+from gr_ros2.study.traffic import is_bag, link_values, of_recording, recorded_graph
 
 _WIDTH = 110
 _ADVICE = 3
+_MOST = 0.95
+"""Share of the packets that arrive on a good link."""
+_GRAPH_S = 5.0
 _HEADINGS = ("offered [1/s]", "message [B]", "on air [B]", "load", "rate [1/s]", "PDR", "age [ms]", "p99 [ms]")
 
 
 @click.command()
-@click.argument("scenario", type=SCENARIO)
+@click.argument("what", type=SCENARIO, required=False, metavar="[SCENARIO | LINK | BAG]")
+@click.option("--bag", type=click.Path(exists=True, path_type=Path), help="With LINK: send this recording.")
+@click.option("--graph", is_flag=True, help="With LINK or alone: what is published on the ROS graph now.")
 @click.option("--seed", type=int, help="Seed of robots and sender.")
-@click.option("--duration", type=float, help="Seconds of traffic that are looked at; 0 = to the end of a bag.")
+@click.option("--duration", type=click.FloatRange(0), help="Seconds of traffic; default: of a bag all, of the graph 5.")
 @set_option(Scenario)
 @click.option("--no-advice", is_flag=True, help="Only the forecast.")
-def plan(scenario: str, seed: int | None, duration: float | None, overrides: tuple[str, ...], no_advice: bool) -> None:
-    """Forecast SCENARIO, a built-in name or a YAML file, without running it, and propose changes."""
-    planner = Planner(load_scenario(scenario, overrides, seed=seed, duration_s=duration))
+def plan(
+    *,
+    what: str | None,
+    bag: Path | None,
+    graph: bool,
+    seed: int | None,
+    duration: float | None,
+    overrides: tuple[str, ...],
+    no_advice: bool,
+) -> None:
+    """Forecast whether messages fit a radio and how fresh they arrive, without sending any, and propose changes.
+
+    SCENARIO is a built-in name or a YAML file. LINK is the YAML file of a link, such as `gr-ros2 link --save` writes,
+    with the messages of a recording (--bag) or of the ROS graph (--graph). A BAG alone, or --graph alone, is planned
+    for a link with default settings, which --set changes.
+    """
+    path = None if what is None else Path(what)
+    if path is not None and bag is None and is_bag(path):
+        path, bag = None, path
+    with ExitStack() as stack:
+        values = link_values(path, overrides) if path is not None or bag is not None or graph else None
+        if values is None:
+            if what is None:
+                raise click.UsageError("give a scenario, a link's YAML file or a bag, or --graph")
+            if bag is not None or graph:
+                raise click.UsageError(f"{what}: has no front_end, so it is no link; leave --bag and --graph out")
+            planner = Planner(load_scenario(what, overrides, seed=seed, duration_s=duration))
+        elif bag is None and not graph:
+            raise click.UsageError(f"{what}: says what carries the messages; which ones? --bag FILE or --graph")
+        else:
+            if graph:
+                bag = stack.enter_context(recorded_graph(values, duration or _GRAPH_S))
+            assert bag is not None
+            planner = Planner(*of_recording(values, bag, duration))
+        _tell(planner, not no_advice)
+
+
+def _tell(planner: Planner, advise: bool) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=_WIDTH)
@@ -36,22 +80,43 @@ def plan(scenario: str, seed: int | None, duration: float | None, overrides: tup
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     console.print(
         f"{phy.name}{rate}: a packet of {forecast.packet_len} B takes "
-        f"{forecast.airtime_s * 1e3:.2f} ms, {forecast.capacity:.1f} packets/s\n",
+        f"{forecast.airtime_s * 1e3:.2f} ms, {forecast.capacity:.3g} packets/s"
+        + (f" within airtime ({planner.scenario.airtime.rule})\n" if planner.scenario.airtime.rule else "\n"),
         soft_wrap=True,
     )
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
     if forecast.air:
         console.print(_air(forecast), soft_wrap=True)
-    if not no_advice:
-        found = planner.advice()
-        for advice in found[:_ADVICE]:
-            console.print(_line(advice), soft_wrap=True)
-        if not found:
-            console.print(
-                "No change of packet_len, compression or pacing makes more better than worse.",
-                soft_wrap=True,
-            )
+    if (half_m := planner.range_m(0.5)) is not None:
+        console.print(
+            f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "
+            f"{planner.range_m(_MOST):.0f} m, without walls, shadowing and other robots that send.",
+            soft_wrap=True,
+        )
+    if not advise:
+        return
+    if cuts := planner.cuts():
+        console.print("To make it fit:", soft_wrap=True)
+        for cut in cuts:
+            console.print(f"  {_cut(cut)}", soft_wrap=True)
+        console.print(f"As settings: {' '.join(map(_set, cuts[-1].settings))}", soft_wrap=True, markup=False)
+    found = [advice for advice in planner.advice() if not cuts or "packet_len" not in advice.setting]
+    for advice in found[:_ADVICE]:
+        console.print(_line(advice), soft_wrap=True)
+    if not found and not cuts:
+        console.print(
+            "No change of packet_len, compression, pacing or medium makes more better than worse.", soft_wrap=True
+        )
+
+
+def _cut(cut: Cut) -> str:
+    what = f"limit {cut.topic} to {cut.rate_hz:g} Hz" if cut.rate_hz else f"drop {cut.topic}"
+    return f"{what}: load {cut.load:.0%}"
+
+
+def _set(setting: str) -> str:
+    return f"--set {quote(setting)}"
 
 
 def _table(forecast: Forecast) -> Table:
@@ -80,10 +145,11 @@ def _verdict(forecast: Forecast) -> str:
     fits = "it fits"
     if forecast.load > 1:
         heaviest = max(forecast.topics, key=lambda topic: topic.load)
-        fits = f"it does not fit, most of it is {heaviest.topic}; max_rate and weight of a topic say what is dropped"
+        what = "most of it" if heaviest.load > forecast.load / 2 else "the heaviest topic"
+        fits = f"it does not fit, {what} is {heaviest.topic}"
     return (
-        f"Load {forecast.load:.0%}: {fits}. {forecast.used:.0%} of the airtime is used, {forecast.pad:.0%} of it for "
-        f"PAD; {per_message} bytes on the air per message delivered."
+        f"Load {forecast.load:.0%}: {fits}. With repair and reports {forecast.used:.0%} of the airtime is used, "
+        f"{forecast.pad:.0%} of it for padding; {per_message} bytes on the air per message delivered."
     )
 
 

@@ -9,8 +9,8 @@ import click
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.core.names import first
-from gr_ros2.report.explain import repair_lines
-from gr_ros2.report.table import ledger_table, notes, summary_table
+from gr_ros2.report.explain import air_lines
+from gr_ros2.report.table import ledger_table, notes, packets_line, summary_table
 from gr_ros2.run.replay import replay as replay_bag
 from gr_ros2.run.scenario import Scenario, load_scenario
 
@@ -49,10 +49,9 @@ def replay(
     console.print(f"Carried: {', '.join(done.carried)}{left_out}", soft_wrap=True)
     for line in done.remarks:
         console.print(line, soft_wrap=True, markup=False, highlight=False)
-    packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())
-    console.print(f"packets: {packets}\n")
+    console.print(f"{packets_line(result)}\n")
     console.print(summary_table([result]))
     console.print(ledger_table(result))
-    for line in (*repair_lines(result), *notes(result)):
+    for line in (*air_lines(result), *notes(result)):
         console.print(line)
     console.print(f"\nWritten to {target}", soft_wrap=True)

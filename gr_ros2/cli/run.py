@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,15 @@ from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import SCENARIO, set_option
+from gr_ros2.cli.params import SCENARIO, pictures_option, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.terminal import path_text
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2.record.result import Result
-from gr_ros2.report.explain import explanation
+from gr_ros2.report.explain import explanation, lateness_lines
 from gr_ros2.report.repetitions import repetition_grid
-from gr_ros2.report.table import as_table, ledger_table, notes, paper_grid, summary_table
+from gr_ros2.report.table import as_table, ledger_table, notes, packets_line, paper_grid, paper_results, summary_table
 from gr_ros2.run import runner
 from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
@@ -37,7 +37,8 @@ _options = [
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
-    click.option("--no-report", is_flag=True, help="No report, no figures; `gr-ros2 report FOLDER` makes them later."),
+    click.option("--no-report", is_flag=True, help="No report; `gr-ros2 report FOLDER` makes it later."),
+    pictures_option,
     set_option(Scenario),
     dashboard_option,
     pcap_option,
@@ -59,11 +60,11 @@ def run(scenario: str, **options: Any) -> int:
 
 
 @click.command()
-@click.option("--version", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
+@click.option("--wire", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
 @_with_options
-def demo(version: str, overrides: tuple[str, ...], **options: Any) -> int:
+def demo(wire: str, overrides: tuple[str, ...], **options: Any) -> int:
     """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other."""
-    older = () if version == "1" else ("version=0", "reports=null")
+    older = () if wire == "1" else ("version=0", "reports=null")
     return _run("demo", overrides=(*older, *overrides), **options)
 
 
@@ -75,6 +76,7 @@ def _run(
     repetitions: int | None,
     duration: float | None,
     no_report: bool,
+    pictures: bool,
     overrides: tuple[str, ...],
     dashboard: str | None,
     pcap: Path | None,
@@ -91,11 +93,12 @@ def _run(
         else:
             turns = (f"{scenario.name} {k} of {scenario.repetitions}" for k in count(1))
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
+    drawn = None if no_report else pictures  # None: nothing at all
     if scenario.repetitions == 1:
-        _report_run(console, scenario, outcome, out, no_report)
+        _report_run(console, scenario, outcome, out, drawn)
         results = [outcome.result]
     else:
-        _report_repetitions(console, scenario, results, out, no_report)
+        _report_repetitions(console, scenario, results, out, drawn)
     return FAILED if any(result.incomplete for result in results) else 0
 
 
@@ -106,9 +109,13 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
         bar.console.print(f"{title}: {how_long} of simulated time, as fast as it can be computed", soft_wrap=True)
     task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
     shown = time.monotonic()
+    begun = False
 
     def advance(progress: runner.Progress) -> None:
-        nonlocal shown
+        nonlocal shown, begun
+        if not begun:
+            begun = True
+            bar.console.print(*_graphs(progress.domains), sep="", end="", soft_wrap=True)
         done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
         bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
         if not bar.console.is_terminal and time.monotonic() - shown >= LOG_S:
@@ -121,21 +128,29 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
     return advance
 
 
-def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, no_report: bool) -> None:
+def _graphs(domains: tuple[int | None, int | None]) -> Iterator[str]:
+    """Where other programs can join in, a line each."""
+    for domain, what in zip(domains, ("messages are sent", "they come out"), strict=True):
+        if domain is not None:
+            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1: the graph on which {what}\n"
+
+
+def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, drawn: bool | None) -> None:
     _print(console, scenario, outcome)
     kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
-    if no_report or outcome.result.interrupted:
+    if drawn is None or outcome.result.interrupted:
         # After Ctrl-C the prompt returns at once, without a second of drawing.
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
         return
     with uninterrupted():  # matplotlib is loaded only when there is something to draw
         from gr_ros2.report.page import Run, write_report
-    written = [path.name for path in write_report([Run(out, scenario.name, outcome.result, outcome.trace)], out)]
-    console.print(f"\nWritten to {out}: {written[0]}, {kept}, {', '.join(written[1:])}", soft_wrap=True)
+    runs = [Run(out, scenario.name, outcome.result, outcome.trace)]
+    written = [path.name for path in write_report(runs, out, pictures=drawn)]
+    console.print(f"\nWritten to {out}: {', '.join([written[0], kept, *written[1:]])}", soft_wrap=True)
 
 
 def _report_repetitions(
-    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, no_report: bool
+    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, drawn: bool | None
 ) -> None:
     if len(results) < scenario.repetitions:
         console.print(f"stopped after {len(results)} of {scenario.repetitions} runs")
@@ -146,12 +161,12 @@ def _report_repetitions(
         for line in result.incomplete:
             console.print(f"rep-{number}: {line}", soft_wrap=True)
     kept = f"{REPETITIONS_FILE}, the runs in rep-0 to {repetition_folder(out, len(results) - 1).name}"
-    if no_report or len(results) < scenario.repetitions:
+    if drawn is None or len(results) < scenario.repetitions:
         console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
         return
     with uninterrupted():
         from gr_ros2.report.page import read_runs, write_report
-    report, *_ = write_report(read_runs([out]), out)
+    report, *_ = write_report(read_runs([out]), out, pictures=drawn)
     console.print(f"\nWritten to {out}: {report.name}, {kept}", soft_wrap=True)
 
 
@@ -168,26 +183,27 @@ def _bar(console: Console) -> Progress:
 
 def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
     result = outcome.result
+    for line in lateness_lines(result):  # first, since all that follows depends on it
+        console.print(line, style="bold red", soft_wrap=True)
     phy = result.phy
     if phy["sample_rate"]:
-        chosen = (
-            ""
-            if scenario.phy.sample_rate != AUTO
-            else f", chosen to carry {scenario.phy.headroom:.0%} of the offered load"
-        )
+        chosen = ""
+        if scenario.phy.sample_rate == AUTO:
+            chosen = f" ({scenario.phy.headroom:.0%} of what the messages need uncompressed, none sharing a packet)"
         console.print(
-            f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a packet of {scenario.packet_len} B takes "
-            f"{phy['airtime_samples']} samples, {phy['airtime_s'] * 1e3:.2f} ms; runs on {phy['runs_on']}",
+            f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a full packet of {scenario.packet_len} B "
+            f"takes {phy['airtime_s'] * 1e3:.2f} ms; runs on {phy['runs_on']}",
             soft_wrap=True,
         )
-    packets = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in result.packets.items())
-    console.print(f"packets: {packets}\n")
-    if scenario.name.startswith("paper-"):
+    console.print(f"{packets_line(result)}\n", soft_wrap=True)
+    if paper_results([result]):
         console.print(as_table(paper_grid([result])))
     console.print(summary_table([result]))
     console.print(ledger_table(result))
     for path in outcome.trace.paths():
         title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
+    late = set(lateness_lines(result))
     for line in (*explanation(result, outcome.trace), *notes(result)):
-        console.print(line)
+        if line not in late:
+            console.print(line)

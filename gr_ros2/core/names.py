@@ -23,8 +23,8 @@ MAX_NODE_LEN = 255
 INFRASTRUCTURE = ("/rosout", "/parameter_events")
 """Topics that every ROS node has and that are rarely meant to be sent by radio."""
 
-OWN_NODES = "/gr_ros2_"
-"""Beginning of the names of this package's nodes, which publish what a link says of itself."""
+OWN_NODES = ("/gr_ros2_", "/gr_ros2/")
+"""Beginnings of the names of this package's nodes and topics, by which a link says how it is."""
 
 _SHOWN = 10
 _FIELD = "{src_id}"

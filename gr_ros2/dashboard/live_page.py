@@ -7,14 +7,14 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.core.properties import Int
+from bokeh.core.properties import Int, String
 from bokeh.document import Document
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column
@@ -23,19 +23,22 @@ from bokeh.models import (
     Checkbox,
     ColumnDataSource,
     CustomJS,
+    DataRange1d,
     Div,
     HoverTool,
     InlineStyleSheet,
     LogTicker,
     Range1d,
     Slider,
+    Toggle,
 )
 from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
 
 from gr_ros2.dashboard.monitor import RadioView, RunMonitor
-from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_html, topics_html
+from gr_ros2.dashboard.tables import alarms_html, colour, heard_html, packets_html, paths_html, tiles_html, topics_html
 from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.report.colours import AIR_COLOURS
 from gr_ros2.settings.config import ChannelConfig
 
 AHEAD = 3
@@ -43,7 +46,14 @@ AHEAD = 3
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SENT, _RECEIVED = "#1f5fbf", "#d62728"
+_SOFT = "#7a8a9a"
+"""Grey that can be read on a bright and on a dark page."""
 _DEFAULT_SNR_DB = 20.0
+_HIDE = """
+for (const card of document.querySelectorAll("[data-card]"))
+    card.hidden = pulse.empty.split(" ").includes(card.dataset.card);
+"""
+_SENDS, _SILENT = "stop sending", "sending is off: send again"
 
 
 class PictureCounter(DataModel):  # type: ignore[misc]
@@ -51,6 +61,8 @@ class PictureCounter(DataModel):  # type: ignore[misc]
 
     drawn = Int(0)
     seen = Int(0)
+    empty = String("")
+    """Cards that have nothing to show, separated by spaces."""
 
 
 class LivePage:
@@ -64,10 +76,11 @@ class LivePage:
         self._monitor = monitor
         self._counter = PictureCounter(name="pulse")
         self._counter.js_on_change("drawn", CustomJS(args={"pulse": self._counter}, code="pulse.seen = pulse.drawn"))
+        self._counter.js_on_change("empty", CustomJS(args={"pulse": self._counter}, code=_HIDE))
         style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
         self._html = {
             name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
-            for name in ("tiles", "topics", "paths", "packets", "note")
+            for name in ("tiles", "alarms", "topics", "heard", "paths", "packets", "note")
         }
         self._sources = {
             name: ColumnDataSource({key: [] for key in columns.split()})
@@ -81,6 +94,8 @@ class LivePage:
                 "latency": "name colour ms share",
                 "constellation": "re im",
                 "spectrum": "khz db",
+                "air": "t new repair report hello",
+                "snr": "t db",
             }.items()
         }
         self._html["tiles"].tags = [self._counter]  # it has no place on the page, but must be in the document
@@ -88,9 +103,11 @@ class LivePage:
         self._following = False
         self._ready = False
         self._noise = Checkbox(label="noise", name="noise")
+        self._pause = Toggle(label="Pause", name="pause")
         self._snr = _slider("snr", "SNR in the sampled band [dB]", (-5, 40), _DEFAULT_SNR_DB)
         self._offset = _slider("offset", "carrier offset [1/1000 of the sample rate]", (-20, 20), 0)
         self._loss = _slider("loss", "packets lost [%]", (0, 100), 0)
+        self._silence = Toggle(label=_SENDS, name="silence", button_type="danger", sizing_mode="stretch_width")
         self._listen()
         self._build(instance)
         self.draw(monitor.snapshot, monitor.radio)
@@ -109,19 +126,22 @@ class LivePage:
 
     def offer(self, snapshot: Snapshot, radio: RadioView, always: bool = False) -> None:
         """Draw it when the document is free. Skip it while there is no viewer, or when the viewer is too far behind."""
-        if self._ready and (always or self.behind < AHEAD):
+        if self._ready and not self._pause.active and (always or self.behind < AHEAD):
             self.document.add_next_tick_callback(partial(self.draw, snapshot, radio))
 
     def draw(self, snapshot: Snapshot, radio: RadioView) -> None:
         """Show a snapshot. The caller holds the lock of the document."""
         self._html["tiles"].text = tiles_html(snapshot, radio.backlog, radio.snr_db)
+        self._html["alarms"].text = alarms_html(snapshot)
         self._html["topics"].text = topics_html(snapshot)
+        self._html["heard"].text = heard_html(snapshot)
         self._html["paths"].text = paths_html(snapshot)
         self._html["packets"].text = packets_html(snapshot)
         self._draw_series(snapshot)
         self._draw_paths(snapshot)
         self._draw_radio(radio)
         self._show_channel(radio)
+        self._counter.empty = " ".join(_empty_cards(snapshot, radio))
         self._counter.drawn += 1
 
     def _draw_series(self, snapshot: Snapshot) -> None:
@@ -135,6 +155,12 @@ class LivePage:
             "age": [_small(line.age_s) for line in series],
             "queued": [_small(line.queued) for line in series],
         }
+        air = snapshot.air
+        if air is not None:
+            kinds = {kind: _small(air.busy[kind] * 100) for kind in AIR_COLOURS} if air.busy else {}
+            none = _small(np.full(len(air.t), np.nan))
+            self._sources["air"].data = {"t": _small(air.t), **dict.fromkeys(AIR_COLOURS, none), **kinds}
+            self._sources["snr"].data = {"t": _small(air.t), "db": _small(air.snr_db)}
         curves = [topic for topic in snapshot.topics if topic.latency_cdf_s]
         self._sources["latency"].data = {
             "name": [topic.name for topic in curves],
@@ -198,6 +224,7 @@ class LivePage:
 
             widget.on_change(attribute, changed)
 
+        listen(self._silence, "active", lambda silent: monitor.transmit(not silent))
         listen(self._noise, "active", lambda active: monitor.set_snr_db(float(self._snr.value) if active else None))
         listen(self._snr, "value", lambda value: monitor.set_snr_db(float(value)))
         listen(self._offset, "value", lambda value: monitor.set_frequency_offset(value / 1000))
@@ -205,6 +232,10 @@ class LivePage:
 
     def _show_channel(self, radio: RadioView) -> None:
         """Show the settings of other viewers. A widget that this viewer is dragging stays as it is."""
+        self._following = True
+        self._silence.active = not radio.transmits
+        self._silence.label = _SENDS if radio.transmits else _SILENT
+        self._following = False
         channel = self._monitor.channel
         if channel is not None and channel != self._shown:
             self._shown = channel
@@ -217,8 +248,10 @@ class LivePage:
             self._following = False
         for widget in (self._noise, self._snr, self._offset):
             widget.disabled = not radio.has_samples
+        for widget in (self._noise, self._snr, self._offset, self._loss):
+            widget.visible = radio.changeable or channel is None
         text = self._monitor.refused
-        if not text and channel is not None and not radio.has_samples:
+        if not text and channel is not None and radio.changeable and not radio.has_samples:
             text = "This PHY has no samples: only packets can be lost."
         self._html["note"].text = f'<div class="note {"bad" if self._monitor.refused else ""}">{escape(text)}</div>'
 
@@ -226,46 +259,62 @@ class LivePage:
 
     def _build(self, instance: str) -> None:
         sources = self._sources
-        map_ = _plot("map", "name", match_aspect=True)
+        map_ = _plot("map", "name", "x [m]", "y [m]", match_aspect=True)
         map_.multi_line("x", "y", source=sources["sent"], color=_SENT, line_width=6, alpha=0.4)
         map_.multi_line("x", "y", source=sources["received"], color=_RECEIVED, line_width=1.5)
-        map_.multi_line("x", "y", source=sources["gap"], color="#1d2733", line_width=1.5, line_dash="dotted")
+        map_.multi_line("x", "y", source=sources["gap"], color=_SOFT, line_width=1.5, line_dash="dotted")
         map_.scatter("x", "y", source=sources["ends"], color="colour", line_color="white", size=12)
-        error = _plot("error", "name")
+        error = _plot("error", "name", "time [s]", "error [m]")
         error.multi_line("t", "m", source=sources["error"], color="colour", line_width=1.5)
         error.y_range.start = 0
-        constellation = _plot("constellation", "", x_range=Range1d(-2.6, 2.6), y_range=Range1d(-1.9, 1.9))
+        constellation = _plot(
+            "constellation", "", "in phase", "quadrature", x_range=Range1d(-2.6, 2.6), y_range=Range1d(-1.9, 1.9)
+        )
         constellation.scatter("re", "im", source=sources["constellation"], size=2.5, color=_SENT, alpha=0.35)
-        spectrum = _plot("spectrum", "", y_range=Range1d(-50, 3))
+        spectrum = _plot("spectrum", "", "frequency [kHz]", "power [dB]", y_range=Range1d(-50, 3))
         spectrum.varea("khz", -200, "db", source=sources["spectrum"], color=_SENT, alpha=0.15)
         spectrum.line("khz", "db", source=sources["spectrum"], color=_SENT, line_width=1.2)
-        latency = _plot("latency", "name", x_axis_type="log", y_range=Range1d(0, 1.03))
+        latency = _plot("latency", "name", "latency [ms]", "share", x_axis_type="log", y_range=Range1d(0, 1.03))
         latency.xaxis.ticker = LogTicker(desired_num_ticks=4, num_minor_ticks=0)
         latency.multi_line("ms", "share", source=sources["latency"], color="colour", line_width=2)
-        plots = [map_, error, constellation, spectrum, latency]
-        series: tuple[tuple[str, str, dict[str, Any]], ...] = (
-            ("pdr", "pdr", {"y_range": Range1d(0, 1.1)}),
-            ("goodput", "goodput", {}),
-            ("age", "age", {"y_axis_type": "log"}),  # a map that is sent once is much older than all else
-            ("queue", "queued", {}),
+        air = _plot("air", "", "time [s]", "busy [%]", y_range=DataRange1d(start=0, max_interval=100))
+        air.varea_stack(
+            list(AIR_COLOURS),
+            x="t",
+            color=list(AIR_COLOURS.values()),
+            source=sources["air"],
+            legend_label=list(AIR_COLOURS),
         )
-        for name, values, options in series:
-            plot = _plot(name, "name", **options)
+        air.legend.orientation, air.legend.padding, air.legend.margin = "horizontal", 0, 0
+        air.add_layout(air.legend[0], "above")
+        air.legend.background_fill_alpha = air.legend.border_line_alpha = 0
+        air.legend.label_text_font_size, air.legend.label_text_color = "10px", _SOFT
+        snr = _plot("snr", "", "time [s]", "SNR [dB]")
+        snr.line("t", "db", source=sources["snr"], color=_SENT, line_width=1.8)
+        plots = [map_, error, constellation, spectrum, latency, air, snr]
+        series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
+            ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
+            ("goodput", "goodput", "kB/s", {}),
+            ("age", "age", "age [s]", {"y_axis_type": "log"}),  # a map that is sent once is much older than all else
+            ("queue", "queued", "messages", {}),
+        )
+        for name, values, unit, options in series:
+            plot = _plot(name, "name", "time [s]", unit, **options)
             plot.multi_line("t", values, source=sources["series"], color="colour", line_width=1.8)
             if not options:
                 plot.y_range.start = 0
             plots.append(plot)
         channel = column(
-            *(self._noise, self._snr, self._offset, self._loss, self._html["note"]),
+            *(self._silence, self._noise, self._snr, self._offset, self._loss, self._html["note"]),
             name="channel",
             sizing_mode="stretch_width",
             spacing=12,
         )
         document = self.document
         document.title = "gr-ros2 · live"
-        texts = [self._html[name] for name in ("tiles", "topics", "paths", "packets")]
+        texts = [self._html[name] for name in ("tiles", "alarms", "topics", "heard", "paths", "packets")]
         with document.models.freeze():  # otherwise the document walks through all models for every root
-            for root in (*plots, channel, *texts):
+            for root in (*plots, channel, self._pause, *texts):
                 document.add_root(root)
         document.template = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=False).get_template(
             "page.html.j2"
@@ -285,7 +334,25 @@ def _slider(name: str, title: str, ends: tuple[float, float], value: float) -> S
     return Slider(name=name, title=title, start=start, end=end, step=0.5, value=value, sizing_mode="stretch_width")
 
 
-def _plot(name: str, hover: str, **options: Any) -> Any:
+def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
+    """The cards that have nothing to show, by the names that the template gives them."""
+    has = {
+        "path": any(len(path.sent_x) or len(path.received_x) for path in snapshot.paths),
+        "error": any(len(path.errors_m) for path in snapshot.paths),
+        "pdr": any(np.isfinite(line.pdr).any() for line in snapshot.series) and snapshot.delivered > 0,
+        "age": any(topic.age_now_s is not None or topic.age_mean_s is not None for topic in snapshot.topics),
+        "queue": any(np.isfinite(line.queued).any() for line in snapshot.series),
+        "latency": any(topic.latency_cdf_s for topic in snapshot.topics),
+        "constellation": radio.symbols is not None,
+        "spectrum": radio.spectrum_db is not None,
+        "air": snapshot.air is not None and bool(snapshot.air.busy),
+        "snr": snapshot.air is not None and bool(np.isfinite(snapshot.air.snr_db).any()),
+    }
+    if snapshot.phase != "waiting":
+        yield from (card for card, filled in has.items() if not filled)
+
+
+def _plot(name: str, hover: str, x: str, y: str, **options: Any) -> Any:
     plot = figure(
         name=name,
         sizing_mode="stretch_both",
@@ -296,12 +363,14 @@ def _plot(name: str, hover: str, **options: Any) -> Any:
         min_border=2,
         **options,
     )
-    plot.outline_line_color = None
-    plot.grid.grid_line_color = "#eef1f5"
+    plot.outline_line_color = plot.background_fill_color = plot.border_fill_color = None  # as the card, bright or dark
+    plot.grid.grid_line_color, plot.grid.grid_line_alpha = _SOFT, 0.2
+    plot.xaxis.axis_label, plot.yaxis.axis_label = x, y
     for axis in plot.axis:
-        axis.axis_line_color = "#c4cdd6"
-        axis.major_tick_line_color = "#c4cdd6"
+        axis.axis_line_color = axis.major_tick_line_color = _SOFT
+        axis.axis_label_text_color, axis.axis_label_text_font_size = _SOFT, "11px"
+        axis.axis_label_text_font_style, axis.axis_label_standoff = "normal", 2
         axis.minor_tick_line_color = None
-        axis.major_label_text_color = "#66788a"
+        axis.major_label_text_color = _SOFT
         axis.major_label_text_font_size = "11px"
     return plot

@@ -15,16 +15,19 @@ import numpy.typing as npt
 
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.dashboard.spectrum import Spectrum
-from gr_ros2.dashboard.state import DashboardState
+from gr_ros2.dashboard.state import RATE_S, DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import Floats
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.record.result import Result
 from gr_ros2.run.observers import LiveLink, LiveRun
 from gr_ros2.settings.config import ChannelConfig
 
 TICK_S = 0.5
 """s between two snapshots."""
+_NEWEST = 200
+"""Late moments that are looked at: more do not fit into the last seconds."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,9 @@ class RadioView:
     """The radio side of a link at one moment.
 
     :param channel: settings of the channel at that moment, None without a run
+    :param transmits: whether every link may send
     :param has_samples: whether the PHY has samples, so that noise and frequency offset can be set
+    :param changeable: whether there is a channel that can be changed
     :param backlog: packets between source and antenna
     :param snr_db: SNR of the newest packets received, dB over the sampled band; None if the PHY does not measure it
     :param frequencies: frequency of each power in ``spectrum_db``, Hz; None if there is no signal
@@ -40,7 +45,9 @@ class RadioView:
     """
 
     channel: ChannelConfig | None = None
+    transmits: bool = True
     has_samples: bool = False
+    changeable: bool = False
     backlog: int | None = None
     snr_db: float | None = None
     frequencies: Floats | None = None
@@ -77,6 +84,8 @@ class RunMonitor:
             duration_s=run.duration_s,
             ledger=None if run.ledger is None else run.ledger.rows,
             tick_s=TICK_S,
+            airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
+            received_as=run.received_as,
         )
         self._run = run
         self.refused = ""
@@ -121,16 +130,21 @@ class RunMonitor:
             for src_id, source in run.sources.items()
             for topic in source.stats()["topics"].values()
         }
-        self.snapshot = state.tick(run.clock(), queued)
-        if not run.links:
+        now, links = run.clock(), run.links
+        snr_db = links[0].snr_db if links else None
+        late_s = max((_late_s(link.gate_lateness(), now) for link in links), default=0.0)
+        self.snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s)
+        if not links:
             return
         spectrum = self._spectrum
         counts = [link.counts() for link in run.links]
         self.radio = RadioView(
             channel=run.links[0].channel,
+            transmits=all(link.transmits for link in run.links),
             has_samples=run.links[0].phy.has_samples,
             backlog=sum(count.backlog + max(count.passed - count.transmitted, 0) for count in counts),
-            snr_db=run.links[0].snr_db,
+            snr_db=snr_db,
+            changeable=run.links[0].changeable,
             frequencies=None if spectrum is None else spectrum.frequencies,
             spectrum_db=None if spectrum is None else spectrum.decibels(),
             symbols=run.links[0].symbols(),
@@ -154,6 +168,10 @@ class RunMonitor:
         """Set the loss probability of whole packets on every link, 0..1."""
         self._change(lambda link: link.set_packet_loss(probability))
 
+    def transmit(self, on: bool) -> None:
+        """Switch sending of every link off, at once, or on again."""
+        self._change(lambda link: link.transmit(on=on))
+
     def _change(self, change: Callable[[LiveLink], None]) -> None:
         self.refused = ""
         try:
@@ -164,3 +182,9 @@ class RunMonitor:
                 self.refused = "a run on simulated time has no channel to change"
         except GrRos2Error as error:
             self.refused = str(error)
+
+
+def _late_s(lateness: Lateness | None, now: float) -> float:
+    """The longest delay in the last seconds, s."""
+    moments = [] if lateness is None else lateness.moments[-_NEWEST:]
+    return max((happened - due for due, happened in moments if happened > now - RATE_S), default=0.0)

@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -17,7 +17,7 @@ import numpy as np
 
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.topic_names import Key, TopicNames
-from gr_ros2.dashboard.views import PathView, SeriesView, Snapshot, TopicView
+from gr_ros2.dashboard.views import AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
@@ -49,6 +49,17 @@ LATENCIES = 2000
 UNDER_WAY = 4096
 """Most messages of a source that wait for their delivery. The oldest is forgotten first and then has no latency."""
 PACKETS_SHOWN = 12
+
+LATE_S = 0.05
+"""s. A computer that is late by this much does not keep up, see :mod:`gr_ros2.link.lateness`."""
+_SILENT_S = 5.0
+"""s without a packet after which a link is down."""
+_GOOD = 0.9
+"""Share of a topic's messages delivered in the last seconds, below which the link is degraded."""
+_ROBOTS = 64
+"""Most robots heard that are remembered."""
+_ENOUGH = 3
+"""Fewest messages in the last seconds from which a share is taken."""
 
 _PATH_STEP_S = 0.1
 
@@ -97,6 +108,8 @@ class DashboardState:
     :param duration_s: s during which messages will be submitted, 0 = unknown
     :param ledger: gives the messages per ledger row, as an observer of both ends knows them; None uses the events alone
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
+    :param airtime: s that a packet of so many bytes takes; None where packets take no air, or it is not known
+    :param received_as: absolute name under which a sender's topic comes out here, '' where it is not known
     """
 
     def __init__(
@@ -109,6 +122,8 @@ class DashboardState:
         duration_s: float = 0.0,
         ledger: Callable[[], Mapping[Key, Mapping[str, int]]] | None = None,
         tick_s: float = 0.5,
+        airtime: Callable[[int], float] | None = None,
+        received_as: Callable[[int, str], str] = lambda _src_id, _name: "",
     ) -> None:
         self._lock = Lock()
         self._names = TopicNames(registry, topics)
@@ -124,6 +139,13 @@ class DashboardState:
         self._packets: Counter[str] = Counter()
         self._packets_sent, self._packets_received = Rate(RATE_S), Rate(RATE_S)
         self._phase = "waiting"
+        self._airtime, self._received_as = airtime, received_as
+        self._tick_s = tick_s
+        self._spent: Counter[str] = Counter()
+        """s of air since the last tick, by what the packets were for."""
+        self._air: deque[tuple[float, ...]] = deque(maxlen=self._history)
+        self._robots: dict[int, tuple[float, int]] = {}
+        """When each robot was heard last, and packets received of it."""
         self._result: Result | None = None
         for key in topics:
             self._topic(key)
@@ -137,6 +159,8 @@ class DashboardState:
             if isinstance(event, SentPacket):
                 self._packets["sent"] += 1
                 self._packets[f"air_{event.kind}"] += 1
+                if self._airtime is not None:
+                    self._spent[event.kind] += self._airtime(len(event.data))  # type: ignore[assignment]
                 self._packets_sent.add(event.now)
                 for entry in event.entries:
                     source.messages.left(entry)
@@ -156,7 +180,8 @@ class DashboardState:
                 self._delivered(event, now)
             elif isinstance(event, Announced):
                 for row in event.rows:
-                    self._learn((event.src_id, row.topic_id), row.name, row.type_name)
+                    full_name = self._received_as(event.src_id, row.name)
+                    self._learn((event.src_id, row.topic_id), row.name, row.type_name, full_name)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):
@@ -166,6 +191,11 @@ class DashboardState:
                 self._packets["handed_up"] += 1
                 self._packets_received.add(now)
                 self._received.append((now, event))
+                if isinstance(event, Received):
+                    src_id = event.packet.src_id
+                    self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + 1
+                    if len(self._robots) > _ROBOTS:
+                        del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
@@ -184,10 +214,19 @@ class DashboardState:
 
     # -- asking -------------------------------------------------------------------------------------------------
 
-    def tick(self, now: float, queued: Mapping[Key, int] | None = None) -> Snapshot:
+    def tick(
+        self,
+        now: float,
+        queued: Mapping[Key, int] | None = None,
+        *,
+        snr_db: float | None = None,
+        late_s: float = 0.0,
+    ) -> Snapshot:
         """A snapshot of the link now. Until the run is over, it also becomes the newest point of the history.
 
         :param queued: messages waiting at the source, by source and topic id
+        :param snr_db: of the newest packets received, dB
+        :param late_s: how late the computer was in the last seconds, s
         """
         ledger = {} if self._ledger is None else self._ledger()
         with self._lock:
@@ -198,6 +237,9 @@ class DashboardState:
             if not over and self._start is not None:
                 for key in keys:
                     self._remember(self._topics[key], now, elapsed, (queued or {}).get(key))
+                spent = (self._spent[kind] / self._tick_s for kind in get_args(AirKind))
+                self._air.append((elapsed, nan if snr_db is None else snr_db, *spent))
+                self._spent.clear()
             views = tuple(
                 self._view(place, key, now, elapsed=elapsed, queued=queued or {}, ledger=ledger)
                 for place, key in enumerate(keys)
@@ -207,6 +249,9 @@ class DashboardState:
             rejected = {kind: n for kind, n in sorted(self._packets.items()) if kind.startswith("rejected_")}
             air = {f"air_{kind}": self._packets[f"air_{kind}"] for kind in get_args(AirKind)}
             heard = list(self._received)
+            alarms = {} if over or self._start is None else dict(self._alarms(now, elapsed, keys, late_s))
+            past = np.array(self._air, dtype=float).reshape(-1, 2 + len(get_args(AirKind)))
+            busy = dict(zip(get_args(AirKind), past[:, 2:].T, strict=True))
             return Snapshot(
                 phase=self._phase,
                 name=self._name,
@@ -225,12 +270,37 @@ class DashboardState:
                     **rejected,
                     **(air if sum(air.values()) > air["air_new"] else {}),
                 },
+                state=next(iter(alarms), "" if over or self._start is None else "up"),
+                alarms=tuple(text for texts in alarms.values() for text in texts),
+                heard=tuple(
+                    RobotView(src_id, now - last, count) for src_id, (last, count) in sorted(self._robots.items())
+                ),
+                air=AirView(past[:, 0], {} if self._airtime is None else busy, past[:, 1]),
                 packets_now=(
                     self._packets_sent.totals(now)[0] / RATE_S,
                     self._packets_received.totals(now)[0] / RATE_S,
                 ),
                 last_packets=packet_views(heard, self._packet_len, self._names, colours, start)[-PACKETS_SHOWN:],
             )
+
+    def _alarms(self, now: float, elapsed: float, keys: list[Key], late_s: float) -> Iterator[tuple[str, list[str]]]:
+        """What is wrong now, by the state that it stands for, the worst first."""
+        if late_s >= LATE_S:
+            yield (
+                "late",
+                [f"the computer is up to {late_s:.2f} s late: what this page shows is the computer's, not the link's"],
+            )
+        silent = [now - last for last, _ in self._robots.values()]
+        if elapsed > _SILENT_S and min(silent, default=elapsed) > _SILENT_S:
+            yield "down", ["no robot has been heard" + (f" for {min(silent):.0f} s" if silent else " yet")]
+        poor = []
+        for key in keys:
+            topic, share = self._topics[key], _pdr_now(self._topics[key], now)
+            enough = elapsed > RATE_S and topic.sent_rate.totals(now)[0] >= _ENOUGH
+            if self._ledger is not None and enough and share is not None and share < _GOOD:
+                poor.append(f"{self._names.full(key)}: {share:.0%} of the messages of the last {RATE_S:.0f} s arrived")
+        if poor:
+            yield "degraded", poor
 
     def _remember(self, topic: _Topic, now: float, elapsed: float, queued: int | None) -> None:
         age = topic.age.read(now)

@@ -21,6 +21,7 @@ Number = float | int | None
 
 _GREY = "#9aa5b1"
 _PHASES = {"waiting": "waiting for messages", "running": "live", "ended": "ended", "failed": "failed"}
+_STATES = {"up": "live", "degraded": "live · degraded", "down": "live · link down", "late": "live · computer late"}
 
 
 def colour(place: int) -> str:
@@ -37,10 +38,11 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
     sent_now, received_now = snapshot.packets_now
     refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
+    phase = _STATES.get(snapshot.state, _PHASES[snapshot.phase])
     tiles = [
-        _tile("phase", _PHASES[snapshot.phase], snapshot.name or "no run", css=f"phase {snapshot.phase}"),
+        _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.state}"),
         _tile("elapsed", time, "time"),
-        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, "main"),
+        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.state}"),
         _tile("sent", f"{snapshot.sent:,}", "messages sent", snapshot.sent),
         _tile("delivered", f"{snapshot.delivered:,}", "delivered", snapshot.delivered),
         _tile(
@@ -57,6 +59,27 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
         _tile("snr", "–" if snr_db is None else f"{snr_db:.1f} dB", "SNR received", snr_db),
     ]
     return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
+
+
+def alarms_html(snapshot: Snapshot) -> str:
+    """What is wrong now; a screen reader says it when it changes."""
+    lines = "".join(f"<li>{escape(alarm)}</li>" for alarm in snapshot.alarms)
+    return f'<div role="status" aria-live="polite">{f"<ul class=alarms>{lines}</ul>" if lines else ""}</div>'
+
+
+def heard_html(snapshot: Snapshot) -> str:
+    """The robots heard, and when last."""
+    if not snapshot.heard:
+        return '<div class="note">no robot has been heard yet</div>'
+    rows = "".join(
+        f'<tr data-robot="{robot.src_id}"><th scope="row" class="name">robot {robot.src_id}</th>'
+        f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td></tr>'
+        for robot in snapshot.heard
+    )
+    return (
+        '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
+        f'<th scope="col">packets</th></tr></thead><tbody>{rows}</tbody></table>'
+    )
 
 
 def _repair_tiles(snapshot: Snapshot) -> list[str]:
@@ -139,8 +162,8 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
 def topics_html(snapshot: Snapshot) -> str:
     """One line per topic, with the ledger as a bar."""
     rows = row_order([topic.ledger for topic in snapshot.topics])
-    groups = "".join(f'<th colspan="{len(columns)}">{name}</th>' for name, columns in _GROUPS)
-    heads = "".join(f"<th>{column[1]}</th>" for _, columns in _GROUPS for column in columns)
+    groups = "".join(f'<th scope="colgroup" colspan="{len(columns)}">{name}</th>' for name, columns in _GROUPS)
+    heads = "".join(f'<th scope="col">{column[1]}</th>' for _, columns in _GROUPS for column in columns)
     body = "".join(_topic_row(topic, rows) for topic in snapshot.topics)
     legend = "".join(
         f'<span class="key"><i style="background:{row_colour(row)}"></i>{escape(row.replace("_", " "))}</span>'

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
 Key = tuple[int, int]
 """Source id and topic id."""
@@ -45,7 +45,7 @@ class TopicNames:
 
     def of(self, key: Key) -> str:
         """Name as in a registry; made from the topic id if nothing is known."""
-        return self._meaning(key)[0] or f"topic_{key[1]}"
+        return self._meaning(key)[0] or ("announced topics" if key[1] == MAX_TOPICS else f"topic_{key[1]}")
 
     def type_name(self, key: Key) -> str:
         """Type, '' if unknown."""

@@ -124,6 +124,32 @@ class PacketView:
 
 
 @dataclass(frozen=True)
+class RobotView:
+    """A robot that was heard.
+
+    :param silent_s: s since its newest packet
+    :param packets: received of it
+    """
+
+    src_id: int
+    silent_s: float
+    packets: int
+
+
+@dataclass(frozen=True)
+class AirView:
+    """The air over time: share of it that packets of each kind took, and the SNR received. Times are s since the start.
+
+    :param busy: by kind of packet; {} for a PHY that takes no air
+    :param snr_db: NaN where it is not known
+    """
+
+    t: Floats
+    busy: Mapping[str, Floats]
+    snr_db: Floats
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """A link at one moment.
 
@@ -132,6 +158,8 @@ class Snapshot:
     :param packets: sent, received and each refusal by name; if not all carried new messages, also ``air_new``,
         ``air_repair``, ``air_report`` and ``air_hello``: those sent, by what they were for
     :param packets_now: packets/s sent and received in the last seconds
+    :param state: of the link now: up, degraded, down, or late where the computer does not keep up; '' before and after
+    :param alarms: what is wrong now, a sentence each
     """
 
     phase: str = "waiting"
@@ -146,6 +174,10 @@ class Snapshot:
     last_packets: tuple[PacketView, ...] = ()
     packets: Mapping[str, int] = field(default_factory=dict)
     packets_now: tuple[float, float] = (0.0, 0.0)
+    state: str = ""
+    alarms: tuple[str, ...] = ()
+    heard: tuple[RobotView, ...] = ()
+    air: AirView | None = None
 
     def in_row(self, row: str) -> int:
         """Messages in a row of the ledger, over all topics."""

@@ -18,15 +18,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, Outgoing, Request, Service
+from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, OutgoingFrame, Request, Service
 from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.gr.ends import LOOP_GUARD, LiveEnd
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link import Delivered, ReceiverEvent
 from gr_ros2.link.events import Gone, Met
-from gr_ros2.link.v1.endpoint import Endpoint
-from gr_ros2.link.v1.key import Key
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
 from gr_ros2.settings.fields import AUTO
@@ -58,10 +56,9 @@ class LiveCalls:
     """
 
     def __init__(self, end: LiveEnd, source: RosSource, sink: RosSink) -> None:
-        assert isinstance(end.endpoint, Endpoint)
-        self._end: Endpoint = end.endpoint
+        self._end, self._messages = end.endpoint, end.endpoint.messages
         self._lock, self._work = end.lock, end.work
-        self._engine = Calls(self._end.settings.src_id, self._end.boot)
+        self._engine = Calls(source.src_id, self._end.boot)
         self._row = len(source.registry)
         self._source, self._sink = source, sink
         self._clock = source.clock
@@ -160,10 +157,10 @@ class LiveCalls:
         with self._lock:
             if there:
                 self._offered[topic_id] = self._own[topic_id]
-                self._end.offer(self._row, offered=True)
+                self._messages.offer(self._row, offered=True)
             else:
                 self._offered.pop(topic_id, None)
-            self._end.offer(topic_id, offered=there)
+            self._messages.offer(topic_id, offered=there)
             self._work.notify()
         _log.info("service %s: %s", self._own[topic_id].name, "offered to other robots" if there else "no server")
 
@@ -207,7 +204,7 @@ class LiveCalls:
                         self._serve(src_id, topic)
                 if services:
                     with self._lock:
-                        self._end.offer(self._row, offered=True)
+                        self._messages.offer(self._row, offered=True)
 
     def _serve(self, src_id: int, topic: Topic) -> None:
         """Make a server of ours for a service of another robot."""
@@ -235,13 +232,12 @@ class LiveCalls:
 
     def _is_frame(self, event: Delivered) -> bool:
         with self._lock:
-            row = self._end.rows(event.src_id).get(event.topic_id)
+            row = self._end.topics_of(event.src_id).get(event.topic_id)
         return row is not None and row.type_name == CALLS_TYPE
 
     def _receive(self, event: Delivered) -> None:
-        assert isinstance(event.key, Key)
         with self._lock:
-            sender = event.src_id, event.key.boot
+            sender = event.src_id, self._robots[event.src_id].boot
             found = self._engine.receive(sender, event.payload, self._offered, self._clock())
         try:
             if isinstance(found, Request):
@@ -253,10 +249,10 @@ class LiveCalls:
         except GrRos2Error as error:
             self._tell_first("not_passed_on", error)
 
-    def _send(self, frame: Outgoing | None, now: float) -> None:
+    def _send(self, frame: OutgoingFrame | None, now: float) -> None:
         """Send a frame. Called with the lock held."""
         if frame is not None:
-            self._end.submit(self._row, frame.data, now, frame.lifespan_s)
+            self._messages.submit(self._row, frame.data, now, frame.lifespan_s)
             self._work.notify()
 
     def _tell_first(self, counter: str, error: Exception) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from gr_ros2.link import Delivered
 from gr_ros2.middleware import Publisher
 
-LOOK_S = 0.01
+CHECK_S = 0.01
 """s between two looks whether subscribers have been found."""
 MOST_S = 0.5
 """s that a publisher waits at most. Where nobody subscribes, its first message comes so much later."""

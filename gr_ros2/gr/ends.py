@@ -14,22 +14,23 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.access import Access
 from gr_ros2.link.endpoint import Endpoint, EndpointV0
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.rate import Rung
-from gr_ros2.link.v1.endpoint import Endpoint as EndpointV1
+from gr_ros2.link.rate import Mcs
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect
+from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect, robot_of
 from gr_ros2.settings.fields import Auto
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.state.boots import RANDOM_BITS, BootFile
@@ -93,7 +94,7 @@ def message_codec(dictionaries: Sequence[str], registry: Sequence[Topic] = ()) -
 
 
 @dataclass(frozen=True)
-class Start:
+class EndpointSetup:
     """What a version 1 endpoint must know about the current start of its robot.
 
     :param boot: number of this start, greater than all earlier numbers
@@ -103,7 +104,9 @@ class Start:
     :param reports: whether the robots from which it receives can also receive from it
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
-    :param ladder: the rungs of an adaptive rate, see :attr:`gr_ros2.phy.Phy.ladder`; () for a fixed rate
+    :param mcs_table: the rates of an adaptive rate, see :attr:`gr_ros2.phy.Phy.mcs_table`; () for a fixed rate
+    :param access: makes what decides when the robot with an id may send; None from it: whenever there is a credit
+    :param airtime_share: part of the time that this robot may send, above 0..1
     :param close: lets another process start this robot; nothing is stored afterwards
     """
 
@@ -114,8 +117,10 @@ class Start:
     reports: bool = False
     half_duplex: bool = False
     any_length: bool = False
-    ladder: Sequence[Rung] = ()
+    mcs_table: Sequence[Mcs] = ()
+    airtime_share: float = 1.0
     close: Callable[[], None] = lambda: None
+    access: Callable[[int], Access | None] = lambda _: None
 
 
 def make_endpoint(
@@ -123,7 +128,7 @@ def make_endpoint(
     source: SourceConfig | None,
     sink: SinkConfig | None,
     *,
-    start: Start | None = None,
+    start: EndpointSetup | None = None,
     codec: MessageCodec | None = None,
     rng: random.Random | None = None,
     observer: Callable[[SenderEvent], None] | None = None,
@@ -158,15 +163,22 @@ def make_endpoint(
         to_air = codec or message_codec(source.dictionaries, rows)
     dictionaries = () if sink is None else sink.dictionaries
     if not version:
-        if start is not None and start.ladder:
+        if start is not None and start.mcs_table:
             raise ConfigError("phy.options.rate = 'adaptive' with version 0, which has no reports; set version to 1")
         from_air = None if sink is None else codec or message_codec(dictionaries, registry)
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
-    start = start or Start()
+    start = start or EndpointSetup()
     known = message_codec(dictionaries)
     return EndpointV1(
         None if source is None or not rows else rows,
-        settings_of(source, sink, hears=start.reports, half_duplex=start.half_duplex, fixed=not start.any_length),
+        settings_of(
+            source,
+            sink,
+            hears=start.reports,
+            half_duplex=start.half_duplex,
+            fixed=not start.any_length,
+            airtime_share=start.airtime_share,
+        ),
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
@@ -180,7 +192,8 @@ def make_endpoint(
         heard=start.heard,
         save=start.save,
         observer=observer,
-        ladder=start.ladder,
+        mcs_table=start.mcs_table,
+        access=start.access(robot_of(source, sink)),
     )
 
 
@@ -191,8 +204,9 @@ def start_of(
     reports: bool,
     half_duplex: bool = False,
     any_length: bool = False,
-    ladder: Sequence[Rung] = (),
-) -> Start:
+    mcs_table: Sequence[Mcs] = (),
+    airtime_share: float = 1.0,
+) -> EndpointSetup:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
@@ -200,13 +214,31 @@ def start_of(
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
     if not config.version:
-        return Start(ladder=ladder)
+        return EndpointSetup(mcs_table=mcs_table)
+    setup = EndpointSetup(
+        keys=keys,
+        reports=reports,
+        half_duplex=half_duplex,
+        any_length=any_length,
+        mcs_table=mcs_table,
+        airtime_share=airtime_share,
+    )
     if not config.state and not config.key and src_id < 0:
-        boot = int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS)
-        return Start(boot, reports=reports, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
-    path = Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
-    file = BootFile(path, time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
-    return Start(file.boot, keys, file.heard, file.save, reports, half_duplex, any_length, ladder, file.close)
+        return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
+    file = BootFile(_state_file(config, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
+    return replace(setup, boot=file.boot, heard=file.heard, save=file.save, close=file.close)
+
+
+def account_of(config: SourceConfig) -> Path:
+    """The file of a robot's airtime account, beside its state file.
+
+    :raises ConfigError: when the settings name no robot
+    """
+    return _state_file(config, config.src_id()).with_suffix(".airtime")
+
+
+def _state_file(config: SourceConfig | SinkConfig, src_id: int) -> Path:
+    return Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
 
 
 def state_folder() -> Path:

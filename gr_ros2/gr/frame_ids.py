@@ -147,6 +147,7 @@ class MergedTransforms:
             self._static_publisher.publish(union)
 
     def close(self) -> None:
+        """Close both publishers."""
         self._moving_publisher.close()
         self._static_publisher.close()
 

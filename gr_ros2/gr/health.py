@@ -18,7 +18,7 @@ from gr_ros2.settings.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
 
-_LOCKED = {
+LOCKED = {
     "no_key": "sealed, and no key is configured here",
     "not_sealed": "not sealed, where a key is configured",
     "wrong_key": "sealed with a key that is not accepted here",
@@ -53,6 +53,7 @@ class Status:
 
     @property
     def message(self) -> str:
+        """The problems in one line, or OK."""
         return "; ".join(self.problems) or "OK"
 
     def judge(self, what: str, value: float, unit: str, warn: float, error: float = 0.0) -> None:
@@ -85,6 +86,8 @@ class _Look(NamedTuple):
     front_end_passed: Mapping[str, int]
     front_end_lost: Mapping[str, int]
     locked: dict[str, int]
+    unsaved: int
+    state_unsaved: int
 
 
 class LinkHealth:
@@ -117,10 +120,29 @@ class LinkHealth:
         receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
         first = before is look
         for kind, count in look.locked.items():
-            receiver.warn(f"packets refused: {_LOCKED[kind]}", count, 0 if first else before.locked.get(kind, 0))
+            receiver.warn(f"packets refused: {LOCKED[kind]}", count, 0 if first else before.locked.get(kind, 0))
+        unsaved = 0 if first else before.state_unsaved
+        receiver.warn("times that the state file could not be written", look.state_unsaved, unsaved)
         receiver.warn("messages not published", look.unpublished, 0 if first else before.unpublished)
         transmitter.warn("messages lost on the ROS graph", look.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *topics]
+
+    def links(self, stats: Stats, receiver: Status) -> dict[int, Status]:
+        """How the link to each robot is that was ever heard: ``up``, ``degraded`` or ``lost``.
+
+        :param receiver: as :meth:`judge` has it; what troubles it troubles all links
+        """
+        limits, found = self._config, {}
+        for src_id, silence in stats["sink"]["silence_s"].items():
+            state = Status(f"gr_ros2/link_{src_id}", values={"age (s)": f"{silence:.2f}"})
+            if limits.silence_error_s and silence > limits.silence_error_s:
+                state.level, state.problems = Level.ERROR, ["lost"]
+            elif receiver.level or (limits.silence_warn_s and silence > limits.silence_warn_s):
+                state.level, state.problems = Level.WARN, ["degraded"]
+            else:
+                state.problems = ["up"]
+            found[src_id] = state
+        return found
 
     def _receiver(self, stats: Stats, before: _Look, look: _Look) -> Status:
         status, limits = Status(f"{self._name}: receiver"), self._config
@@ -149,6 +171,15 @@ class LinkHealth:
         status.judge("packets sent", rate, "1/s", 0)
         status.values["airtime of a packet (s)"] = f"{stats['phy']['airtime_s']:.3g}"
         status.values["airtime used"] = f"{min(1.0, rate * stats['phy']['airtime_s']):.3g}"
+        account = stats["airtime"]
+        if not account["transmits"]:
+            status.level = max(status.level, Level.WARN)
+            status.problems.append("sending is off")
+        if "spent_s" in account:
+            status.values["airtime spent (s)"] = f"{account['spent_s']:.3g}"
+            status.values["airtime allowed (s)"] = f"{account['allowed_s']:.3g} in {account['window_s']:g}"
+            status.warn("times that the airtime account could not be stored", account["unsaved"], before.unsaved)
+        status.values |= {f"packets dropped: {why}": str(count) for why, count in sorted(account["refused"].items())}
         status.values["packets waiting"] = str(stats["packets"]["backlog"])
         topics = stats["source"]["topics"].values()
         status.values["messages waiting"] = str(sum(topic["queued"] for topic in topics))
@@ -162,6 +193,9 @@ class LinkHealth:
             for reason, count in topic["refused"].items():
                 refused[reason] = refused.get(reason, 0) + count
         status.values |= {f"messages dropped: {reason}": str(count) for reason, count in sorted(refused.items())}
+        for name, topic in stats["source"]["topics"].items():
+            dropped = sum(topic["refused"].values()) + topic[LedgerRow.LOST_ON_GRAPH]
+            status.values[f"{name} (sent, dropped)"] = f"{topic['sent']}, {dropped}"
         return status
 
     def _front_end(self, look: _Look, before: Mapping[str, int]) -> list[Status]:
@@ -181,6 +215,8 @@ class LinkHealth:
             share = lost / (delivered + lost)
             status.judge("messages lost", share, "", limits.message_loss_warn, limits.message_loss_error)
         status.judge("messages", _rate(delivered, before, look), "1/s", 0)
+        status.values["messages delivered"] = str(topic["delivered"])
+        status.values |= {f"messages lost: {reason}": str(count) for reason, count in sorted(topic["lost"].items())}
         latency = topic["recent_latency_s"]
         if latency is not None:
             status.judge("latency", latency["p50"], "s", limits.latency_warn_s, limits.latency_error_s)
@@ -206,7 +242,9 @@ def _look(stats: Stats, now: float) -> _Look:
         topics=topics,
         front_end_passed=stats["front_end"]["passed"],
         front_end_lost=stats["front_end"]["lost"],
-        locked={kind: count for kind, count in sink["rejected"].items() if kind in _LOCKED},
+        locked={kind: count for kind, count in sink["rejected"].items() if kind in LOCKED},
+        unsaved=stats["airtime"].get("unsaved", 0),
+        state_unsaved=sink["dropped"].get("state_not_written", 0),
     )
 
 

@@ -65,6 +65,7 @@ class LatencyWindow:
         self._negative = 0
 
     def add(self, seconds: float) -> None:
+        """Note the latency of a message, s."""
         self._values.append(seconds)
         self._count += 1
         self._negative += seconds < 0

@@ -1,6 +1,7 @@
 """Packets to PDUs with metadata.
 
-Invariant: metadata is for people and other blocks, except for the rung of an adaptive rate, which transmitters read.
+Invariant: metadata is for people and other blocks, except for the MCS of an adaptive rate and the time to leave, which
+transmitters read.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from typing import Any
 
 import pmt
 
-from gr_ros2.phy.pdus import u8vector, with_rung
+from gr_ros2.phy.pdus import AirPacket, pdu_to_send
 from gr_ros2.wire import Packet
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
@@ -22,12 +23,12 @@ class PduMaker:
     def __init__(self) -> None:
         self._metadata: dict[tuple[int, ...], Any] = {}
 
-    def pdu(self, packet: Packet, data: bytes, wall: float, rung: int | None = None) -> Any:
+    def pdu(self, packet: Packet, on_air: AirPacket, wall: float) -> Any:
         """One packet as a PDU.
 
-        :param data: bytes of the packet
+        :param packet: its meaning
+        :param on_air: its bytes, and how and when they leave
         :param wall: s since 1970, for ``t_src_wall``
-        :param rung: with an adaptive rate, the rung that it is sent with; None with a fixed one
         """
         header = (packet.src_id, packet.dst_id, packet.seq, packet.qos)
         metadata = self._metadata.get(header)
@@ -36,9 +37,7 @@ class PduMaker:
                 self._metadata.clear()
             metadata = self._metadata[header] = _header_metadata(header)
         metadata = pmt.dict_add(metadata, _WALL, pmt.from_double(wall))
-        if rung is not None:
-            metadata = with_rung(metadata, rung)
-        return pmt.cons(metadata, u8vector(data))
+        return pdu_to_send(on_air, metadata)
 
 
 def _header_metadata(header: tuple[int, ...]) -> Any:

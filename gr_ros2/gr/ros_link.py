@@ -22,7 +22,7 @@ from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry,
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from gr_ros2.settings.fields import AUTO
@@ -38,8 +38,10 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param source: settings of the sending half
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
+    :param reports: whether it tells the others what it hears; False for a robot that only receives
     :param half_duplex: whether sending and receiving share the airtime
-    :param any_length, ladder: see :class:`RosSource`
+    :param any_length, mcs_table: see :class:`RosSource`
+    :param airtime_share: part of the time that this robot may send, above 0..1
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -51,9 +53,11 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         sink: SinkConfig,
         *,
         middleware: tuple[Middleware, Middleware] | None = None,
+        reports: bool = True,
         half_duplex: bool = False,
         any_length: bool = False,
-        ladder: Sequence[Rung] = (),
+        mcs_table: Sequence[Mcs] = (),
+        airtime_share: float = 1.0,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
@@ -63,10 +67,11 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         start = self._start = start_of(
             source,
             source.src_id(),
-            reports=True,
+            reports=reports,
             half_duplex=half_duplex,
             any_length=any_length,
-            ladder=ladder,
+            mcs_table=mcs_table,
+            airtime_share=airtime_share,
         )
         rng = random.Random(seed)
         calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))

@@ -22,24 +22,23 @@ from gnuradio import gr
 from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error, SealError
 from gr_ros2.core.guard import Guard
 from gr_ros2.core.names import topic_fault
-from gr_ros2.gr.early import LOOK_S, EarlyMessages
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.early import CHECK_S, EarlyMessages
+from gr_ros2.gr.ends import LOOP_GUARD, EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.link import Delivered, Received, ReceiverEvent, Rejected
+from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.phy.pdus import PDUS, PduPort, packets_of, snr_db_of
+from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, packets_of
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.settings.config import SinkConfig, replaced
+from gr_ros2.settings.config import SinkConfig, TopicOptions, replaced, robot_of
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic, announced, check_outputs
 
@@ -99,6 +98,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         observer that raises is not called again
     :param clock: s, monotonic
     :param end: endpoint of both directions, shared with a source; None: an endpoint that only receives is made
+    :ivar live: this endpoint
     :param values: the fields of :class:`gr_ros2.settings.config.SinkConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
@@ -120,11 +120,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if rows:
             check_outputs(rows, self.config)
             self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
-        self._start = Start()
+        self._start = EndpointSetup()
         if end is None:
             start = self._start = start_of(self.config, robot_of(None, self.config), reports=False)
+            if self.config.key:
+                debug_logger("gr_ros2.gr.sink", self.config.debug).warning(
+                    "ros2_sink: one way, a key keeps out what is forged or was heard before; what never came here is "
+                    "taken from a recording, however old it is"
+                )
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
-        self._live, self._end = end, end.endpoint
+        self.live, self._end = end, end.endpoint
         self._announced: dict[tuple[int, int], Topic] = {}
         """Topics that senders have announced, by source id and topic id."""
         self._calls: Services | None = None
@@ -151,6 +156,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._said: set[str] = set()
         self._sim_time: float | None = None
         self._clock_subscription: Subscription | None = None
+        self._heard: dict[int, float] = {}
+        """When a packet of each robot was taken last, s."""
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
         self.message_port_register_in(PDUS)
@@ -251,6 +258,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
                 "message_loss_est": stats.message_loss_est,
+                "silence_s": {src_id: self._clock() - at for src_id, at in self._heard.items()},
                 "held_bytes": self._end.held_bytes,
                 "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
@@ -296,6 +304,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         for output in list(self._outputs.values()):
             if output.topic.type_name == described.type_name:
                 output.stamped = stamped
+
+    def name_here(self, src_id: int, name: str) -> str:
+        """Absolute name under which a sender's topic comes out, by its name in a registry."""
+        options = self.config.topic_options.get(name, TopicOptions())
+        return Topic(0, name, "", options).republished(self.config.namespace_format, src_id)
 
     def _name(self, key: tuple[int, int]) -> str:
         return self._topic(key).republished(self.config.namespace_format, key[0])
@@ -362,7 +375,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if problem:
                 self._refuse(problem)
             else:
-                self._take(packets, snr_db_of(message))
+                self._take(packets)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failed(error)
         self.handled += max(len(packets), 1)
@@ -383,15 +396,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         if first:
             self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
 
-    def _take(self, packets: Iterable[bytes], snr_db: float | None) -> None:
+    def _take(self, packets: Iterable[AirPacket]) -> None:
         events: list[ReceiverEvent] = []
         with self._lock:
-            for data in packets:
-                events += self._end.receive(data, self._clock(), snr_db)
+            for packet in packets:
+                events += self._end.receive(ReceivedPacket(packet.data, packet.at, packet.snr_db), self._clock())
             if self._timer_idle and self._end.next_timeout() is not None:
                 self._timer_due.notify_all()
             if self._end.answers:
-                self._live.wake()
+                self.live.wake()
         self._settle(events)
 
     def _settle(self, events: Iterable[ReceiverEvent]) -> None:
@@ -401,7 +414,9 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             try:
                 if debug and isinstance(event, Received | Rejected):
                     self._log.debug("rx %s", describe(event, self.registry))
-                if isinstance(event, Announced):
+                if isinstance(event, Received):
+                    self._heard[event.packet.src_id] = self._clock()
+                elif isinstance(event, Announced):
                     self._learn(event)
                 elif isinstance(event, Rejected):
                     self._warn(event)
@@ -578,7 +593,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 if not events:
                     at = self._end.next_timeout()
                     if self._opening:
-                        at = min(self._clock() + LOOK_S, inf if at is None else at)
+                        at = min(self._clock() + CHECK_S, inf if at is None else at)
                     self._timer_idle = at is None
                     self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
                     self._timer_idle = False

@@ -15,6 +15,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from math import inf
 from typing import Any
 
 import pmt
@@ -22,7 +23,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.core.guard import Guard
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd, Start, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.ends import LOOP_GUARD, EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
@@ -30,17 +31,17 @@ from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.phy.pdus import CREDIT, PduPort
+from gr_ros2.phy.pdus import CREDIT, AirPacket, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import MAX_TOPICS, NewRow, Registry, Topic, normalize_type, options_of
+from gr_ros2.settings.registry import MAX_TOPICS, NewTopic, Registry, Topic, normalize_type, options_of
 from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
 from gr_ros2.settings.topic_choice import TopicChoice
 
@@ -67,8 +68,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param seed: seed of sequence number and entry ids; None: random
     :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
         packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
-    :param ladder: the rungs of an adaptive rate (:attr:`gr_ros2.phy.Phy.ladder`). Each packet then is a PDU whose
-        metadata names its ``rung``
+    :param mcs_table: the rates of an adaptive rate (:attr:`gr_ros2.phy.Phy.mcs_table`). Each packet then is a PDU whose
+        metadata names its ``mcs``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
     :param values: the fields of :class:`gr_ros2.settings.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
@@ -83,7 +84,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
         any_length: bool = False,
-        ladder: Sequence[Rung] = (),
+        mcs_table: Sequence[Mcs] = (),
         end: LiveEnd | None = None,
         **values: Any,
     ) -> None:
@@ -93,10 +94,10 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.src_id = self.config.src_id()
         """The source id on the wire."""
         self.registry = rows.with_options(self.config.topic_options)
-        self._start = Start()
+        self._start = EndpointSetup()
         if end is None:
             start = self._start = start_of(
-                self.config, self.src_id, reports=False, any_length=any_length, ladder=ladder
+                self.config, self.src_id, reports=False, any_length=any_length, mcs_table=mcs_table
             )
             rng = random.Random(seed)
             end = LiveEnd(
@@ -104,17 +105,21 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             )
         end.observer = self._observe
         self._live, self._end = end, end.endpoint
+        self._messages = end.endpoint.messages
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self.clock = clock
         self._pdus = PduMaker()
-        self._composed: list[SentPacket] = []
+        self._mcs = 0
+        """MCS of the newest packet."""
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
         self._lock, self._work = end.lock, end.work
         self._room = threading.Condition(self._lock)
         self._running = False
         self._closed = False
         self._thread = BlockThread()
+        self._looked = -inf
+        """When the sending thread last began to look for packets, s."""
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.emitted = 0
@@ -180,15 +185,28 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
         return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
 
+    def stalled_s(self, now: float) -> float:
+        """s for which the sending thread has been at one thing, or asleep beyond the time at which it meant to look
+        again; infinite if it has ended. Takes no lock, which that thread may hold.
+
+        :param now: s of this block's clock
+        """
+        if not self._running:
+            return 0.0
+        if not self._thread.alive:
+            return inf
+        awake = self._live.sleeps_until == -inf
+        return max(0.0, now - (self._looked if awake else self._live.sleeps_until))
+
     def rate(self) -> dict[str, str]:
-        """With an adaptive rate, the name of the rung of the newest packet as ``rung``; otherwise nothing."""
-        ladder = self._end.ladder
-        return {"rung": ladder[self._end.rung].name} if ladder else {}
+        """With an adaptive rate, the name of the mcs of the newest packet as ``mcs``; otherwise nothing."""
+        mcs_table = self._end.mcs_table
+        return {"mcs": mcs_table[self._mcs].name} if mcs_table else {}
 
     def use_credit(self) -> None:
         """Let no packet leave before the first `credit` message."""
         with self._lock:
-            self._end.use_credit()
+            self._end.pace.use_credit()
 
     def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
         """Look for services too, from the next start on, unless ``services`` of the settings is false.
@@ -201,6 +219,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
+        self._looked = self.clock()
         with self._lock:
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
@@ -239,7 +258,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._take_losses()
             stats = self._end.sent
-            queued = self._end.queued()
+            queued = self._messages.queued()
             rows: dict[str, list[int]] = {}
             for topic in self.registry:
                 if topic.is_topic:
@@ -253,8 +272,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                     LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
                     "sent": sum(stats.sent[row] for row in rows[topic.name]),
                     "queued": sum(queued[row] for row in rows[topic.name]),
-                    "queue": self._end.queue(topic.topic_id)[0],
-                    "queue_depth": self._end.depth(topic.topic_id),
+                    "queue": self._messages.queue(topic.topic_id)[0],
+                    "queue_depth": self._messages.depth(topic.topic_id),
                     "refused": {
                         reason: sum(stats.refused[row, reason] for row in rows[topic.name])
                         for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
@@ -340,7 +359,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _learn(self, described: Described) -> None:
         """Code messages of a type by the definition that a node has given."""
         with self._lock:
-            self._end.learn(described.type_name, described.types)
+            self._messages.learn(described.type_name, described.types)
             self._work.notify()
 
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
@@ -394,7 +413,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
         """
         assert self._offer is not None
-        rows: dict[str, NewRow] = {}
+        rows: dict[str, NewTopic] = {}
         for name, type_name in parts(row.name, row.kind).items():
             if not self.choice.leaves_out(name):
                 part = row_name + name.removeprefix(row.name)
@@ -402,7 +421,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if not any(is_service(type_name) for _, type_name, _ in rows.values()):
             raise ConfigError("topics leaves out all its services")
         with self._lock:
-            self.registry = self._end.add(list(rows.values()))
+            self.registry = self._messages.add(list(rows.values()))
             added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
             self.services = {**self.services, **{name: topic for name, topic in added.items() if topic.is_service}}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
@@ -427,7 +446,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             before = self.subscribed.get(info.topic)
             rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
             if not rows:
-                self.registry = self._end.add([(row_name, type_name, options)])
+                self.registry = self._messages.add([(row_name, type_name, options)])
                 rows = [self.registry[-1]]
             (topic,) = rows
             subscribed = {**self.subscribed, info.topic: topic}
@@ -451,12 +470,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._take_losses()
             self._subscriptions = subscriptions
-            self._end.forget_kept(topic.topic_id)
+            self._messages.forget_kept(topic.topic_id)
 
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
         qos = agreed(offers)
-        return self._end.follow(
+        return self._messages.follow(
             topic.topic_id,
             reliable=qos.reliability != "best_effort",
             latched=all(offer.durability == "transient_local" for offer in offers),
@@ -469,7 +488,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         with self._lock:
             changed = self._adapt(topic, offers)
-            policy, deadline_s = self._end.queue(topic.topic_id)
+            policy, deadline_s = self._messages.queue(topic.topic_id)
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
@@ -477,33 +496,34 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
         with self._lock:
-            while self.config.backpressure and not self._closed and not self._end.room(topic_id):
+            while self.config.backpressure and not self._closed and not self._messages.room(topic_id):
                 self._room.wait()
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
             subscription = self._subscriptions.get(topic_id)
             if subscription is not None and subscription.lost:
-                self._end.missed(topic_id, subscription.lost)
+                self._messages.missed(topic_id, subscription.lost)
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._end.submit(topic_id, whole or payload, self.clock())
+            self._messages.submit(topic_id, whole or payload, self.clock())
             self._live.wake()
 
     def _take_losses(self) -> None:
         """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
         for topic_id, subscription in self._subscriptions.items():
-            self._end.missed(topic_id, subscription.lost)
+            self._messages.missed(topic_id, subscription.lost)
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
-            self._end.credit(max(0, packets))
+            self._end.pace.credit(max(0, packets))
             self._live.wake()
 
     def _pump(self) -> None:
         while self._running:
+            self._looked = self.clock()
             try:
                 if packets := self._compose():
                     self._emit(packets)
@@ -517,11 +537,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _compose(self) -> list[SentPacket]:
         """The packets that may leave now. If there are none, wait for a reason to look again and return none."""
         with self._lock:
-            packets = self._composed = []
-            while self._running and len(packets) < _BATCH:
-                if self._end.next_packet(self.clock()) is None:
-                    break
+            packets: list[SentPacket] = []
+            while self._running and len(packets) < _BATCH and (sent := self._end.next_packet(self.clock())) is not None:
+                packets.append(sent)
             if packets:
+                self._mcs = packets[-1].mcs
                 self._room.notify_all()
             elif self._running:
                 self._live.sleep(self.clock())
@@ -531,22 +551,21 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.registry))
-        if self._port.bundles and not self._end.ladder:
-            self._port.send([sent.data for sent in packets])
+        adaptive = bool(self._end.mcs_table)
+        on_air = [AirPacket(sent.data, sent.mcs if adaptive else None, leave_at=sent.leave_at) for sent in packets]
+        if self._port.bundles:
+            self._port.send(on_air)
         else:
             wall = time.time()
-            for sent in packets:
-                rung = sent.rung if self._end.ladder else None
-                self._port.send_pdu(self._pdus.pdu(sent.packet, sent.data, wall, rung))
+            for sent, packet in zip(packets, on_air, strict=True):
+                self._port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)
 
     def _observe(self, event: SenderEvent) -> None:
-        if isinstance(event, SentPacket):
-            self._composed.append(event)
-        elif isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
+        if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
             name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends

@@ -1,18 +1,21 @@
 """When each packet occupies the channel: one after the other, each for its airtime; and when to ask for the next.
 
-Invariants: a packet starts at the later of its arrival and the end of the packet before; a packet leaves when its
-airtime is over, or ``ahead`` before it begins, never earlier; idle time is not saved up; a credit is granted no earlier
-than ``lead`` before the channel is free of all queued and all promised packets (a promised packet is an unused credit,
-counted as a longest packet), and only while there are fewer than ``OUTSTANDING`` of them. There is no IO and no clock:
-``now`` is seconds, monotonic.
+Invariants: a packet starts at the latest of its arrival, the time it asks for, and the end of the packet before; a
+packet leaves when its airtime is over, or ``ahead`` before it begins, never earlier; idle time is not saved up; a
+credit is granted no earlier than ``lead`` before the channel is free of all queued and all promised packets (a
+promised packet is an unused credit, counted as a longest packet), and only while there are fewer than ``OUTSTANDING``
+of them. There is no IO and no clock: ``now`` is seconds, monotonic. With a limit (:mod:`gr_ros2.link.airtime_limit`)
+a credit is granted only when the limit lets a longest packet begin, and a packet that comes without one and would
+have to wait for the limit is refused. While sending is switched off, nothing passes and no credit is granted.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import Generic, TypeVar
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.airtime_limit import AirtimeLimit
 
 T = TypeVar("T")
 
@@ -29,10 +32,22 @@ class AirtimeClock(Generic[T]):
     :param lead: s before the channel is free at which the next packet is requested
     :param ahead: s before the begin of its airtime at which a packet leaves, if a device then spends that time; None:
         a packet leaves when its airtime is over, because the following stages take no time
+    :param limit: what limits the airtime; None = nothing
+    :param timed: the device itself waits for the time that a packet asks for, which then leaves ``lead`` before it
     :raises ConfigError: for a negative airtime, lead or ahead
+    :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``
+    :ivar used: s of airtime of all packets taken
     """
 
-    def __init__(self, airtime: float, lead: float = LEAD_S, ahead: float | None = None) -> None:
+    def __init__(
+        self,
+        airtime: float,
+        lead: float = LEAD_S,
+        ahead: float | None = None,
+        limit: AirtimeLimit | None = None,
+        *,
+        timed: bool = False,
+    ) -> None:
         if not airtime >= 0:
             raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
         if not lead >= 0:
@@ -42,27 +57,61 @@ class AirtimeClock(Generic[T]):
         self._airtime = airtime
         self._lead = lead
         self._ahead = ahead
+        self._timed = timed
         self._free = float("-inf")
-        self._queue: deque[tuple[float, T]] = deque()
+        self._queue: deque[tuple[float, float, T]] = deque()
+        """When each packet leaves, when its airtime begins, and the packet."""
         self._unused = 0
+        self.limit = limit
+        self._transmits = True
+        self.refused: Counter[str] = Counter()
+        self.used = 0.0
 
-    def offer(self, packet: T, now: float, airtime: float | None = None) -> float:
+    def offer(self, packet: T, now: float, airtime: float | None = None, leave_at: float | None = None) -> float | None:
         """A packet arrives; it uses a credit if one is open.
 
         :param airtime: s that it occupies, None for the airtime of the longest packet
-        :return: when its airtime begins
+        :param leave_at: s, before which its airtime must not begin; None for no such time
+        :return: when its airtime begins; None where it is refused
         """
-        begin = max(now, self._free)
-        self._free = begin + (self._airtime if airtime is None else airtime)
-        self._queue.append((self._free if self._ahead is None else begin - self._ahead, packet))
         self._unused = max(0, self._unused - 1)
+        takes = self._airtime if airtime is None else airtime
+        begin = max(now, self._free, now if leave_at is None else leave_at)
+        if not self._transmits:
+            self.refused["transmit_off"] += 1
+            return None
+        if self.limit is not None:
+            allowed = self.limit.earliest(begin, takes)
+            if allowed > begin + self._lead or not self.limit.reserve(now, takes):
+                self.refused["airtime_limit"] += 1
+                return None
+            begin = allowed
+            self.limit.spend(begin, takes)
+        self.used += takes
+        self._free = begin + takes
+        leaves = self._free if self._ahead is None else begin - self._ahead
+        if self._timed and leave_at is not None:
+            leaves = min(leaves, begin - self._lead)
+        self._queue.append((leaves, begin, packet))
         return begin
 
-    def due(self, now: float) -> list[T]:
-        """The packets that may leave, in order of arrival."""
-        over: list[T] = []
+    @property
+    def transmits(self) -> bool:
+        """Whether packets may pass."""
+        return self._transmits
+
+    def switch(self, *, on: bool) -> None:
+        """Let packets pass, or refuse those that wait and all that come."""
+        self._transmits = on
+        if not on:
+            self.refused["transmit_off"] += len(self._queue)
+            self._queue.clear()
+
+    def due(self, now: float) -> list[tuple[float, T]]:
+        """The packets that may leave, in order of arrival, each with the time at which its airtime begins."""
+        over: list[tuple[float, T]] = []
         while self._queue and self._queue[0][0] <= now:
-            over.append(self._queue.popleft()[1])
+            over.append(self._queue.popleft()[1:])
         return over
 
     def grants(self, now: float) -> int:
@@ -76,8 +125,9 @@ class AirtimeClock(Generic[T]):
     def next_timeout(self, now: float) -> float | None:
         """When ``due`` or ``grants`` next has something, None if only an arrival can change that."""
         times = [self._queue[0][0]] if self._queue else []
-        if self._free > now and self._outstanding < OUTSTANDING:
-            times.append(max(now, self._promised_until(now) - self._lead))
+        granted = self._next_grant(now)
+        if granted is not None and (self._free > now or self.limit is not None):
+            times.append(max(now, granted))
         return min(times) if times else None
 
     @property
@@ -95,7 +145,19 @@ class AirtimeClock(Generic[T]):
         return len(self._queue) + self._unused
 
     def _may_grant(self, now: float) -> bool:
-        return self._outstanding < OUTSTANDING and self._promised_until(now) - self._lead <= now
+        at = self._next_grant(now)
+        return at is not None and at <= now and (self.limit is None or self.limit.reserve(now, self._airtime))
+
+    def _next_grant(self, now: float) -> float | None:
+        """When the next credit may be granted, None if only an arrival or the switch can change that."""
+        if self._outstanding >= OUTSTANDING or not self._transmits:
+            return None
+        begin = self._promised_until(now)
+        if self.limit is None:
+            return begin - self._lead
+        if self._unused:
+            return None  # what the limit says of the packet after it is known when that one has come
+        return max(self.limit.earliest(begin, self._airtime) - self._lead, self.limit.again(now) or now)
 
     def _promised_until(self, now: float) -> float:
         return max(now, self._free) + self._unused * self._airtime

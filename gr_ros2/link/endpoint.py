@@ -1,25 +1,34 @@
 """One robot's end of a link: messages and packets in, packets and events out.
 
-An end sends and receives, so that received packets can change what it sends. Invariants: as everywhere in ``link``,
-time is an argument and never goes back; nothing happens outside a call; the sending half reports to its observer
-immediately; the receiving half returns its events, so that the caller can act on them before any observer.
+It has two sides. The *message side* (``messages``) is what a robot's ROS graph works with: it takes messages, keeps
+their queues, and announces their topics. The *packet side* is what a PHY works with: it gives and takes packets. An end
+sends and receives, so that received packets can change what it sends.
+
+Invariants: as everywhere in ``link``, time is an argument and never goes back; nothing happens outside a call; the
+sending half reports to its observer immediately; the receiving half returns its events, so that the caller can act on
+them before any observer.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
 from typing import Any, Protocol
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.pace import Pace
+from gr_ros2.link.rate import Mcs
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.settings.config import QueuePolicy, SinkConfig, SourceConfig
-from gr_ros2.settings.registry import NewRow, Registry
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.wire import AnnouncedTopic
 
 LIVE_SETTINGS = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
 """Settings of a sending half that may change at run time, the same in every version."""
@@ -35,43 +44,16 @@ def check_live(changes: Mapping[str, Any]) -> None:
             raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
 
 
-class Endpoint(Protocol):
-    """The interface of an end, the same for every version of the wire format."""
+class MessageSide(Protocol):
+    """The messages that an end sends."""
 
-    @property
-    def answers(self) -> bool:
-        """Whether received packets can change what this end sends."""
-
-    @property
-    def sent(self) -> SenderStats:
-        """Counters of the sending half."""
-
-    @property
-    def received(self) -> ReceiverStats:
-        """Counters of the receiving half."""
-
-    @property
-    def idle(self) -> bool:
-        """Whether no message waits, and no packet that has left is worth repairing."""
-
-    @property
-    def interval(self) -> float:
-        """s from one packet to the next while busy: as configured, or as measured from the credits; 0 if unknown."""
-
-    @property
-    def out_of_credit(self) -> bool:
-        """Whether nothing leaves before the next credit, whatever is submitted."""
-
-    @property
-    def held_bytes(self) -> int:
-        """Memory in use for incomplete messages."""
-
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
         """Take a serialized message.
 
         It may be refused, and it may cause waiting messages of its topic to be dropped; all are counted and observed.
 
-        :raises ConfigError: for a topic that is not in the registry, or at an end that sends nothing
+        :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline (version 1)
+        :raises ConfigError: for a topic that is not sent
         """
 
     def missed(self, topic_id: int, total: int) -> None:
@@ -80,13 +62,19 @@ class Endpoint(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
-    def add(self, rows: Sequence[NewRow]) -> Registry:
+    def add(self, rows: Sequence[NewTopic]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 
         A name may come again with another type: both rows stay, and the messages of each keep their type.
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Start or stop announcing a service to the other robots. At the start, services are not announced.
+
+        :raises ConfigError: a version without services
         """
 
     def forget_kept(self, topic_id: int) -> None:
@@ -130,6 +118,120 @@ class Endpoint(Protocol):
     def queued(self) -> dict[int, int]:
         """Messages that wait or are partly sent, per topic id."""
 
+
+class PacketSide(Protocol):
+    """The packets that an end sends and receives."""
+
+    @property
+    def answers(self) -> bool:
+        """Whether received packets can change what this end sends."""
+
+    @property
+    def pace(self) -> Pace:
+        """When packets may leave: the credits of the PHY, and the configured rate."""
+
+    @property
+    def mcs_table(self) -> Sequence[Mcs]:
+        """The rates of an adaptive rate, the most robust one first; () for a fixed rate."""
+
+    @property
+    def urged(self) -> bool:
+        """Whether a received packet may let one leave at once, before ``next_departure``."""
+
+    def next_packet(self, now: float) -> SentPacket | None:
+        """The next packet that may go at ``now``, or None."""
+
+    def next_departure(self, *, credited: bool = False) -> float | None:
+        """Earliest time at which ``next_packet`` may have something without a further call; None if only a call can
+        change that.
+
+        :param credited: if there were a credit
+        """
+
+    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+        """Take one packet; the events it causes, in order."""
+
+    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
+        """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
+
+    def next_timeout(self) -> float | None:
+        """The same as ``next_departure`` for ``handle_timeout``."""
+
+
+@dataclass(frozen=True)
+class HeardRobot:
+    """A robot that was heard.
+
+    :param heard_s: s since the newest packet
+    :param silent: it has been silent for long
+    :param start: its boot number
+    :param sealed: its packets are sealed
+    :param snr_db: SNR of its newest packets, dB; None if it is not measured packet by packet
+    :param loss: share of its packets that were lost lately, 0..1
+    :param topics: number of topics and services that it has announced
+    """
+
+    robot: int
+    heard_s: float
+    silent: bool
+    start: int
+    sealed: bool
+    snr_db: float | None
+    loss: float
+    topics: int
+
+
+class Questions(Protocol):
+    """Questions to other robots, which answer at once, so that round trip and loss can be told.
+
+    :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
+    :ivar snr_db: returns the SNR of the newest packets of all robots, dB
+    """
+
+    wall_s: float
+    snr_db: Callable[[], float | None]
+
+    def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
+        """Tell those who ask what this end is.
+
+        :param phy: number that stands for the settings of the PHY
+        :param key: number that stands for the key, 0 for none
+        """
+
+    def put(self, robot: int, now: float) -> dict[str, Any]:
+        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far."""
+
+
+class Endpoint(PacketSide, Protocol):
+    """An end, the same for every version of the wire format."""
+
+    @property
+    def messages(self) -> MessageSide:
+        """Its message side.
+
+        :raises ConfigError: it sends nothing
+        """
+
+    @property
+    def boot(self) -> int:
+        """Number of this start of the robot; 0 in a version that does not count them."""
+
+    @property
+    def sent(self) -> SenderStats:
+        """Counters of the sending half."""
+
+    @property
+    def received(self) -> ReceiverStats:
+        """Counters of the receiving half."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether no message waits, and no packet that has left is worth repairing."""
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory in use for incomplete messages."""
+
     def reconfigure(self, **changes: Any) -> None:
         """Change settings of the sending half at run time, some of ``LIVE_SETTINGS``.
 
@@ -142,46 +244,18 @@ class Endpoint(Protocol):
     def knows(self, src_id: int) -> bool:
         """Whether the state of a sender is held at present."""
 
-    def use_credit(self) -> None:
-        """From now on, a packet leaves only when there is a credit."""
-
-    def credit(self, packets: int = 1) -> None:
-        """The PHY can take this many further packets."""
-
-    def next_packet(self, now: float) -> bytes | None:
-        """The next packet that may go at ``now``, or None."""
+    def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
+        """The topics of a robot by topic id, as far as it has announced them."""
 
     @property
-    def ladder(self) -> Sequence[Rung]:
-        """The rungs of an adaptive rate, the most robust one first; () for a fixed rate."""
+    def questions(self) -> Questions:
+        """Its questions to other robots.
 
-    @property
-    def rung(self) -> int:
-        """With an adaptive rate, the rung of the last packet from ``next_packet`` (:mod:`gr_ros2.link.rate`);
-        otherwise 0."""
-
-    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
-        """Take the bytes of one packet; the events it causes, in order.
-
-        :param snr_db: SNR of this packet, dB; None where it is not measured
+        :raises ConfigError: a version without them
         """
 
-    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Do what is due by ``now``; return the events it causes, in order. It does not include ``next_packet``."""
-
-    @property
-    def urged(self) -> bool:
-        """Whether a received packet may let one leave at once, before ``next_departure``."""
-
-    def next_departure(self, *, credited: bool = False) -> float | None:
-        """Earliest time at which ``next_packet`` may have something without a further call; None if only a call can
-        change that.
-
-        :param credited: if there were a credit
-        """
-
-    def next_timeout(self) -> float | None:
-        """The same for ``handle_timeout``."""
+    def peers(self, now: float) -> list[HeardRobot]:
+        """The robots that are known, if the version tells."""
 
 
 class EndpointV0:
@@ -195,7 +269,8 @@ class EndpointV0:
     """
 
     answers = urged = False
-    ladder: Sequence[Rung] = ()
+    boot = 0
+    mcs_table: Sequence[Mcs] = ()
 
     def __init__(
         self,
@@ -212,81 +287,11 @@ class EndpointV0:
         self._receiver = None if sink is None else Receiver(registry, sink, codec=from_air)
         self.sent = SenderStats() if self._sender is None else self._sender.stats
         self.received = ReceiverStats() if self._receiver is None else self._receiver.stats
+        self.pace = Pace(AUTO) if self._sender is None else self._sender.pace
 
     @property
-    def idle(self) -> bool:
-        """Whether nothing waits to be sent."""
-        return self._sender is None or self._sender.idle
-
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
-        """See :class:`Endpoint`."""
-        self._half().submit(topic_id, payload, now)
-
-    @property
-    def interval(self) -> float:
-        """See :class:`Endpoint`."""
-        return 0.0 if self._sender is None else self._sender.interval
-
-    @property
-    def out_of_credit(self) -> bool:
-        """See :class:`Endpoint`."""
-        return self._sender is not None and self._sender.out_of_credit
-
-    @property
-    def held_bytes(self) -> int:
-        """See :class:`Endpoint`."""
-        return 0 if self._receiver is None else self._receiver.held_bytes
-
-    def missed(self, topic_id: int, total: int) -> None:
-        """See :class:`Endpoint`."""
-        self._half().missed(topic_id, total)
-
-    def add(self, rows: Sequence[NewRow]) -> Registry:
-        """See :class:`Endpoint`."""
-        raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
-
-    def forget_kept(self, topic_id: int) -> None:
-        """Do nothing: the types of version 0 never change."""
-
-    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        """Do nothing: both ends of version 0 code by the same dictionaries."""
-
-    def follow(self, topic_id: int, **qos: Any) -> bool:  # noqa: ARG002
-        """Do nothing: version 0 delivers as it comes, and the registry says the rest at both ends."""
-        return False
-
-    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:  # noqa: ARG002 - all topics have the same
-        """See :class:`Endpoint`."""
-        return "fifo", 0.0
-
-    def depth(self, topic_id: int) -> int:
-        """See :class:`Endpoint`."""
-        return self._half().depth(topic_id)
-
-    def room(self, topic_id: int) -> bool:
-        """See :class:`Endpoint`."""
-        return self._half().room(topic_id)
-
-    def queued(self) -> dict[int, int]:
-        """See :class:`Endpoint`."""
-        return {} if self._sender is None else self._sender.queued()
-
-    def reconfigure(self, **changes: Any) -> None:
-        """See :class:`Endpoint`."""
-        check_live(changes)
-        self._half().reconfigure(**changes)
-
-    def unpublished(self, event: Delivered) -> Lost:
-        """See :class:`Endpoint`."""
-        assert self._receiver is not None
-        return self._receiver.unpublished(event)
-
-    def knows(self, src_id: int) -> bool:
-        """See :class:`Endpoint`."""
-        return self._receiver is not None and self._receiver.knows(src_id)
-
-    def _half(self) -> Sender:
-        """The half that sends.
+    def messages(self) -> Sender:
+        """Its sending half.
 
         :raises ConfigError: there is no such half
         """
@@ -294,37 +299,57 @@ class EndpointV0:
             raise ConfigError("an end that sends nothing was asked to; give it a source")
         return self._sender
 
-    def use_credit(self) -> None:
-        """See :class:`Endpoint`."""
-        if self._sender is not None:
-            self._sender.use_credit()
-
-    def credit(self, packets: int = 1) -> None:
-        """See :class:`Endpoint`."""
-        if self._sender is not None:
-            self._sender.credit(packets)
-
-    def next_packet(self, now: float) -> bytes | None:
-        """See :class:`Endpoint`."""
-        return None if self._sender is None else self._sender.next_packet(now)
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits to be sent."""
+        return self._sender is None or self._sender.idle
 
     @property
-    def rung(self) -> int:
+    def held_bytes(self) -> int:
         """See :class:`Endpoint`."""
-        return 0
+        return 0 if self._receiver is None else self._receiver.held_bytes
 
-    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:  # noqa: ARG002
+    def reconfigure(self, **changes: Any) -> None:
         """See :class:`Endpoint`."""
-        return [] if self._receiver is None else self._receiver.receive(data, now)
+        check_live(changes)
+        self.messages.reconfigure(**changes)
 
-    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """See :class:`Endpoint`."""
-        return [] if self._receiver is None else self._receiver.handle_timeout(now)
+    def next_packet(self, now: float) -> SentPacket | None:
+        """See :class:`PacketSide`."""
+        return None if self._sender is None else self._sender.next_packet(now)
 
     def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002 - nothing is due by itself
-        """See :class:`Endpoint`."""
+        """See :class:`PacketSide`."""
         return None if self._sender is None else self._sender.next_timeout()
 
+    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+        """See :class:`PacketSide`."""
+        return [] if self._receiver is None else self._receiver.receive(arrival, now)
+
+    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
+        """See :class:`PacketSide`."""
+        return [] if self._receiver is None else self._receiver.handle_timeout(now)
+
     def next_timeout(self) -> float | None:
-        """See :class:`Endpoint`."""
+        """See :class:`PacketSide`."""
         return None if self._receiver is None else self._receiver.next_timeout()
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """See :class:`Endpoint`."""
+        assert self._receiver is not None
+        return self._receiver.unpublished(event)
+
+    @property
+    def questions(self) -> Questions:
+        raise ConfigError("version = 0: a robot can be asked with version 1 only; set version to 1 at every end")
+
+    def peers(self, now: float) -> list[HeardRobot]:  # noqa: ARG002 - senders are not followed
+        return []
+
+    def knows(self, src_id: int) -> bool:
+        """See :class:`Endpoint`."""
+        return self._receiver is not None and self._receiver.knows(src_id)
+
+    def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:  # noqa: ARG002 - nobody announces any
+        """See :class:`Endpoint`."""
+        return {}

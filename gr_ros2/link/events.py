@@ -13,14 +13,47 @@ from collections.abc import Hashable
 from typing import Literal, NamedTuple
 
 from gr_ros2.core.errors import WireError
-from gr_ros2.wire import Packet, TableRow
+from gr_ros2.wire import AnnouncedTopic, Packet
+
+
+class PacketId(NamedTuple):
+    """What a packet is named by, at its sender and at every receiver, whatever its bytes.
+
+    :param boot: number of the sender's start; 0 with version 0, which has none
+    :param number: full number of the packet; with version 0 the number on the wire, which comes round
+    :param row: distinguishes the packets that have one number: a packet of messages and its repairs; with version 0,
+        whose numbers come round, a checksum of its bytes
+    """
+
+    src_id: int
+    boot: int
+    number: int
+    row: int
+
+
+class ReceivedPacket(NamedTuple):
+    """A packet as it comes out of a PHY.
+
+    :param received_at: s on the clock of the call, when its burst began; None where the PHY does not say
+    :param snr_db: SNR of its burst, dB; None where it is not measured
+    """
+
+    data: bytes
+    received_at: float | None = None
+    snr_db: float | None = None
 
 
 class Received(NamedTuple):
-    """A packet arrived: its bytes and their meaning. Events that it causes follow it."""
+    """A packet arrived: its bytes and their meaning. Events that it causes follow it.
+
+    :param received_at, snr_db: see :class:`ReceivedPacket`
+    """
 
     data: bytes
     packet: Packet
+    identity: PacketId
+    received_at: float | None = None
+    snr_db: float | None = None
 
 
 class Rejected(NamedTuple):
@@ -80,7 +113,7 @@ class Announced(NamedTuple):
     """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
-    rows: tuple[TableRow, ...]
+    rows: tuple[AnnouncedTopic, ...]
 
 
 ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
@@ -140,23 +173,26 @@ class SentEntry(NamedTuple):
 
 
 AirKind = Literal["new", "repair", "report", "hello"]
-"""What a packet's airtime was used for: messages; repair of what may have been lost; reports of what was heard; hellos
-and requests."""
+"""What a packet's airtime was used for: messages; repair of what may have been lost; reports of what was heard; hellos,
+requests, and questions that try out the link."""
 
 
 class SentPacket(NamedTuple):
     """A packet that left the sender: its bytes, their meaning, and the messages to which its entries belong, in order.
 
-    ``entries`` are those of messages that are sent for the first time; a repair has none. ``rung`` is that of the
-    adaptive rate (:mod:`gr_ros2.link.rate`), 0 where the rate is fixed.
+    ``entries`` are those of messages that are sent for the first time; a repair has none. ``mcs`` is that of the
+    adaptive rate (:mod:`gr_ros2.link.rate`), 0 where the rate is fixed. ``leave_at`` is the time in s, on the clock of
+    ``now``, at which its burst is to begin; None: as soon as the PHY can send it.
     """
 
     data: bytes
     packet: Packet
+    identity: PacketId
     entries: tuple[SentEntry, ...]
     now: float
     kind: AirKind = "new"
-    rung: int = 0
+    mcs: int = 0
+    leave_at: float | None = None
 
 
 SenderEvent = Accepted | Refused | Missed | SentPacket

@@ -46,10 +46,12 @@ class Observers(Generic[_Observer]):
         return guard
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """Pass an event of a sending half on to all."""
         for observer, guard in self._guarded:
             guard(observer.sender_event, src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """Pass an event of a receiving half on to all."""
         for observer, guard in self._guarded:
             guard(observer.receiver_event, event, now)
 

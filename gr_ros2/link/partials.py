@@ -10,7 +10,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from gr_ros2.wire.v0 import Entry
+from gr_ros2.wire.v0 import EntryV0
 
 _FRAGMENT_COST = 64
 """Bytes of bookkeeping counted per held fragment."""
@@ -39,12 +39,12 @@ class Partial:
     size: int = 0
     following: int = 0
 
-    def contradicts(self, entry: Entry, flags: int) -> bool:
+    def contradicts(self, entry: EntryV0, flags: int) -> bool:
         """Whether an entry with the same id cannot belong to this message."""
         held = self.fragments.get(entry.index)
         return entry.total != self.total or flags != self.flags or (held is not None and held != entry.payload)
 
-    def goes_on_with(self, entry: Entry) -> bool:
+    def goes_on_with(self, entry: EntryV0) -> bool:
         """Whether an entry is the next fragment of this message, or one that was received before."""
         return not self.doubtful and (entry.index == self.following or entry.index in self.fragments)
 
@@ -75,7 +75,7 @@ class Partials:
         """All messages in their order."""
         return iter(self._in_order)
 
-    def add(self, partial: Partial, entry: Entry, now: float) -> bytes | None:
+    def add(self, partial: Partial, entry: EntryV0, now: float) -> bytes | None:
         """Hold a fragment of a message, which may be its first.
 
         :return: the complete message, which is then no longer held; None while fragments are missing

@@ -15,8 +15,10 @@ from math import inf
 
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.wire import QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +128,23 @@ class TopicQueue(deque[Outgoing]):
         return LedgerRow.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
+def qos_class(options: TopicOptions, *, command: bool = False) -> int:
+    """The QoS class of a topic's messages.
+
+    :param command: whether it is one of commands, which go first unless the options say otherwise
+    """
+    if options.qos == AUTO:
+        return QOS_LATENCY if command else QOS_DEFAULT
+    return QOS_NAMES.index(options.qos)
+
+
 def queue_for(
-    options: TopicOptions, depth: int = 0, lifespan_s: float = 0.0, period_s: float = 0.0
+    options: TopicOptions,
+    depth: int = 0,
+    lifespan_s: float = 0.0,
+    period_s: float = 0.0,
+    *,
+    command: bool = False,
 ) -> tuple[QueuePolicy, float]:
     """The policy of a topic's queue and its deadline in s (0 = none): the configured ones, otherwise from its
     publishers' QoS.
@@ -140,10 +157,12 @@ def queue_for(
     :param depth: depth of the publishers' history, 0 for unbounded or unknown
     :param lifespan_s: s, 0 without limit
     :param period_s: the publishers' deadline: s within which they promise a message, 0 for no promise
+    :param command: whether it is one of commands, which have a deadline of their own
     """
+    own_s = COMMAND_DEADLINE_S * command
     if options.queue != AUTO:
-        return options.queue, 0.0 if options.deadline_s == AUTO else options.deadline_s
-    deadline_s = lifespan_s if options.deadline_s == AUTO else options.deadline_s
+        return options.queue, own_s if options.deadline_s == AUTO else options.deadline_s
+    deadline_s = (lifespan_s or own_s) if options.deadline_s == AUTO else options.deadline_s
     if options.max_rate or options.depth == 1 or (options.depth == AUTO and (depth == 1 or period_s)):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

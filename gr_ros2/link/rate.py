@@ -1,12 +1,12 @@
-"""Adaptive rate: which rung of a ladder of modulations and codes each packet is sent with.
+"""Adaptive rate: which MCS of a table of modulations and codes each packet is sent with.
 
-Receivers report the SNR of the packets that they hear. A rung's model says what share of its packets arrive at an SNR,
-so the rung with the greatest expected goodput can be chosen. Reports also tell the share of packets lost. Where it
+Receivers report the SNR of the packets that they hear. An MCS's model says what share of its packets arrive at an SNR,
+so the MCS with the greatest expected goodput can be chosen. Reports also tell the share of packets lost. Where it
 differs from the expected share, the SNR is corrected ("outer loop": the model may not fit a radio, and in a fading
 channel a report is late).
 
-Invariants: a packet for several robots is sent with a rung that suits the weakest of them; a packet for nobody who is
-known, and one for a robot that has fallen silent, is sent with the most robust rung. A rung is left for a faster one
+Invariants: a packet for several robots is sent with an MCS that suits the weakest of them; a packet for nobody who is
+known, and one for a robot that has fallen silent, is sent with the most robust MCS. An MCS is left for a faster one
 only if that promises clearly more, and only some reports after the last change: more of them each time that the faster
 one is soon left again. There is no clock here: ``now`` is seconds, monotonic.
 """
@@ -21,11 +21,11 @@ from math import exp, inf
 from gr_ros2.core.errors import ConfigError
 
 GAIN_UP, GAIN_DOWN = 1.1, 1.03
-"""How many times the present rung's goodput a faster rung, and a slower one, must promise to be taken."""
+"""How many times the present MCS's goodput a faster MCS, and a slower one, must promise to be taken."""
 SETTLED = 2
-"""Reports after a change before a faster rung is tried. A slower one is taken at once."""
+"""Reports after a change before a faster MCS is tried. A slower one is taken at once."""
 _HASTY, _MOST_PATIENCE = 4, 128
-"""A faster rung that is left within this many times the reports that were waited for before it, was taken because of an
+"""A faster MCS that is left within this many times the reports that were waited for before it, was taken because of an
 error of measurement: the next one is tried after twice as many reports, up to the second number. Otherwise after half
 as many."""
 MOST_SILENT_S = 1.0
@@ -61,7 +61,7 @@ _STEEPEST = 50.0
 
 
 @dataclass(frozen=True)
-class Rung:
+class Mcs:
     """A modulation and a code.
 
     :param name: for people
@@ -86,10 +86,10 @@ class Rung:
 
 
 @dataclass
-class _Robot:
+class _Peer:
     """What is known of a receiver."""
 
-    rung: int = 0
+    mcs: int = 0
     reported_db: float = -inf
     """The newest SNR reported."""
     correction_db: float = 0.0
@@ -97,13 +97,13 @@ class _Robot:
     gap_s: float = _LONGEST_GAP_S
     unanswered: int = 0
     reports: int = 0
-    """Reports since the last change of the rung."""
+    """Reports since the last change of the MCS."""
     patience: int = SETTLED
-    """Reports after a change before a faster rung is tried."""
+    """Reports after a change before a faster MCS is tried."""
     changed_db: float = -inf
-    """The SNR to count on at the last change of the rung."""
+    """The SNR to count on at the last change of the MCS."""
     climbed: bool = False
-    """Whether the last change was to a faster rung."""
+    """Whether the last change was to a faster MCS."""
     before: tuple[float, float] = (-inf, 0.0)
     """When the SNR was looked at for its change, s, and its value then, dB."""
     trend_db_s: float = 0.0
@@ -140,17 +140,17 @@ class _Robot:
 
 
 class RateController:
-    """Chooses the rung of each packet.
+    """Chooses the MCS of each packet.
 
-    :param ladder: the rungs, the most robust one first, each faster than the one before
-    :raises ConfigError: for a ladder without rungs, or in another order
+    :param mcs_table: the rates, the most robust one first, each faster than the one before
+    :raises ConfigError: for a table without an MCS, or in another order
     """
 
-    def __init__(self, ladder: Sequence[Rung]) -> None:
-        if not ladder or any(one.airtime_s <= two.airtime_s for one, two in pairwise(ladder)):
-            raise ConfigError("the rungs of a ladder: one at least, each with less airtime than the one before")
-        self.ladder = tuple(ladder)
-        self._robots: dict[int, _Robot] = {}
+    def __init__(self, mcs_table: Sequence[Mcs]) -> None:
+        if not mcs_table or any(one.airtime_s <= two.airtime_s for one, two in pairwise(mcs_table)):
+            raise ConfigError("the MCS table: one MCS at least, each with less airtime than the one before")
+        self.mcs_table = tuple(mcs_table)
+        self._robots: dict[int, _Peer] = {}
 
     def report(self, robot: int, snr_db: float, loss: float, now: float) -> None:
         """A robot has reported.
@@ -158,54 +158,54 @@ class RateController:
         :param snr_db: of the newest packets that it has heard
         :param loss: share of the packets that it has lost lately, 0..1
         """
-        known = self._robots.setdefault(robot, _Robot())
+        known = self._robots.setdefault(robot, _Peer())
         gap = known.heard_at(snr_db, now)
-        surplus = loss - (1 - self.ladder[known.rung].pdr(known.snr_db(now)))
+        surplus = loss - (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
         correction = known.correction_db + gap * (_CORRECTION_DB_S * surplus - known.correction_db / _FADE_S)
         known.correction_db = min(max(correction, -_MOST_CORRECTION_DB), _MOST_CORRECTION_DB)
         self._choose(known, now)
 
     def meet(self, robot: int) -> None:
         """A robot that can report is known. It counts for packets to everybody from now on."""
-        self._robots[robot] = _Robot()
+        self._robots[robot] = _Peer()
 
     def forget(self, robot: int) -> None:
         """A robot is gone."""
         self._robots.pop(robot, None)
 
     def sent(self, robot: int | None, now: float) -> int:
-        """A packet leaves for a robot, or for everybody (None). Returns the index of its rung."""
-        known = self._robots.values() if robot is None else [self._robots.get(robot, _Robot())]
+        """A packet leaves for a robot, or for everybody (None). Returns the index of its MCS."""
+        known = self._robots.values() if robot is None else [self._robots.get(robot, _Peer())]
         return min((self._next(one, now) for one in known), default=0)
 
-    def _next(self, known: _Robot, now: float) -> int:
+    def _next(self, known: _Peer, now: float) -> int:
         known.unanswered += 1
         if self._silent(known, now):
-            known.rung, known.reports, known.climbed, known.changed_db = 0, 0, False, -inf
+            known.mcs, known.reports, known.climbed, known.changed_db = 0, 0, False, -inf
         elif known.fades:
             self._choose(known, now, faster=False)
-        return known.rung
+        return known.mcs
 
-    def _silent(self, known: _Robot, now: float) -> bool:
+    def _silent(self, known: _Peer, now: float) -> bool:
         waited = now - known.heard
         least_s, packets = (_FADING_SILENT_S, _FADING_UNANSWERED) if known.fades else (_LEAST_SILENT_S, _UNANSWERED)
         usual = max(_GAPS * known.gap_s, least_s)
         return waited > MOST_SILENT_S or (known.unanswered >= packets and waited > usual)
 
-    def _choose(self, known: _Robot, now: float, *, faster: bool = True) -> None:
+    def _choose(self, known: _Peer, now: float, *, faster: bool = True) -> None:
         snr_db = known.snr_db(now)
-        worth = [rung.goodput(snr_db) for rung in (self.ladder if faster else self.ladder[: known.rung + 1])]
+        worth = [mcs.goodput(snr_db) for mcs in (self.mcs_table if faster else self.mcs_table[: known.mcs + 1])]
         best = max(range(len(worth)), key=worth.__getitem__)
-        gain = GAIN_UP if best > known.rung else GAIN_DOWN
-        if best == known.rung or worth[best] < gain * worth[known.rung]:
+        gain = GAIN_UP if best > known.mcs else GAIN_DOWN
+        if best == known.mcs or worth[best] < gain * worth[known.mcs]:
             return
-        # A change of the SNR explains that a rung is left. Without one, its choice was an error of measurement.
+        # A change of the SNR explains that an MCS is left. Without one, its choice was an error of measurement.
         changed = abs(snr_db - known.changed_db) > _CHANGE_DB
-        if best > known.rung:
+        if best > known.mcs:
             if not changed and known.reports < known.patience:
                 return
         elif known.climbed and not changed:
             hasty = known.reports <= _HASTY * known.patience
             known.patience = min(2 * known.patience, _MOST_PATIENCE) if hasty else max(known.patience // 2, SETTLED)
-        known.climbed = best > known.rung
-        known.rung, known.reports, known.changed_db = best, 0, snr_db
+        known.climbed = best > known.mcs
+        known.mcs, known.reports, known.changed_db = best, 0, snr_db

@@ -25,9 +25,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gr_ros2.link.partials import Partial, Partials
-from gr_ros2.link.sequence import Pace
+from gr_ros2.link.sequence import CountRate
 from gr_ros2.wire import unwrap
-from gr_ros2.wire.v0 import V0, Entry
+from gr_ros2.wire.v0 import V0, EntryV0
 
 OVERTAKEN = 64
 _PATIENT = 192
@@ -78,9 +78,9 @@ class TopicReassembler:
         self._epoch = 0
         self._top = -1
         """The highest packet position that had an entry of this topic."""
-        self._pace = Pace(window=16, least=8)
+        self._pace = CountRate(window=16, least=8)
 
-    def accept(self, entry: Entry, context: Context) -> tuple[bytes | None, list[Partial]]:
+    def accept(self, entry: EntryV0, context: Context) -> tuple[bytes | None, list[Partial]]:
         """Take one entry.
 
         :returns: the message it completed, if any, and the incomplete messages it ended
@@ -131,7 +131,7 @@ class TopicReassembler:
         self._latest = self._settled = _NOWHERE
         self._history.clear()
         self._orderly = True
-        self._pace = Pace(window=16, least=8)
+        self._pace = CountRate(window=16, least=8)
         return self.clear()
 
     def _number(self, entry_id: int) -> int:

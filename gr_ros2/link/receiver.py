@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
-from gr_ros2.link.events import Delivered, Lost, Received, ReceiverEvent, Rejected
+from gr_ros2.link.events import Delivered, Lost, PacketId, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.partials import Partial, Partials
@@ -21,7 +22,7 @@ from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import BROADCAST
-from gr_ros2.wire.v0 import V0, Packet
+from gr_ros2.wire.v0 import V0, PacketV0
 
 SOURCE_IDLE_S = 60.0
 """A source that was silent for this many seconds is replaced by a new one when ``max_sources`` are known."""
@@ -59,8 +60,9 @@ class Receiver:
         self._sources: dict[int, _Source] = {}
         self._partials = Partials()
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
-        """Take the bytes of one packet; the events it causes, in order."""
+    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+        """Take one packet; the events it causes, in order."""
+        data = arrival.data
         events = self.handle_timeout(now) if self._partials.size else []
         try:
             packet = V0.decode(data, self.config.packet_len)
@@ -69,7 +71,7 @@ class Receiver:
             events.append(Rejected(data, error))
             return events
         self.stats.packets += 1
-        events.append(Received(data, packet))
+        events.append(Received(data, packet, PacketId(packet.src_id, 0, packet.seq, crc32(data)), *arrival[1:]))
         source = self._admit(packet, now)
         if source is not None:
             self._take(source, packet, data, now, events)
@@ -106,7 +108,7 @@ class Receiver:
         """Memory in use for incomplete messages."""
         return self._partials.size
 
-    def _admit(self, packet: Packet, now: float) -> _Source | None:
+    def _admit(self, packet: PacketV0, now: float) -> _Source | None:
         """The source of a packet, None if the packet is not for this receiver."""
         own = self.config.robot_id
         if own != AUTO:
@@ -129,7 +131,7 @@ class Receiver:
         source.last = now
         return source
 
-    def _take(self, source: _Source, packet: Packet, data: bytes, now: float, events: list[ReceiverEvent]) -> None:
+    def _take(self, source: _Source, packet: PacketV0, data: bytes, now: float, events: list[ReceiverEvent]) -> None:
         placed = source.sequence.place(packet.seq, data, now)
         if placed.arrival is Arrival.DUPLICATE:
             self.stats.dropped["duplicate"] += 1
@@ -171,7 +173,7 @@ class Receiver:
             events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.MEMORY))
 
     def _deliver(
-        self, source: _Source, packet: Packet, topic_id: int, entry_id: int, payload: bytes
+        self, source: _Source, packet: PacketV0, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
             return [self._undone(packet, topic_id, entry_id, LedgerRow.UNSUPPORTED)]
@@ -188,7 +190,7 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: Packet, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
+    def _undone(self, packet: PacketV0, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
         """Record a complete message that cannot be decoded here."""
         self.stats.lost[packet.src_id, topic_id, row.value] += 1
         return Lost(packet.src_id, topic_id, row, entry_id)

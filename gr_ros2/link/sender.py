@@ -8,24 +8,25 @@ composed when it is requested, never before; time is an argument and never goes 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any
+from zlib import crc32
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Missed, PacketId, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
-from gr_ros2.link.queues import TopicQueue
+from gr_ros2.link.queues import TopicQueue, qos_class
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.settings.config import SourceConfig, replaced
+from gr_ros2.settings.config import QueuePolicy, SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry
-from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
-from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
 Observer = Callable[[SenderEvent], None]
 
@@ -64,7 +65,7 @@ class Sender:
         self._largest = V0.largest_message(config.packet_len)
         self._scheduler = PaperScheduler(config)
         self._queues = {topic.topic_id: TopicQueue("fifo") for topic in self.registry}
-        self._classes = [QOS_NAMES.index(topic.options.qos) for topic in self.registry]
+        self._classes = [qos_class(topic.options) for topic in self.registry]
         self._depths = [topic.options.queue_depth for topic in self.registry]
         self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
         """Topics whose newest message is kept for robots that join late."""
@@ -75,12 +76,13 @@ class Sender:
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
         self._seq = self._rng.randrange(self._numbers)
         self._serial = 0
-        self._pace = Pace(config.packet_rate)
+        self.pace = Pace(config.packet_rate)
+        """When packets may leave."""
         self._latched: dict[int, tuple[int, bytes]] = {}
         """Per topic, serial and coded bytes of the message for robots that join late."""
         self._repeat_at: dict[int, float] = {}
 
-    def submit(self, topic_id: int, payload: bytes, now: float) -> None:
+    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:  # noqa: ARG002
         """Take a serialized message.
 
         It may be refused (``too_large``), and it may cause the oldest waiting message of its topic to be dropped
@@ -120,56 +122,66 @@ class Sender:
             self.stats.missed[topic_id] = total
             self._observe(Missed(topic_id, new))
 
-    def next_packet(self, now: float) -> bytes | None:
+    def next_packet(self, now: float) -> SentPacket | None:
         """The next packet that may go at ``now``, or None."""
-        if not self._pace.may_leave(now):
+        if not self.pace.may_leave(now):
             return None
         if self._repeat_at:
             self._repeat(now)
         plan = self._planned()
         if plan is None or now < self._departure(plan):
             return None
-        data = self._compose(plan, now)
-        if self._pace.known:
-            self._pace.left(now, waiting=not self.idle)
-        return data
+        sent = self._compose(plan, now)
+        if self.pace.known:
+            self.pace.left(now, waiting=not self.idle)
+        return sent
 
     def next_timeout(self) -> float | None:
         """Earliest time at which ``next_packet`` may return a packet without a further submit or credit."""
-        if self.out_of_credit:
+        if self.pace.out_of_credit:
             return None
         times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
         plan = self._planned()
         if plan is not None:
             times.append(self._departure(plan))
-        return max(min(times), self._pace.slot) if times else None
+        return max(min(times), self.pace.slot) if times else None
+
+    def add(self, rows: Sequence[NewTopic]) -> Registry:
+        """Refuse: both ends of version 0 have the same registry.
+
+        :raises ConfigError: always
+        """
+        raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:  # noqa: ARG002
+        """Refuse: version 0 carries no services.
+
+        :raises ConfigError: always
+        """
+        raise ConfigError("version 0 carries no services; set version to 1")
+
+    def forget_kept(self, topic_id: int) -> None:
+        """Do nothing: the types of version 0 never change."""
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Do nothing: both ends of version 0 code by the same dictionaries."""
+
+    def follow(self, topic_id: int, **qos: Any) -> bool:  # noqa: ARG002
+        """Do nothing: version 0 delivers as it comes, and the registry says the rest at both ends."""
+        return False
+
+    def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:  # noqa: ARG002 - all topics have the same
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        return "fifo", 0.0
 
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
         depth = self._depths[topic_id]
         return self.config.queue_depth if depth == AUTO else depth
 
-    def use_credit(self) -> None:
-        """See :class:`gr_ros2.link.pace.Pace`."""
-        self._pace.use_credit()
-
-    def credit(self, packets: int = 1) -> None:
-        """See :class:`gr_ros2.link.pace.Pace`."""
-        self._pace.credit(packets)
-
-    @property
-    def out_of_credit(self) -> bool:
-        """Whether nothing leaves before the next credit, whatever is submitted."""
-        return self._pace.out_of_credit
-
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
         return self._queues[topic_id].room(self.depth(topic_id))
-
-    @property
-    def interval(self) -> float:
-        """See :class:`gr_ros2.link.pace.Pace`."""
-        return self._pace.interval
 
     @property
     def idle(self) -> bool:
@@ -189,7 +201,7 @@ class Sender:
         self._scheduler.config = self.config
         self._stale = True
         if "packet_rate" in settings:
-            self._pace.change(self.config.packet_rate)
+            self.pace.change(self.config.packet_rate)
 
     def _planned(self) -> Plan | None:
         """The next packet's content; planned again only when something has changed."""
@@ -205,7 +217,7 @@ class Sender:
         waits = (min(message.submitted, self._queues[message.topic_id].since) for message in plan.picks)
         return min(waits) + self.config.flush_timeout_s
 
-    def _compose(self, plan: Plan, now: float) -> bytes:
+    def _compose(self, plan: Plan, now: float) -> SentPacket:
         config = self.config
         entries = []
         record = []
@@ -213,7 +225,7 @@ class Sender:
             if not message.started:
                 message.entry_id = self._take_id(message.topic_id)
                 self._queues[message.topic_id].started(now)
-            entry = Entry(message.topic_id, message.entry_id, message.index, message.total, message.take(length))
+            entry = EntryV0(message.topic_id, message.entry_id, message.index, message.total, message.take(length))
             entries.append(entry)
             record.append(
                 SentEntry(message.serial, entry.topic_id, entry.entry_id, entry.index, entry.total, message.repeat)
@@ -221,7 +233,7 @@ class Sender:
             if message.done:
                 self._queues[message.topic_id].popleft()
                 self.stats.sent[message.topic_id] += not message.repeat
-        packet = Packet(
+        packet = PacketV0(
             self.src_id,
             config.dst_id,
             self._seq,
@@ -231,6 +243,7 @@ class Sender:
             compressed=self._codec is not None,
         )
         data = V0.encode(packet, config.packet_len)
+        sent = SentPacket(data, packet, PacketId(self.src_id, 0, self._seq, crc32(data)), tuple(record), now)
         self._seq = (self._seq + 1) % self._numbers
         self._scheduler.sent(plan)
         self._stale = True
@@ -239,8 +252,8 @@ class Sender:
         stats.air["new"] += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
-        self._observe(SentPacket(data, packet, tuple(record), now))
-        return data
+        self._observe(sent)
+        return sent
 
     def _take_id(self, topic_id: int) -> int:
         if self.config.entry_ids == "random":

@@ -38,7 +38,7 @@ class Arrival(Enum):
     RESET = "cannot belong to the numbering so far: a restarted sender, or an outage too long to bridge"
 
 
-class Pace:
+class CountRate:
     """How long a count takes at its recent rate.
 
     :param window: counts remembered
@@ -90,7 +90,7 @@ class SequenceTracker:
         self._newest: int | None = None
         self._last_time = 0.0
         self._recent: OrderedDict[int, bytes] = OrderedDict()
-        self._pace = Pace(RECENT_PACKETS, RECENT_PACKETS)
+        self._pace = CountRate(RECENT_PACKETS, RECENT_PACKETS)
 
     def place(self, seq: int, data: bytes, now: float) -> Placed:
         """Place a packet by its sequence number and bytes."""

@@ -10,22 +10,29 @@ from __future__ import annotations
 import heapq
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, takewhile
+from functools import cached_property
+from itertools import count
 from math import inf
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.settings.config import ChannelConfig
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int_]
+
 
 @dataclass(frozen=True)
 class Path:
-    """What lies between a sender and one robot that can hear it.
+    """What lies between a sender and one robot that can hear it, whatever the level.
 
     :param receiver: place of that robot among the robots of the medium
-    :param channel: its ``snr_db`` is the level of the sender's bursts over the receiver's noise
+    :param channel: what happens to packets on the way. Its ``snr_db`` counts in :class:`FixedPaths` alone
     :param delay_s: s from the end of a packet's airtime to its reception
     """
 
@@ -33,16 +40,104 @@ class Path:
     channel: ChannelConfig
     delay_s: float = 0.0
 
-    @property
-    def level(self) -> float:
-        """Power received over that of the noise; 1 on a channel without noise."""
-        return 1.0 if self.channel.snr_db is None else float(10 ** (self.channel.snr_db / 10))
+
+@dataclass(frozen=True, eq=False)
+class Hearers:
+    """The robots that hear a sender, and how well, as long as nothing changes.
+
+    :param ids: their places among the robots of the medium, shape (n,)
+    :param snr_db: level of the sender's bursts over each receiver's noise, dB, shape (n,); infinite without noise
+    :param shift_hz: by how much each hears the carrier higher, Hz, shape (n,); 0 where robots do not move
+    :param robots: how many there are in all
+    """
+
+    ids: Ints
+    snr_db: Floats
+    shift_hz: Floats
+    robots: int
+
+    @cached_property
+    def noise(self) -> Floats:
+        """1, or 0 for a receiver without noise, shape (n,)."""
+        return np.isfinite(self.snr_db).astype(float)
+
+    @cached_property
+    def levels(self) -> Floats:
+        """Power received over that of the noise; 1 where there is none, shape (n,)."""
+        return np.asarray(10 ** (np.where(np.isfinite(self.snr_db), self.snr_db, 0.0) / 10))
+
+    @cached_property
+    def at(self) -> Floats:
+        """The level at every robot, 0 where the sender is not heard, shape (robots,)."""
+        levels = np.zeros(self.robots)
+        levels[self.ids] = self.levels
+        return levels
 
 
-Paths = Sequence[Sequence[Path]]
-"""For every robot the paths to those that can hear it. Robots below their noise are best left out."""
-PathsAt = Callable[[float], Paths]
-"""The paths at a time in s: the same object as long as no gain has changed."""
+class Surroundings(ABC):
+    """Who hears whom, and how well, as a function of time.
+
+    :ivar robots: how many there are
+    :ivar moves: whether levels change with time. All channels then differ in their seeds alone
+    :ivar passes: whether no path drops or delays whole packets
+    """
+
+    robots: int
+    moves: bool
+    passes: bool
+
+    @abstractmethod
+    def hearers(self, sender: int, now: float) -> Hearers:
+        """Those who hear a robot at a time in s: the same object as long as nothing has changed for this robot."""
+
+    @abstractmethod
+    def path(self, sender: int, receiver: int) -> Path:
+        """What lies between two robots."""
+
+    @abstractmethod
+    def reached(self, sender: int) -> list[int]:
+        """The robots that may ever hear this one."""
+
+    @abstractmethod
+    def near(self, sender: int, now: float) -> NDArray[np.bool_]:
+        """Which robots may be heard by anybody who hears this one, or hear it themselves, shape (robots,)."""
+
+
+class FixedPaths(Surroundings):
+    """Robots between which nothing changes.
+
+    :param paths: for every robot those to the robots that can hear it. Robots below their noise are best left out
+    """
+
+    moves = False
+
+    def __init__(self, paths: Sequence[Sequence[Path]]) -> None:
+        self.robots = len(paths)
+        self._paths = [{path.receiver: path for path in heard} for heard in paths]
+        self._hearers = [self._of(heard) for heard in paths]
+        self.passes = not any(path.channel.loses_packets or path.delay_s for heard in paths for path in heard)
+        hears = np.zeros((self.robots, self.robots), bool)
+        for sender, heard in enumerate(self._hearers):
+            hears[sender, heard.ids] = True
+        # Robots that reach a common one, and robots of which one reaches the other.
+        self._near = (hears.astype(np.float32) @ hears.T.astype(np.float32) > 0) | hears | hears.T
+
+    def _of(self, heard: Sequence[Path]) -> Hearers:
+        snrs = [inf if path.channel.snr_db is None else path.channel.snr_db for path in heard]
+        ids = np.array([path.receiver for path in heard], int)
+        return Hearers(ids, np.array(snrs), np.zeros(len(heard)), self.robots)
+
+    def hearers(self, sender: int, now: float) -> Hearers:  # noqa: ARG002
+        return self._hearers[sender]
+
+    def path(self, sender: int, receiver: int) -> Path:
+        return self._paths[sender][receiver]
+
+    def reached(self, sender: int) -> list[int]:
+        return list(self._paths[sender])
+
+    def near(self, sender: int, now: float) -> NDArray[np.bool_]:  # noqa: ARG002
+        return np.asarray(self._near[sender])
 
 
 class Transmission(NamedTuple):
@@ -51,7 +146,7 @@ class Transmission(NamedTuple):
     :param sender: place of the robot among the robots of the medium
     :param number: counts the packets of this sender, from 0
     :param start, end: s; the gap after a burst is included
-    :param rung: with an adaptive rate the rung that it is sent with
+    :param mcs: with an adaptive rate the MCS that it is sent with
     """
 
     sender: int
@@ -59,7 +154,7 @@ class Transmission(NamedTuple):
     data: bytes
     start: float
     end: float
-    rung: int = 0
+    mcs: int = 0
 
     def overlaps(self, other: Transmission) -> bool:
         """Whether both are on the air at the same time."""
@@ -85,10 +180,43 @@ class Reception(NamedTuple):
     measured_db: float | None = None
 
 
+class Losses:
+    """Packets that one robot did not receive from another, by reason: ``lost[sender, receiver]["collision"]``.
+
+    :ivar dropped: by the settings of a path
+    """
+
+    def __init__(self, robots: int) -> None:
+        self._robots = robots
+        self._counts: dict[str, Ints] = {}
+        self.dropped: dict[tuple[int, int], Counter[str]] = defaultdict(Counter)
+
+    def add(self, reason: str, sender: int, receivers: int | Ints, count: int = 1) -> None:
+        """A packet, or ``count``, was not received by these robots."""
+        if reason not in self._counts:
+            self._counts[reason] = np.zeros((self._robots, self._robots), int)
+        self._counts[reason][sender, receivers] += count
+
+    def clear(self) -> None:
+        """Count from 0 again."""
+        self._counts.clear()
+        for dropped in self.dropped.values():
+            dropped.clear()
+
+    def total(self, reason: str) -> int:
+        """Of all pairs together."""
+        counted = int(self._counts[reason].sum()) if reason in self._counts else 0
+        return counted + sum(dropped[reason] for dropped in self.dropped.values())
+
+    def __getitem__(self, pair: tuple[int, int]) -> Counter[str]:
+        counts = {reason: int(counts[pair]) for reason, counts in self._counts.items() if counts[pair]}
+        return Counter(counts) + self.dropped.get(pair, Counter())
+
+
 class Medium(ABC):
     """What robots share. Subclasses say what arrives of one packet.
 
-    :param paths: see :data:`PathsAt`
+    :param around: who hears whom
     :param shared: all robots use one channel: whoever sends hears nothing meanwhile, and packets that overlap at a
         receiver interfere. Otherwise every robot sends on a channel of its own, and hears while it sends
     :ivar lost: packets that one robot did not receive from another, by sender, receiver and reason: ``phy``,
@@ -99,27 +227,23 @@ class Medium(ABC):
     late = False
     """Whether receptions may come after their time, see :attr:`known_until`."""
 
-    def __init__(self, paths: PathsAt, *, shared: bool) -> None:
-        self.shared = shared
-        self.lost: dict[tuple[int, int], Counter[str]] = defaultdict(Counter)
-        self._paths_at = paths
-        self._paths: Paths = ()
-        self._near: dict[int, list[int]] = {}
-        self._hears: dict[int, set[int]] = {}
+    def __init__(self, around: Surroundings, *, shared: bool) -> None:
+        self.shared, self.around = shared, around
+        self.lost = Losses(around.robots)
         self._due: list[tuple[float, int, Transmission | Reception]] = []
         self._order = count()
         self._sent: Counter[int] = Counter()
-        self._recent: dict[int, deque[Transmission]] = defaultdict(deque)
+        self._recent: deque[Transmission] = deque()
         self._longest = 0.0
         self._losses: dict[tuple[int, int], PduLosses] = {}
 
-    def send(self, sender: int, data: bytes, start: float, airtime: float, rung: int = 0) -> Transmission:
+    def send(self, sender: int, data: bytes, start: float, airtime: float, mcs: int = 0) -> Transmission:
         """Take a packet that starts at ``start`` s and lasts for ``airtime`` s."""
-        sent = Transmission(sender, self._sent[sender], data, start, start + airtime, rung)
+        sent = Transmission(sender, self._sent[sender], data, start, start + airtime, mcs)
         self._sent[sender] += 1
         self._longest = max(self._longest, airtime)
         if self.shared:
-            self._recent[sender].append(sent)
+            self._recent.append(sent)
         heapq.heappush(self._due, (sent.end, next(self._order), sent))
         return sent
 
@@ -138,7 +262,7 @@ class Medium(ABC):
             yield from self.passed(self.outcome(item))
 
     @abstractmethod
-    def outcome(self, sent: Transmission) -> Iterable[tuple[Path, Reception]]:
+    def outcome(self, sent: Transmission) -> Iterable[Reception]:
         """What the receivers make of a packet whose airtime is over, before whole packets are dropped."""
 
     @property
@@ -150,46 +274,30 @@ class Medium(ABC):
         """What has been received and was not known at once. Nothing further is sent."""
         return iter(())
 
-    def paths_of(self, sent: Transmission) -> Sequence[Path]:
-        """The paths of a packet."""
-        paths = self._paths_at(sent.start)
-        if paths is not self._paths:
-            self._paths = paths
-            self._near.clear()
-            self._hears.clear()
-            for sender, heard in enumerate(paths):
-                for path in heard:
-                    self._hears.setdefault(path.receiver, set()).add(sender)
-            self.paths_changed(paths)
-        return paths[sent.sender]
-
-    def paths_changed(self, paths: Paths) -> None:  # noqa: B027 - not every medium prepares something
-        """Called before the first packet, and whenever a gain has changed."""
+    def hearers(self, sent: Transmission) -> Hearers:
+        """Those who hear a packet. All of a packet is heard as its start is."""
+        return self.around.hearers(sent.sender, sent.start)
 
     def others(self, sent: Transmission) -> list[Transmission]:
-        """The packets on the air meanwhile that matter to anybody who can hear ``sent``."""
-        if not self.shared:
+        """The packets on the air meanwhile that matter to anybody who hears ``sent``."""
+        recent = self._recent
+        while recent and recent[0].end < sent.end - 2 * self._longest:
+            recent.popleft()
+        if len(recent) < 2:
             return []
-        near = self._near.get(sent.sender)
-        if near is None:
-            hearers = {path.receiver for path in self.paths_of(sent)}
-            heard = (self._hears.get(receiver, set()) for receiver in hearers)
-            near = self._near[sent.sender] = sorted(hearers.union(*heard) - {sent.sender})
-        found = []
-        for sender in (sent.sender, *near):
-            recent = self._recent[sender]
-            while recent and recent[0].end < sent.end - 2 * self._longest:
-                recent.popleft()
-            found += [other for other in takewhile(lambda one: one.start < sent.end, recent) if other.overlaps(sent)]
-        return [other for other in found if other is not sent]
+        found = [other for other in recent if other.start < sent.end and sent.start < other.end and other is not sent]
+        if found:
+            near = self.around.near(sent.sender, sent.start)
+            found = [other for other in found if near[other.sender] or other.sender == sent.sender]
+        return found
 
-    def reaches(self, sent: Transmission, receiver: int) -> bool:
-        """Whether a robot hears a packet, or sends it."""
-        return receiver == sent.sender or sent.sender in self._hears.get(receiver, ())
-
-    def passed(self, received: Iterable[tuple[Path, Reception]]) -> Iterator[Reception]:
+    def passed(self, received: Iterable[Reception]) -> Iterator[Reception]:
         """Receptions, now or later, without those of packets that their path drops."""
-        for path, reception in received:
+        if self.around.passes:
+            yield from received
+            return
+        for reception in received:
+            path = self.around.path(reception.sent.sender, reception.receiver)
             if path.channel.loses_packets and not self._losses_of(path, reception).passes(reception.at):
                 continue
             if path.delay_s:
@@ -203,5 +311,5 @@ class Medium(ABC):
         losses = self._losses.get(key)
         if losses is None:
             losses = self._losses[key] = PduLosses(path.channel)
-            losses.dropped = self.lost[key]
+            losses.dropped = self.lost.dropped[key]
         return losses

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.medium.base import Medium, PathsAt
+from gr_ros2.medium.base import Medium, Surroundings
 from gr_ros2.medium.flowgraph import FlowgraphMedium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.medium.samples import SampleMedium
@@ -13,7 +13,13 @@ from gr_ros2.phy import Phy
 
 
 def make_medium(
-    paths: PathsAt, phys: Sequence[Phy], *, samples: bool, shared: bool = False, seed: int = 0, at_once: bool = True
+    around: Surroundings,
+    phys: Sequence[Phy],
+    *,
+    samples: bool,
+    shared: bool = False,
+    seed: int = 0,
+    at_once: bool = True,
 ) -> Medium:
     """The medium for these robots.
 
@@ -22,12 +28,17 @@ def make_medium(
     :raises ConfigError: for PHYs of stock or foreign blocks that share one channel
     """
     if not samples or not any(phy.has_samples for phy in phys):
-        return PacketMedium(paths, phys, shared=shared, seed=seed)
+        return PacketMedium(around, phys, shared=shared, seed=seed)
     if all(phy.burst_modem is not None for phy in phys):
-        return SampleMedium(paths, phys, shared=shared, seed=seed)
+        return SampleMedium(around, phys, shared=shared, seed=seed)
+    if around.moves:
+        raise ConfigError(
+            f"channel.from = 'positions': phy {phys[0].name} runs on {phys[0].runs_on()}, whose channel stands still; "
+            "set time to packets, or take a receiver of this package"
+        )
     if shared:
         raise ConfigError(
             f"phy {phys[0].name} runs on {phys[0].runs_on()}, whose bursts cannot be added up on one channel; "
             "set time to packets, or take a receiver of this package"
         )
-    return FlowgraphMedium(paths, phys, at_once=at_once)
+    return FlowgraphMedium(around, phys, at_once=at_once)

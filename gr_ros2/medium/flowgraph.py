@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from math import inf
 
-from gr_ros2.medium.base import Medium, Path, PathsAt, Reception, Transmission
+from gr_ros2.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import replaced
 
@@ -27,13 +27,13 @@ class FlowgraphMedium(Medium):
         come late (:attr:`known_until`, :meth:`rest`)
     """
 
-    def __init__(self, paths: PathsAt, phys: Sequence[Phy], *, at_once: bool) -> None:
-        super().__init__(paths, shared=False)
+    def __init__(self, around: Surroundings, phys: Sequence[Phy], *, at_once: bool) -> None:
+        super().__init__(around, shared=False)
         self._phys, self.late = phys, not at_once
         self._waiting: dict[int, list[Transmission]] = {}
         self._batches = 0
 
-    def outcome(self, sent: Transmission) -> Iterator[tuple[Path, Reception]]:
+    def outcome(self, sent: Transmission) -> Iterator[Reception]:
         from gr_ros2.phy.measure import batch_of  # with GNU Radio
 
         waiting = self._waiting.setdefault(sent.sender, [])
@@ -49,27 +49,25 @@ class FlowgraphMedium(Medium):
         while self._waiting:
             yield from self.passed(self._through(self._waiting.popitem()[1]))
 
-    def _through(self, batch: Sequence[Transmission]) -> Iterator[tuple[Path, Reception]]:
+    def _through(self, batch: Sequence[Transmission]) -> Iterator[Reception]:
         """What comes out of the flowgraphs for some packets of one sender."""
         from gr_ros2.phy.measure import deliver, modulated
 
         phy, data = self._phys[batch[0].sender], [sent.data for sent in batch]
         samples = modulated(phy, data)
-        for path in self.paths_of(batch[0]):
+        hearers = self.hearers(batch[0])
+        for receiver, snr_db in zip(hearers.ids.tolist(), hearers.snr_db.tolist(), strict=True):
+            path = self.around.path(batch[0].sender, receiver)
             phy.check_channel(path.channel)
             seed = (path.channel.seed + self._batches * _BATCH_SEEDS) % _SEEDS
             arrived = deliver(phy, samples, replaced(path.channel, seed=seed))
             came = list(zip(places(data, arrived), arrived, strict=True))
             whole = sum(data[place] == packet for place, packet in came)
-            self.lost[batch[0].sender, path.receiver]["phy"] += len(batch) - whole
+            self.lost.add("phy", batch[0].sender, receiver, len(batch) - whole)
             for place, packet in came:
                 sent = batch[place]
-                yield path, Reception(path.receiver, sent, sent.end, packet, *[_snr_db(path)] * 2)
+                yield Reception(receiver, sent, sent.end, packet, snr_db, snr_db)
         self._batches += 1
-
-
-def _snr_db(path: Path) -> float:
-    return inf if path.channel.snr_db is None else path.channel.snr_db
 
 
 def places(packets: Sequence[bytes], arrived: Sequence[bytes]) -> list[int]:

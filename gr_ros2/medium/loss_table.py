@@ -92,9 +92,7 @@ class LossTable:
     @property
     def name(self) -> str:
         """Name of its file."""
-        text = json.dumps(self.setting, sort_keys=True)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:12]
-        return f"{self.setting['phy']}-{self.setting['packet_len']}-{digest}.json"
+        return named(self.setting)
 
     def losses(self, snr_db: float | None) -> tuple[float, float]:
         """Share of packets lost, and their memory (see :class:`Point`), from the points next to an SNR.
@@ -112,6 +110,12 @@ class LossTable:
             return 1 - low.pdr, memory
         odds = low.log_odds + share * (high.log_odds - low.log_odds)
         return 1 / (1 + math.exp(odds)), memory
+
+
+def named(setting: dict[str, Any]) -> str:
+    """Name of the file of a setting's table."""
+    digest = hashlib.sha256(json.dumps(setting, sort_keys=True).encode()).hexdigest()[:12]
+    return f"{setting['phy']}-{setting['packet_len']}-{digest}.json"
 
 
 def neighbours(snr_db: float) -> tuple[float, float]:
@@ -243,7 +247,7 @@ def table_for(
     if _missing(table, snrs, packets):
         path = (folder or cache_dir()) / table.name
         try:
-            with _alone(path):
+            with alone(path):
                 _read(path, table)
                 for snr_db in _missing(table, snrs, packets):
                     at = "without noise" if snr_db is None else f"at {snr_db:g} dB"
@@ -269,7 +273,7 @@ def write(table: LossTable, path: Path) -> None:
     """Write a table so that it appears whole or not at all."""
     points = sorted(table.points.items(), key=lambda item: -math.inf if item[0] is None else item[0])
     rows = [[snr_db, point.sent, point.delivered, point.lost_in] for snr_db, point in points]
-    values = {"program": _program(), "setting": table.setting, "columns": ["snr_db", "sent", "delivered", "lost_in"]}
+    values = {"program": program(), "setting": table.setting, "columns": ["snr_db", "sent", "delivered", "lost_in"]}
     lines = ",\n  ".join(json.dumps(row) for row in rows)
     text = json.dumps(values, indent=1)[:-2] + f',\n "points": [\n  {lines}\n ]\n}}\n'
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -278,7 +282,7 @@ def write(table: LossTable, path: Path) -> None:
 
 
 @cache
-def _program() -> str:
+def program() -> str:
     """Version of gr-ros2 and digest of the PHYs' sources. A changed PHY loses other packets."""
     digest = hashlib.sha256()
     for source in sorted((BUILTIN_DIR.parent / "phy").glob("*.py")):
@@ -290,7 +294,7 @@ def _read(path: Path, table: LossTable) -> None:
     """Add the points of a file. A file that is damaged, or that was measured with other PHYs, is ignored."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        if (path.parent == BUILTIN_DIR or values["program"] == _program()) and values["setting"] == table.setting:
+        if (path.parent == BUILTIN_DIR or values["program"] == program()) and values["setting"] == table.setting:
             points = {row[0]: Point(*row[1:]) for row in values["points"]}
             table.points.update(points)
     except FileNotFoundError:
@@ -305,7 +309,7 @@ def _missing(table: LossTable, snrs: set[float | None], packets: int) -> list[fl
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
+def alone(path: Path) -> Iterator[None]:
     """Lock the file: this process has it for itself, and other processes wait."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_name(f".{path.name}.lock").open("w") as lock:

@@ -1,7 +1,10 @@
 """The medium at packets: each packet is lost as often as a table says that was measured on the PHY's flowgraph.
 
-Where packets overlap at a receiver, the others count as noise: the packet is cut into chunks during which the same
-packets are on the air, and arrives with the product over its chunks of PDR(SINR) ** (share of the packet).
+Where packets overlap at a receiver, the packet is cut into chunks during which the same packets are on the air. Of the
+packets that survive the noise, the share that survives a chunk is what was measured beside one packet of the same power
+that overlaps as much: at the beginning for the first chunk, else at the end (:mod:`gr_ros2.medium.collision_table`).
+Where nothing was measured (blocks of others, an adaptive rate), the others count as noise: PDR(SINR) ** (share of the
+packet), over that without them.
 
 Invariants: the work for a packet depends on the robots that hear it and on those that disturb them, not on how many
 robots there are; equal seeds give equal fading, losses and errors of measurement for the same packets. Fading of an
@@ -12,23 +15,21 @@ reciprocal of the Doppler shift. Fading of a fixed rate is in its table, as burs
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from itertools import pairwise
-from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.losses import PduLosses
-from gr_ros2.link.rate import Rung
-from gr_ros2.medium.base import Medium, Path, Paths, PathsAt, Reception, Transmission
+from gr_ros2.link.rate import Mcs
+from gr_ros2.medium.base import Floats, Hearers, Ints, Medium, Reception, Surroundings, Transmission
+from gr_ros2.medium.collision_table import SIRS_DB, CollisionTable, burst_s, collision_table
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.medium.loss_table import LossCurve, packet_losses
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ChannelConfig, replaced
-
-Floats = NDArray[np.float64]
 
 _ERROR_DB = 1.0
 """Standard deviation of the SNR that a receiver measures on one preamble, dB."""
@@ -43,40 +44,55 @@ _BARE: dict[str, Any] = {
     "seed": 0,
 }
 """What the curve of a channel does not depend on."""
+_LEAST = 1e-9
+"""Smallest PDR by which another one is divided."""
+_WEAK = 10 ** (SIRS_DB[-1] / 10)
+"""Power of a packet over the interference from which on it takes no harm: the end of the tables."""
+_HOPELESS = 1e-3
+"""PDR without interference below which nobody asks what interference does."""
 _BELOW, _ABOVE = 6.0, 10.0
-"""Widths of a rung from the SNR at which half of its packets arrive: below the first all are lost, above the second as
+"""Widths of an MCS from the SNR at which half of its packets arrive: below the first all are lost, above the second as
 many as at the second."""
 
 
-class _Hearers:
-    """The receivers of one sender.
+class _Reach:
+    """What one sender's packets meet at its receivers, as long as nothing changes.
 
-    :ivar levels: power received over that of the noise
-    :ivar noise: 1, or 0 where a channel has no noise
+    :ivar groups: channels that differ in what a curve depends on
+    :ivar kinds: the place in ``groups`` of each receiver's channel
     :ivar bursts: what decides for receivers whose losses have a memory, by place
     :ivar fading: by place
-    :ivar clear: PDR of a packet by its rung, where nothing disturbs it
+    :ivar clear: PDR of a packet by its MCS, where nothing disturbs it
     """
 
-    def __init__(self, paths: Sequence[Path], phy: Phy) -> None:
-        self.paths, self.phy, self.ladder = paths, phy, phy.ladder
-        self.ids = np.array([path.receiver for path in paths], int)
-        self.levels = np.array([path.level for path in paths])
-        self.noise = np.array([path.channel.snr_db is not None for path in paths], float)
+    def __init__(self, heard: Hearers, sender: int, around: Surroundings, phy: Phy) -> None:
+        self.heard, self.sender, self.phy, self.mcs_table = heard, sender, phy, phy.mcs_table
         self.bursts: dict[int, PduLosses] = {}
         self.fading: dict[int, RayleighFading] = {}
         self.clear: dict[int, Floats] = {}
-        self.alike: dict[ChannelConfig, list[int]] = {}
-        """The places of the paths that differ only in what a curve does not depend on."""
-        for place, path in enumerate(paths):
-            phy.check_channel(path.channel)
-            self.alike.setdefault(replaced(path.channel, **_BARE), []).append(place)
-            if path.channel.doppler_hz and self.ladder:
-                if sum(tap != 0 for tap in path.channel.taps) > 1:
+        ids = heard.ids.tolist()
+        channels = [around.path(sender, receiver).channel for receiver in (ids[:1] if around.moves else ids)]
+        for channel in set(channels):
+            phy.check_channel(channel)
+        bare = [replaced(channel, **_BARE) for channel in channels]
+        self.groups = list(dict.fromkeys(bare))
+        self.kinds = np.array([self.groups.index(channel) for channel in bare])
+        self.fades = any(channel.doppler_hz for channel in channels)
+        if self.fades and self.mcs_table:
+            for place, receiver in enumerate(ids):
+                channel = around.path(sender, receiver).channel
+                if sum(tap != 0 for tap in channel.taps) > 1:
                     raise ConfigError(
                         "channel.taps: with rate: adaptive, a channel that fades has one tap; leave taps out"
                     )
-                self.fading[place] = RayleighFading(path.channel.doppler_hz, path.channel.seed)
+                if channel.doppler_hz:
+                    self.fading[place] = RayleighFading(channel.doppler_hz, channel.seed)
+
+    def over(self, heard: Hearers) -> _Reach:
+        """The same with other levels, where robots move."""
+        reach = copy(self)
+        reach.heard, reach.clear = heard, {}
+        return reach
 
 
 class PacketMedium(Medium):
@@ -89,132 +105,187 @@ class PacketMedium(Medium):
     """
 
     def __init__(
-        self, paths: PathsAt, phys: Sequence[Phy], *, shared: bool = False, seed: int = 0, ideal: bool = False
+        self, around: Surroundings, phys: Sequence[Phy], *, shared: bool = False, seed: int = 0, ideal: bool = False
     ) -> None:
-        super().__init__(paths, shared=shared)
+        super().__init__(around, shared=shared)
         self._phys, self._ideal = phys, ideal
         self._random = [np.random.default_rng([seed, 1, sender]) for sender in range(len(phys))]
-        self._hearers: dict[int, _Hearers] = {}
+        self._reach: dict[int, _Reach] = {}
         self._curves: dict[Any, LossCurve] = {}
-        self._levels = np.zeros((0, 0))
+        self._tables: dict[Any, CollisionTable | None] = {}
+        self._gaps: dict[Phy, float] = {}
         self.examined = 0
         """Pairs of a packet and a receiver, and of a packet and another one, that were looked at."""
 
-    def paths_changed(self, paths: Paths) -> None:
-        self._hearers.clear()
-        self._levels = np.zeros((len(paths), len(paths)))
-        for sender, heard in enumerate(paths):
-            for path in heard:
-                self._levels[sender, path.receiver] = path.level
-
-    def outcome(self, sent: Transmission) -> Iterator[tuple[Path, Reception]]:
-        paths = self.paths_of(sent)
-        hearers = self._hearers.get(sent.sender)
-        if hearers is None:
-            hearers = self._hearers[sent.sender] = _Hearers(paths, self._phys[sent.sender])
-        if not len(hearers.ids):
+    def outcome(self, sent: Transmission) -> Iterator[Reception]:
+        heard = self.hearers(sent)
+        if not len(heard.ids):
             return
+        reach = self._reached(sent, heard)
         draw = self._random[sent.sender]
-        chances, errors = draw.random(len(hearers.ids)), draw.normal(0, _ERROR_DB, len(hearers.ids))
-        levels = hearers.levels
-        if hearers.fading:
+        chances, errors = draw.random(len(heard.ids)), draw.normal(0, _ERROR_DB, len(heard.ids))
+        levels = heard.levels
+        if reach.fading:
             levels = levels.copy()
-            for place, fading in hearers.fading.items():
+            for place, fading in reach.fading.items():
                 levels[place] *= 10 ** (fading.gain_db(sent.end) / 10)
-        clear = self._clear(hearers, sent, levels)
+        clear = self._clear(reach, sent, levels)
         others = self.others(sent)
-        self.examined += len(hearers.ids) + len(others)
-        pdr, worst = (clear, np.zeros(len(clear))) if not others else self._disturbed(hearers, sent, levels, others)
-        busy = np.isin(hearers.ids, [other.sender for other in others])
-        with np.errstate(divide="ignore"):
-            snrs = np.where(hearers.noise > 0, 10 * np.log10(levels), inf)
-            sinrs = 10 * np.log10(levels / (hearers.noise + worst))
+        self.examined += len(heard.ids) + len(others)
         alone = chances < clear
-        for place, bursts in hearers.bursts.items():
+        for place, bursts in reach.bursts.items():
             alone[place] = bursts.passes(sent.end)
-        arrived = alone & (chances < pdr) & ~busy if others else alone
-        for place in np.flatnonzero(~arrived).tolist():
-            reason = "sending" if busy[place] else "collision" if alone[place] else "phy"
-            self.lost[sent.sender, int(hearers.ids[place])][reason] += 1
-        for place in np.flatnonzero(arrived).tolist():
-            path, snr_db, sinr_db = hearers.paths[place], float(snrs[place]), float(sinrs[place])
-            measured_db = _CLEAR_DB if snr_db == inf else snr_db + float(errors[place])
-            yield path, Reception(path.receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
+        arrived, busy = alone, np.zeros(len(alone), bool)
+        snrs = sinrs = heard.snr_db if levels is heard.levels else _in_db(levels, heard.noise)
+        if others:
+            pdr, worst = self._disturbed(reach, sent, levels, clear, others)
+            deaf = np.array(self._deaf(reach, sent, others), int)
+            busy = (heard.ids[:, None] == deaf).any(1)
+            sinrs = _in_db(levels, heard.noise + worst)
+            arrived = alone & (chances < pdr) & ~busy
+        if not arrived.all():
+            self.lost.add("phy", sent.sender, heard.ids[~alone & ~busy])
+            self.lost.add("collision", sent.sender, heard.ids[alone & ~arrived & ~busy])
+            self.lost.add("sending", sent.sender, heard.ids[busy])
+        rows = (heard.ids, snrs, sinrs, np.where(heard.noise > 0, snrs + errors, _CLEAR_DB))
+        for receiver, snr_db, sinr_db, measured_db in zip(*(row[arrived].tolist() for row in rows), strict=True):
+            yield Reception(receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
 
-    def _clear(self, hearers: _Hearers, sent: Transmission, levels: Floats) -> Floats:
-        """PDR of a packet where nothing disturbs it."""
-        phy = hearers.phy
-        if self._ideal or not phy.has_samples:
-            return np.ones(len(levels))
-        if not hearers.ladder and not self.shared:
-            return self._fixed(hearers)
-        if not hearers.ladder and any(path.channel.doppler_hz for path in hearers.paths):
-            raise ConfigError(
-                "channel.doppler_hz: on a shared channel that fades, packets of a fixed rate are not simulated at "
-                "packets; set time to samples"
-            )
-        if hearers.fading:
-            return self._on_curves(hearers, sent, np.where(hearers.noise > 0, levels, inf))
-        known = hearers.clear.get(sent.rung)
-        if known is None:
-            known = self._on_curves(hearers, sent, np.where(hearers.noise > 0, levels, inf))
-            hearers.clear[sent.rung] = known
+    def _reached(self, sent: Transmission, heard: Hearers) -> _Reach:
+        known = self._reach.get(sent.sender)
+        if known is None or (known.heard is not heard and known.fading):
+            known = _Reach(heard, sent.sender, self.around, self._phys[sent.sender])
+        elif known.heard is not heard:
+            known = known.over(heard)
+        self._reach[sent.sender] = known
         return known
 
-    def _fixed(self, hearers: _Hearers) -> Floats:
-        """The PDR of a fixed rate, from the points of its table next to each SNR."""
-        known = hearers.clear.get(0)
+    def _clear(self, reach: _Reach, sent: Transmission, levels: Floats) -> Floats:
+        """PDR of a packet where nothing disturbs it."""
+        if self._ideal or not reach.phy.has_samples:
+            return np.ones(len(levels))
+        if not reach.mcs_table and not self.shared and not self.around.moves:
+            return self._fixed(reach)
+        if not reach.mcs_table and reach.fades:
+            raise ConfigError(
+                "channel.doppler_hz: on a channel that fades and is shared or follows positions, packets of a fixed "
+                "rate are not simulated at packets; set time to samples"
+            )
+        if reach.fading:
+            return self._on_curves(reach, sent, _in_db(levels, reach.heard.noise))
+        known = reach.clear.get(sent.mcs)
         if known is None:
-            known = hearers.clear[0] = np.ones(len(hearers.paths))
-            for place, path in enumerate(hearers.paths):
-                losses = packet_losses(hearers.phy, path.channel)
+            known = reach.clear[sent.mcs] = self._on_curves(reach, sent, reach.heard.snr_db)
+        return known
+
+    def _fixed(self, reach: _Reach) -> Floats:
+        """The PDR of a fixed rate, from the points of its table next to each SNR."""
+        known = reach.clear.get(0)
+        if known is None:
+            known = reach.clear[0] = np.ones(len(reach.heard.ids))
+            for place, receiver in enumerate(reach.heard.ids.tolist()):
+                losses = packet_losses(reach.phy, self.around.path(reach.sender, receiver).channel)
                 known[place] -= losses.packet_loss
                 if losses.burst_loss is not None:
-                    hearers.bursts[place] = PduLosses(losses)
+                    reach.bursts[place] = PduLosses(losses)
         return known
 
-    def _on_curves(self, hearers: _Hearers, sent: Transmission, sinrs: Floats) -> Floats:
-        """PDR at these power ratios."""
-        pdr = np.ones(len(sinrs))
-        with np.errstate(divide="ignore"):
-            sinrs_db = 10 * np.log10(sinrs)
-        for channel, places in hearers.alike.items():
-            key = hearers.phy, sent.rung, channel
-            curve = self._curves.get(key)
-            if curve is None:
-                limits = limits_of(hearers.ladder[sent.rung]) if hearers.ladder else None
-                curve = self._curves[key] = LossCurve(hearers.phy.on_rung(sent.rung), channel, limits)
-            pdr[places] = curve.pdr(sinrs_db[places])
+    def _on_curves(self, reach: _Reach, sent: Transmission, sinrs_db: Floats) -> Floats:
+        """PDR at these SINRs in dB."""
+        pdr = np.ones(len(sinrs_db))
+        for kind, channel in enumerate(reach.groups):
+            places = slice(None) if len(reach.groups) == 1 else reach.kinds == kind
+            pdr[places] = self._curve(reach, sent, channel).pdr(sinrs_db[places])
         return pdr
 
+    def _curve(self, reach: _Reach, sent: Transmission, channel: ChannelConfig) -> LossCurve:
+        key = reach.phy, sent.mcs, channel
+        curve = self._curves.get(key)
+        if curve is None:
+            limits = limits_of(reach.mcs_table[sent.mcs]) if reach.mcs_table else None
+            curve = self._curves[key] = LossCurve(reach.phy.on_mcs(sent.mcs), channel, limits)
+        return curve
+
     def _disturbed(
-        self, hearers: _Hearers, sent: Transmission, levels: Floats, others: Sequence[Transmission]
+        self, reach: _Reach, sent: Transmission, levels: Floats, clear: Floats, others: Sequence[Transmission]
     ) -> tuple[Floats, Floats]:
         """PDR of a packet that others overlap, and the power of those others where they were strongest."""
-        edges = {sent.start, sent.end}
-        for other in others:
-            edges |= {max(sent.start, other.start), min(sent.end, other.end)}
-        times = sorted(edges)
-        pdr, worst = np.ones(len(levels)), np.zeros(len(levels))
-        for begin, end in pairwise(times):
+        heard = reach.heard
+        bursts = [(other.start, self._end(other)) for other in others]
+        powers = [self.around.hearers(other.sender, sent.start).at[heard.ids] for other in others]
+        begin_s, end_s = sent.start, self._end(sent)
+        edges = {min(max(edge, begin_s), end_s) for burst in bursts for edge in burst}
+        pdr, worst = clear.copy(), np.zeros(len(levels))
+        for begin, end in pairwise(sorted({begin_s, end_s} | edges)):
             power = np.zeros(len(levels))
-            for other in others:
-                if other.start < end and begin < other.end:
-                    power += self._levels[other.sender, hearers.ids]
-            worst = np.maximum(worst, power)
-            share = (end - begin) / (sent.end - sent.start)
-            with np.errstate(divide="ignore"):
-                sinrs = levels / (hearers.noise + power)
-            pdr *= self._chunk(hearers, sent, sinrs, power) ** share
+            for (first, last), added in zip(bursts, powers, strict=True):
+                if first < end and begin < last:
+                    power += added
+            np.maximum(worst, power, out=worst)
+            hit = np.flatnonzero((power * _WEAK > levels) & (clear > _HOPELESS))
+            if len(hit):
+                share = (end - begin) / (end_s - begin_s)
+                offset = share - 1 if begin == begin_s else 1 - share
+                pdr[hit] *= self._survival(reach, sent, hit, levels[hit], power[hit], offset=offset)
         return pdr, worst
 
-    def _chunk(self, hearers: _Hearers, sent: Transmission, sinrs: Floats, power: Floats) -> Floats:
-        """PDR of a packet if it were like this chunk from end to end."""
-        if not hearers.phy.has_samples or self._ideal:
-            return np.where(power > 0, 0.0, 1.0)  # nothing is known of a level: packets that overlap are lost
-        return self._on_curves(hearers, sent, sinrs)
+    def _survival(
+        self, reach: _Reach, sent: Transmission, hit: Ints, levels: Floats, power: Floats, *, offset: float
+    ) -> Floats:
+        """Share of the packets that survive interference during part of them, of those that survive the noise.
+
+        :param hit: places of the receivers
+        :param power: of the interference over that of the noise
+        :param offset: as in :meth:`CollisionTable.survival`
+        """
+        if self._ideal or not reach.phy.has_samples:
+            return np.zeros(len(hit))  # nothing is known of a level: packets that overlap are lost
+        noise = reach.heard.noise[hit]
+        survival = np.ones(len(hit))
+        for kind, channel in enumerate(reach.groups):
+            places = slice(None) if len(reach.groups) == 1 else np.flatnonzero(reach.kinds[hit] == kind)
+            one, beside = levels[places], power[places]
+            table = self._table(reach.phy.on_mcs(sent.mcs), channel, measured=not reach.mcs_table)
+            if table is not None:
+                snrs_db = _in_db(one, noise[places])
+                survival[places] = table.survival(snrs_db, np.asarray(10 * np.log10(one / beside)), offset)
+            else:  # as if it were noise
+                curve = self._curve(reach, sent, channel)
+                alone = np.maximum(curve.pdr(_in_db(one, noise[places])), _LEAST)
+                survival[places] = (curve.pdr(_in_db(one, noise[places] + beside)) / alone) ** (1 - abs(offset))
+        return survival
+
+    def _deaf(self, reach: _Reach, sent: Transmission, others: Sequence[Transmission]) -> list[int]:
+        """The robots that send while a packet is on the air, and so long that they miss too much of it."""
+        begin, end = sent.start, self._end(sent)
+        for channel in reach.groups if reach.phy.has_samples and not self._ideal else ():
+            table = self._table(reach.phy.on_mcs(sent.mcs), channel, measured=not reach.mcs_table)
+            if table is not None:
+                length = end - begin
+                begin, end = begin + table.edges[0] * length, end - table.edges[1] * length
+                break
+        return [other.sender for other in others if other.start < end and begin < self._end(other)]
+
+    def _table(self, phy: Phy, channel: ChannelConfig, *, measured: bool) -> CollisionTable | None:
+        key = phy, channel
+        if key not in self._tables:
+            self._tables[key] = collision_table(phy, channel, measured=measured)
+        return self._tables[key]
+
+    def _end(self, sent: Transmission) -> float:
+        """s, when the burst of a packet ends; its airtime includes a gap after that."""
+        phy = self._phys[sent.sender].on_mcs(sent.mcs)
+        if phy not in self._gaps:
+            self._gaps[phy] = 0.0 if phy.burst_modem is None else phy.airtime() - burst_s(phy)
+        return sent.end - self._gaps[phy]
 
 
-def limits_of(rung: Rung) -> tuple[float, float]:
-    """The SNRs in dB between which the losses of a rung are measured."""
-    return rung.half_db - _BELOW * rung.width_db, rung.half_db + _ABOVE * rung.width_db
+def _in_db(levels: Floats, noise: Floats) -> Floats:
+    """Levels over noise in dB; infinite where there is none."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(10 * np.log10(levels / noise))
+
+
+def limits_of(mcs: Mcs) -> tuple[float, float]:
+    """The SNRs in dB between which the losses of an MCS are measured."""
+    return mcs.half_db - _BELOW * mcs.width_db, mcs.half_db + _ABOVE * mcs.width_db

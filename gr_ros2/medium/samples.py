@@ -15,14 +15,15 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2.medium.base import Medium, Path, PathsAt, Reception, Transmission
+from gr_ros2.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.phy import Phy
-from gr_ros2.phy.burst import BurstModem, Heard
+from gr_ros2.phy.burst import BurstModem, DemodulatedPacket
 from gr_ros2.settings.config import ChannelConfig
 
 Samples = NDArray[np.complex64]
@@ -41,10 +42,11 @@ class _Burst:
 
     :param start: sample at which it begins
     :param packet: what it is a burst of
+    :param snr_db: its level, dB; infinite without noise
     """
 
-    def __init__(self, packet: Transmission, path: Path, start: int, samples: Samples) -> None:
-        self.packet, self.path, self.start, self.samples = packet, path, start, samples
+    def __init__(self, packet: Transmission, snr_db: float, start: int, samples: Samples) -> None:
+        self.packet, self.snr_db, self.start, self.samples = packet, snr_db, start, samples
         self.end = start + len(samples)
 
 
@@ -60,23 +62,35 @@ class _Ear:
         self._lead = modem.preamble_samples + modem.margin + len(self._tail) + _MARGIN
         self._at = 0
         self._coming: list[tuple[int, int, _Burst]] = []
+        self._order = count()
         self.bursts: list[_Burst] = []
         """What is on the air or has been since the last packets."""
         self.deaf: deque[tuple[int, int]] = deque()
 
     def add(self, burst: _Burst) -> None:
         """A burst will reach this receiver."""
-        heapq.heappush(self._coming, (burst.start, len(self._coming), burst))
+        heapq.heappush(self._coming, (burst.start, next(self._order), burst))
 
-    def hear(self, until: int) -> list[Heard]:
+    def hear(self, until: int) -> list[DemodulatedPacket]:
         """The packets that are complete at a sample."""
+        _, samples = self.received(until)
+        return self._receiver.feed(self._filtered(samples))
+
+    def silent(self, until: int) -> bool:
+        """Whether no burst reaches this receiver between the last sample that it got and this one."""
+        coming = bool(self._coming) and self._coming[0][0] < until
+        return not coming and all(burst.end <= self._at for burst in self.bursts)
+
+    def received(self, until: int) -> tuple[int, Samples]:
+        """The samples that reach the receiver, up to one: the first of them, and its number. Where no burst does, there
+        are none but for a stretch of noise before the next."""
         self.bursts = [burst for burst in self.bursts if burst.end > self._at]
         while self._coming and self._coming[0][0] < until:
             self.bursts.append(heapq.heappop(self._coming)[2])
         first = min((burst.start for burst in self.bursts), default=until)
         begin = max(self._at, min(first, until) - self._lead)
         if until <= begin:
-            return []
+            return until, np.zeros(0, np.complex64)
         self._at = until
         samples = np.zeros(until - begin, np.complex64)
         sigma = 0.0
@@ -84,20 +98,21 @@ class _Ear:
             low, high = max(begin, burst.start), min(until, burst.end)
             if low < high:
                 samples[low - begin : high - begin] += burst.samples[low - burst.start : high - burst.start]
-            sigma = max(sigma, self._sigma(burst.path.channel))
+            if burst.snr_db < math.inf:
+                sigma = math.sqrt(self._power)  # a burst at 0 dB, see :class:`SampleMedium`
         for low, high in self.deaf:
             samples[max(low - begin, 0) : max(high - begin, 0)] = 0
         if sigma:
             drawn = self._noise.standard_normal((2, len(samples)), np.float32) * np.float32(sigma / math.sqrt(2))
             samples.real += drawn[0]
             samples.imag += drawn[1]
+        self.forget(until)
+        return begin, samples
+
+    def forget(self, until: int) -> None:
+        """Forget what the robot has sent up to a sample."""
         while self.deaf and self.deaf[0][1] <= until:
             self.deaf.popleft()
-        return self._receiver.feed(self._filtered(samples))
-
-    def _sigma(self, channel: ChannelConfig) -> float:
-        """Standard deviation of the noise: that of a burst at 0 dB, see :class:`SampleMedium`."""
-        return 0.0 if channel.snr_db is None else math.sqrt(self._power)
 
     def _filtered(self, samples: Samples) -> Samples:
         if self._taps is None:
@@ -114,45 +129,66 @@ class SampleMedium(Medium):
     :param seed: of noise and phases
     """
 
-    def __init__(self, paths: PathsAt, phys: Sequence[Phy], *, shared: bool = False, seed: int = 0) -> None:
-        super().__init__(paths, shared=shared)
+    def __init__(self, around: Surroundings, phys: Sequence[Phy], *, shared: bool = False, seed: int = 0) -> None:
+        super().__init__(around, shared=shared)
         self._phys = phys
         self._seed = seed
         self._ears: dict[tuple[int, int], _Ear] = {}
         self._phases = np.random.default_rng([seed, 3])
 
-    def send(self, sender: int, data: bytes, start: float, airtime: float, rung: int = 0) -> Transmission:
-        sent = super().send(sender, data, start, airtime, rung)
+    def send(self, sender: int, data: bytes, start: float, airtime: float, mcs: int = 0) -> Transmission:
+        sent = super().send(sender, data, start, airtime, mcs)
         phy = self._phys[sender]
         modem = phy.burst_modem
         assert modem is not None
-        burst = modem.rungs[rung].modulate(data)
-        first = round(start * phy.sample_rate)
-        for path in self.paths_of(sent):
-            phy.check_channel(path.channel)
-            samples = self._through(burst, path.channel, start, phy.sample_rate)
-            self._ear(path.receiver, sender).add(_Burst(sent, path, first, samples))
-        if self.shared:
-            last = round(sent.end * phy.sample_rate)
-            self._ear(sender, sender).deaf.append((first, last))
+        self.transmit(sent, modem.rates[mcs].modulate(data))
         return sent
 
-    def outcome(self, sent: Transmission) -> Iterator[tuple[Path, Reception]]:
+    def transmit(self, sent: Transmission, burst: Samples) -> None:
+        """A burst starts, and reaches all who hear its sender."""
+        sender, start, phy = sent.sender, sent.start, self._phys[sent.sender]
+        first = round(start * phy.sample_rate)
+        heard = self.hearers(sent)
+        rows = (heard.ids.tolist(), heard.snr_db.tolist(), heard.shift_hz.tolist())
+        for receiver, snr_db, shift_hz in zip(*rows, strict=True):
+            channel = self.around.path(sender, receiver).channel
+            phy.check_channel(channel)
+            samples = self._heard(_through(burst, channel, start, phy.sample_rate), channel, snr_db, shift_hz)
+            self._ear(receiver, sender).add(_Burst(sent, snr_db, first, samples))
+        if self.shared:
+            self._ear(sender, sender).deaf.append((first, first + len(burst)))
+
+    def received(self, receiver: int, until: float) -> tuple[float, Samples]:
+        """The samples that reach a robot on the shared channel up to a time in s, and the time of the first; none while
+        nothing is on the air around it. For receivers elsewhere."""
+        ear, rate = self._ear(receiver, receiver), self._phys[receiver].sample_rate
+        last = round(until * rate)
+        if ear.silent(last):
+            ear.forget(last)
+            return until, np.zeros(0, np.complex64)
+        first, samples = ear.received(last)
+        return first / rate, samples
+
+    def outcome(self, sent: Transmission) -> Iterator[Reception]:
         phy = self._phys[sent.sender]
         until = round(sent.end * phy.sample_rate)
-        for path in self.paths_of(sent):
-            ear = self._ear(path.receiver, sent.sender)
+        for receiver in self.hearers(sent).ids.tolist():
+            ear = self._ear(receiver, sent.sender)
             arrived = False
             for heard in ear.hear(until):
                 burst = next((one for one in ear.bursts if one.packet.data == heard.data), None)
-                packet, way = (sent, path) if burst is None else (burst.packet, burst.path)
+                packet, snr_db = (sent, math.inf) if burst is None else (burst.packet, burst.snr_db)
                 arrived = arrived or packet is sent
-                snr_db = math.inf if way.channel.snr_db is None else way.channel.snr_db
-                yield way, Reception(path.receiver, packet, sent.end, heard.data, snr_db, snr_db, heard.snr_db)
+                yield Reception(receiver, packet, sent.end, heard.data, snr_db, snr_db, heard.snr_db)
             if not arrived:
-                disturbing = {other.sender for other in self.others(sent) if self.reaches(other, path.receiver)}
-                reason = "sending" if path.receiver in disturbing else "collision" if disturbing else "phy"
-                self.lost[sent.sender, path.receiver][reason] += 1
+                self.lost.add(self._reason(sent, receiver), sent.sender, receiver)
+
+    def _reason(self, sent: Transmission, receiver: int) -> str:
+        """Why a packet did not arrive."""
+        others = self.others(sent)
+        if any(other.sender == receiver for other in others):
+            return "sending"
+        return "collision" if any(self.hearers(other).at[receiver] for other in others) else "phy"
 
     def _ear(self, receiver: int, sender: int) -> _Ear:
         """A robot's receiver: the one of the shared channel, or of the channel on which the sender sends."""
@@ -166,19 +202,23 @@ class SampleMedium(Medium):
             ear = self._ears[key] = _Ear(phy, modem, noise)
         return ear
 
-    def _through(self, burst: Samples, channel: ChannelConfig, start: float, rate: float) -> Samples:
-        """A burst after its path, without noise."""
-        samples = burst.astype(np.complex128)
-        if channel.doppler_hz:
-            samples = _faded(samples, channel, start, rate)
-        elif channel.taps != (1,):
-            samples = np.convolve(samples, channel.taps)
-        if channel.epsilon != 1:
-            samples = _resampled(samples, channel.epsilon)
+    def _heard(self, samples: Wide, channel: ChannelConfig, snr_db: float, shift_hz: float) -> Samples:
+        """A burst with the level, the carrier and the phase with which it reaches a receiver."""
         gain = sum(abs(tap) ** 2 for tap in channel.taps)
-        amplitude = 1.0 if channel.snr_db is None else math.sqrt(10 ** (channel.snr_db / 10) / gain)
-        angle = self._phases.uniform(0, 2 * math.pi) + 2 * math.pi * channel.frequency_offset * np.arange(len(samples))
+        amplitude = 1.0 if snr_db == math.inf else math.sqrt(10 ** (snr_db / 10) / gain)
+        offset = channel.frequency_offset + shift_hz / self._phys[0].sample_rate
+        angle = self._phases.uniform(0, 2 * math.pi) + 2 * math.pi * offset * np.arange(len(samples))
         return np.asarray(samples * (amplitude * np.exp(1j * angle)), np.complex64)
+
+
+def _through(burst: Samples, channel: ChannelConfig, start: float, rate: float) -> Wide:
+    """A burst after echoes, fading and with the clock of its path."""
+    samples = burst.astype(np.complex128)
+    if channel.doppler_hz:
+        samples = _faded(samples, channel, start, rate)
+    elif channel.taps != (1,):
+        samples = np.convolve(samples, channel.taps)
+    return samples if channel.epsilon == 1 else _resampled(samples, channel.epsilon)
 
 
 def _faded(samples: Wide, channel: ChannelConfig, start: float, rate: float) -> Wide:

@@ -69,7 +69,7 @@ class ServiceParticipant(ServiceGraph):
         """Delete the endpoints of a server or a client."""
 
 
-class _End:
+class _DdsEnd:
     """What servers and clients have in common.
 
     :ivar node: absolute name of the node to which it belongs; '' the participant's own
@@ -110,7 +110,7 @@ class _End:
             self._participant.drop_pair(self)  # type: ignore[arg-type]
 
 
-class DdsServer(_End, ServiceServer):
+class DdsServer(_DdsEnd, ServiceServer):
     """A server. ``reply`` may be called from any thread."""
 
     role = "service"
@@ -146,7 +146,7 @@ class DdsServer(_End, ServiceServer):
         self._close()
 
 
-class DdsClient(_End, ServiceClient):
+class DdsClient(_DdsEnd, ServiceClient):
     """A client. ``call`` may be called from any thread."""
 
     role = "client"

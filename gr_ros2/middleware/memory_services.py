@@ -45,7 +45,7 @@ class MemoryServices:
             client.look()
 
 
-class _End:
+class _MemoryEnd:
     def __init__(
         self, services: MemoryServices, participant: ServiceGraph, thread: CallbackThread, names: tuple[str, str]
     ) -> None:
@@ -58,7 +58,7 @@ class _End:
             raise MiddlewareError(f"service {self.names[0]}: it is closed")
 
 
-class MemoryServer(_End, ServiceServer):
+class MemoryServer(_MemoryEnd, ServiceServer):
     """See :class:`gr_ros2.middleware.services.ServiceServer`."""
 
     def __init__(
@@ -98,7 +98,7 @@ class MemoryServer(_End, ServiceServer):
                 self.services.look()
 
 
-class MemoryClient(_End, ServiceClient):
+class MemoryClient(_MemoryEnd, ServiceClient):
     """See :class:`gr_ros2.middleware.services.ServiceClient`."""
 
     def __init__(

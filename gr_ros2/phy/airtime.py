@@ -10,14 +10,16 @@ import threading
 import time
 from array import array
 from collections.abc import Callable
+from math import inf
 from typing import Any
 
 import pmt
 from gnuradio import gr
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
+from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, rung_of
+from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
 from gr_ros2.phy.threads import BlockThread
 
 _ONE = pmt.from_long(1)
@@ -27,9 +29,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
-    :param airtime_of: the airtime for a packet's bytes and rung, at most ``airtime``; None = all packets have the same
+    :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
     :param lead: s before the channel is free at which a credit is given
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
+    :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
+    :param timed: see :class:`AirtimeClock`
+    :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
     :ivar passed_at: s, monotonic, of every packet; empty if ``times`` is off
@@ -43,17 +48,25 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         airtime_of: Callable[[int, int], float] | None = None,
         lead: float = LEAD_S,
         ahead: float | None = None,
+        limit: AirtimeLimit | None = None,
+        timed: bool = False,
         times: bool = False,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead)
+        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed)
+        self._now = clock
+        self._left = 0
+        """Packets that have passed or are about to."""
         self.passed = 0
         self.lateness = Lateness()
         self.passed_at = array("d")
         self._times = times
         self._changed = threading.Condition()
         self._running = False
+        self._looks_at = inf
+        """When its thread began with what it does, or looks again at the latest, s."""
         self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
@@ -65,7 +78,49 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         """Packets that wait for the channel or occupy it."""
         return self._clock.backlog
 
+    def at_rest(self) -> int | None:
+        """How many packets have passed; None while one is due."""
+        with self._changed:
+            due = self._clock.first_due
+            return None if due is not None and due <= self._now() else self._left
+
+    @property
+    def transmits(self) -> bool:
+        """Whether packets may pass."""
+        return self._clock.transmits
+
+    def transmit(self, *, on: bool) -> None:
+        """Switch sending off, at once for all packets that have not reached the device, or on again."""
+        with self._changed:
+            self._clock.switch(on=on)
+            self._changed.notify_all()
+
+    def account(self) -> dict[str, Any]:
+        """Whether it sends, s of airtime sent since the start, packets refused by reason; with a limit also the s sent
+        in its window, the s allowed, the window, and how often the account could not be stored."""
+        with self._changed:
+            clock, limit = self._clock, self._clock.limit
+            told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
+            if limit is None:
+                return told
+            now = self._now()
+            return told | {
+                "spent_s": limit.spent(now),
+                "allowed_s": limit.budget,
+                "window_s": limit.rule.window_s,
+                "waits_s": max(limit.earliest(now, 0.0) - now, 0.0),
+                "unsaved": limit.unsaved,
+            }
+
+    def stalled_s(self) -> float:
+        """s for which its thread has been at one thing, or asleep beyond the time at which it meant to look again;
+        infinite if it has ended. Takes no lock."""
+        if not self._running:
+            return 0.0
+        return max(0.0, time.monotonic() - self._looks_at) if self._thread.alive else inf
+
     def start(self) -> bool:
+        self._looks_at = time.monotonic()
         with self._changed:
             self._running = True
         self._thread.start(self._run, "gr-ros2-airtime")
@@ -79,9 +134,11 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         return True
 
     def _arrive(self, pdu: Any) -> None:
-        airtime = None if self._airtime_of is None else self._airtime_of(int(pmt.length(pmt.cdr(pdu))), rung_of(pdu))
+        airtime = None
+        if self._airtime_of is not None:
+            airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
         with self._changed:
-            self._clock.offer(pdu, time.monotonic(), airtime)
+            self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
             self._changed.notify_all()
 
     def _run(self) -> None:
@@ -90,22 +147,25 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
-            for pdu in pdus:
-                self.message_port_pub(PDUS, pdu)
+            for begins_at, pdu in pdus:
+                self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
             for _ in range(credits):
                 self.message_port_pub(CREDIT, _ONE)
 
-    def _step(self) -> tuple[list[Any], int]:
+    def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""
-        now = time.monotonic()
+        now = self._now()
         due = self._clock.first_due
         pdus, credits = self._clock.due(now), self._clock.grants(now)
+        self._left += len(pdus)
         if pdus and due is not None:
             self.lateness.happened(due, now)
             if self._times:
                 self.passed_at.extend([now] * len(pdus))
         if not pdus and not credits:
             at = self._clock.next_timeout(now)
+            self._looks_at = inf if at is None else max(at, now)
             self._changed.wait(None if at is None else max(0.0, at - now))
+            self._looks_at = time.monotonic()
         return pdus, credits

@@ -8,6 +8,7 @@ packets cross as messages. Invariant: the airtime of a packet depends on its len
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_args
 
 import numpy as np
@@ -16,7 +17,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError, PhyError
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.rate import Mcs
 from gr_ros2.settings.config import ChannelConfig, Kernels, build
 
 if TYPE_CHECKING:
@@ -71,6 +72,12 @@ class PacketReceiver(Protocol):
         """SNR of the newest packets, dB over the sampled band; None before the first, or if the PHY does not measure
         it."""
 
+    def follow_clock(self, offset: Callable[[], float]) -> None:
+        """Take the times in tags ``rx_time`` of the stream.
+
+        :param offset: returns s to add to them for the machine's monotonic clock
+        """
+
     def tap_symbols(self) -> SymbolSource | None:
         """Make the decoded symbols visible; None if the PHY cannot. Call it once, before the start."""
 
@@ -123,19 +130,19 @@ class Phy(ABC):
         """From now on :attr:`any_length` is False. Needed where all bursts must have the same length."""
 
     @property
-    def ladder(self) -> tuple[Rung, ...]:
-        """The rungs of an adaptive rate, the most robust one first; () for a fixed rate."""
+    def mcs_table(self) -> tuple[Mcs, ...]:
+        """The rates of an adaptive rate, the most robust one first; () for a fixed rate."""
         return ()
 
     @property
-    def rungs(self) -> tuple[Phy, ...]:
-        """The PHY of each rung, with its rate fixed; this PHY alone where the rate is fixed."""
+    def rates(self) -> tuple[Phy, ...]:
+        """The PHY of each MCS, with its rate fixed; this PHY alone where the rate is fixed."""
         return (self,)
 
-    def on_rung(self, rung: int) -> Phy:
-        """The PHY of a rung by its index; that of the most robust one for an index of other settings."""
-        rungs = self.rungs
-        return rungs[rung if 0 <= rung < len(rungs) else 0]
+    def on_mcs(self, mcs: int) -> Phy:
+        """The PHY of an MCS by its index; that of the most robust one for an index of other settings."""
+        rates = self.rates
+        return rates[mcs if 0 <= mcs < len(rates) else 0]
 
     @abstractmethod
     def airtime_samples(self, packet_len: int | None = None) -> int:
@@ -144,13 +151,13 @@ class Phy(ABC):
         :param packet_len: its bytes, None = the longest; ignored if :attr:`any_length` is False
         """
 
-    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
+    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
         """Seconds one packet occupies on the air, gap included.
 
         :param packet_len: its bytes, as in :meth:`airtime_samples`
-        :param rung: see :meth:`on_rung`
+        :param mcs: see :meth:`on_mcs`
         """
-        return self.on_rung(rung).airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
+        return self.on_mcs(mcs).airtime_samples(packet_len) / self.sample_rate if self.has_samples else 0.0
 
     @abstractmethod
     def burst_power(self) -> float:

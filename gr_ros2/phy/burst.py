@@ -90,8 +90,8 @@ class Frames:
     :param order: whether a byte's highest or lowest bit is sent first
     :param multiple: a frame's bytes are filled up with zeros to a multiple of this
     :param mask: whitening sequence of the longest frame; shorter frames use its beginning; None = PN9
-    :param rung: with an adaptive rate the number of its rung. The CRC-32 then covers rung and packet length too, so
-        that no frame is taken for one of another rung or length
+    :param mcs: with an adaptive rate the number of its MCS. The CRC-32 then covers MCS and packet length too, so
+        that no frame is taken for one of another MCS or length
     :param decoders: what decodes the code
     """
 
@@ -104,14 +104,14 @@ class Frames:
         order: BitOrder = "big",
         multiple: int = 1,
         mask: Octets | None = None,
-        rung: int | None = None,
+        mcs: int | None = None,
         decoders: Decoders = GNU_RADIO,
     ) -> None:
-        form: dict[str, Any] = {"fixed": fixed, "order": order, "multiple": multiple, "mask": mask, "rung": rung}
+        form: dict[str, Any] = {"fixed": fixed, "order": order, "multiple": multiple, "mask": mask, "mcs": mcs}
         self._again = partial(Frames, packet_len, fec, **form, decoders=decoders)
-        self._rung = rung
+        self._mcs = mcs
         self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
-        self.plain = not self.coded and rung is None
+        self.plain = not self.coded and mcs is None
         """Whether a frame is packet, filling and their CRC-32, whitened, and nothing else."""
         self.order, self.multiple = order, multiple
         self.mask = whitening(self.length(packet_len)) if mask is None else mask
@@ -148,7 +148,7 @@ class Frames:
     def _make(self, packet_len: int) -> Frame:
         mask = self.mask[: self.length(packet_len)]
         code = self._codes.of(self.data_bits(packet_len))
-        head = b"" if self._rung is None else bytes((self._rung,)) + packet_len.to_bytes(2, "big")
+        head = b"" if self._mcs is None else bytes((self._mcs,)) + packet_len.to_bytes(2, "big")
         return Frame(packet_len, self.fill(packet_len), mask, code, order=self.order, head=head)
 
 
@@ -184,7 +184,7 @@ class Reading:
     :param points: the received constellation points, for display; magnitude about 1
     :param snr: mean power of the burst over that of the noise in the sampled band, measured on its preamble
     :param end: index after the last sample that is needed
-    :param rung: with an adaptive rate the rung that it was sent with, an index of :attr:`BurstModem.rungs`
+    :param mcs: with an adaptive rate the MCS that it was sent with, an index of :attr:`BurstModem.rates`
     """
 
     length: int
@@ -192,20 +192,22 @@ class Reading:
     points: Samples
     snr: float
     end: int
-    rung: int = 0
+    mcs: int = 0
 
 
-class Heard(NamedTuple):
+class DemodulatedPacket(NamedTuple):
     """A packet that was received.
 
     :param data: its bytes
     :param snr: of its burst, as in :class:`Reading`
-    :param rung: as in :class:`Reading`
+    :param end: the sample after the last one that was needed, counted from the first that the receiver was fed
+    :param mcs: as in :class:`Reading`
     """
 
     data: bytes
     snr: float
-    rung: int = 0
+    end: int
+    mcs: int = 0
 
     @property
     def snr_db(self) -> float:
@@ -232,7 +234,7 @@ class ModemConstants:
 class BurstModem(ABC):
     """A modulation for the frames of a link.
 
-    :param frames: the frames that bursts carry; with an adaptive rate those of the most robust rung
+    :param frames: the frames that bursts carry; with an adaptive rate those of the most robust MCS
     """
 
     margin = 0
@@ -244,8 +246,8 @@ class BurstModem(ABC):
         self.frames = frames
 
     @property
-    def rungs(self) -> Sequence[BurstModem]:
-        """The modems that send the rungs of an adaptive rate, the most robust one first; this modem alone where the
+    def rates(self) -> Sequence[BurstModem]:
+        """The modems that send the rates of an adaptive rate, the most robust one first; this modem alone where the
         rate is fixed. This modem reads the bursts of all of them."""
         return (self,)
 
@@ -300,7 +302,7 @@ class BurstModem(ABC):
         """The packet of a burst, or None if it is cut or its CRC-32 does not match."""
         if reading.soft is None:
             return None
-        return self.rungs[reading.rung].frames.of(reading.length).unwrap(reading.soft)
+        return self.rates[reading.mcs].frames.of(reading.length).unwrap(reading.soft)
 
     def receiver(self) -> BurstReceiver:
         """A receiver for these bursts."""
@@ -330,6 +332,8 @@ class BurstReceiver:
         self._stretch = modem.preamble_samples + modem.stretch
         self._start: int | None = None
         self._last: int | None = None
+        self._dropped = -modem.margin
+        """Samples fed that are not in the buffer any more; at first it begins with as many zeros."""
         self.points = np.empty(0, np.complex64)
         """The constellation points of the newest packet."""
         self.damaged = 0
@@ -346,9 +350,9 @@ class BurstReceiver:
             return None
         return _in_db(median(self._snrs))
 
-    def feed(self, samples: Samples) -> list[Heard]:
+    def feed(self, samples: Samples) -> list[DemodulatedPacket]:
         """Take the next samples; returns the packets they complete."""
-        packets: list[Heard] = []
+        packets: list[DemodulatedPacket] = []
         while len(samples):
             room = self._make_room()
             self._buffer[self._end : self._end + len(samples[:room])] = samples[:room]
@@ -363,11 +367,16 @@ class BurstReceiver:
             self._buffer[: self._end - first] = self._buffer[first : self._end].copy()
             self._cursor -= first
             self._end -= first
+            self._dropped += first
             if self._start is not None:
                 self._start -= first
             if self._last is not None:
                 self._last -= first
         return len(self._buffer) - self._end
+
+    def _counted(self, place: int) -> int:
+        """An index of the buffer, counted from the first sample fed."""
+        return place + self._dropped
 
     def _usable(self) -> int:
         """Index of the first sample that is no finite number, in or near the burst; otherwise that after the last
@@ -380,9 +389,9 @@ class BurstReceiver:
     def _remember(self, snrs: list[float]) -> None:
         self._snrs = (*self._snrs, *snrs)[-_LOOKED_BACK:]
 
-    def _take(self) -> list[Heard]:
+    def _take(self) -> list[DemodulatedPacket]:
         """The packets that are complete now."""
-        packets: list[Heard] = []
+        packets: list[DemodulatedPacket] = []
         while True:
             if self._start is None:
                 stretch = self._buffer[self._cursor : min(self._end, self._cursor + self._stretch)]
@@ -407,7 +416,7 @@ class BurstReceiver:
                 self.damaged += 1
                 self._cursor = self._start + self._modem.peak_samples
             else:
-                packets.append(Heard(packet, reading.snr, reading.rung))
+                packets.append(DemodulatedPacket(packet, reading.snr, self._counted(reading.end), reading.mcs))
                 self.points = reading.points
                 self._remember([reading.snr])
                 self._cursor = reading.end - self._modem.margin

@@ -10,6 +10,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
@@ -20,12 +21,13 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, DemodulatedPacket, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders, fastest, which
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of, pdu_heard, rung_of
+from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, octets, packets_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
+from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
 from gr_ros2.phy.tap import SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.settings.fields import AUTO, Auto
@@ -110,6 +112,18 @@ class BurstPhy(Phy):
     def burst_modem(self) -> BurstModem | None:
         return self.running_modem if hasattr(self, "modem") else None
 
+    @cached_property
+    def lag(self) -> int:
+        """Samples from the end of a burst, as sent, to where the receiver says that it ends, behind its filter."""
+        packet = bytes(range(min(self.packet_len, 32)))
+        burst = self.running_modem.modulate(packet if self.any_length else packet.ljust(self.packet_len, b"\0"))
+        before = self.running_modem.margin + self.running_modem.preamble_samples
+        samples = np.pad(burst, (before, before + self.gap))
+        if self.receiver_taps is not None:
+            samples = np.convolve(samples, self.receiver_taps).astype(np.complex64)
+        (heard,) = self.running_modem.receiver().feed(samples)
+        return heard.end - before - len(burst)
+
     def runs_on(self) -> str:
         return which(self.kernels)
 
@@ -157,17 +171,15 @@ class TakesPackets(KeptAlive):
         PduPort.readable_by(self)
 
     @abstractmethod
-    def take_packets(self, packets: list[bytes], rung: int) -> None:
-        """Process packets that came together.
-
-        :param rung: the rung that their PDU says, 0 where it says none
-        """
+    def take_packets(self, packets: list[AirPacket]) -> None:
+        """Process packets that came together."""
 
     def _take(self, message: Any) -> None:
-        packets, problem = ([octets(message)], "") if pmt.is_u8vector(message) else packets_of(message)
-        good = [packet for packet in packets if len(packet) in self._lengths]
+        bare = pmt.is_u8vector(message)
+        packets, problem = ([AirPacket(octets(message))], "") if bare else packets_of(message)
+        good = [packet for packet in packets if len(packet.data) in self._lengths]
         self._refuse(len(packets) - len(good) + bool(problem))
-        self.take_packets(good, rung_of(message))
+        self.take_packets(good)
 
     def _refuse(self, count: int) -> None:
         first = bool(count and not self.refused)
@@ -180,7 +192,8 @@ class TakesPackets(KeptAlive):
 
 
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
-    """Message port `pdus` in, samples out: each packet's burst and gap, tagged with its length if bursts differ in it.
+    """Message port `pdus` in, samples out: each packet's burst and gap, tagged with its length if bursts differ in it,
+    and with the time at which it begins, as far as that is known (:mod:`gr_ros2.phy.stream_times`).
 
     This is one block instead of a modulator before ``pdu_to_tagged_stream``: that block needs buffer space for a whole
     packet, and without it sleeps until the next message comes, or 250 ms.
@@ -190,9 +203,9 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         least = 1 if phy.any_length else phy.packet_len
         super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
-        self._rungs = phy.running_modem.rungs
+        self._rates = phy.running_modem.rates
         self._gap = phy.gap
-        self._waiting: deque[tuple[BurstModem, bytes]] = deque()
+        self._waiting: deque[tuple[BurstModem, AirPacket]] = deque()
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
         self._rest = self._whole[:0]
         """What has not left yet of a burst that did not fit."""
@@ -202,10 +215,11 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         log_warnings_only([self])
         self.set_min_output_buffer(_BUFFER)
 
-    def take_packets(self, packets: list[bytes], rung: int) -> None:
-        # A rung that this end does not have is one of settings that differ: the most robust one is sent.
-        modem = self._rungs[rung if 0 <= rung < len(self._rungs) else 0]
-        self._waiting.extend((modem, packet) for packet in packets)
+    def take_packets(self, packets: list[AirPacket]) -> None:
+        # An MCS that this end does not have is one of settings that differ: the most robust one is sent.
+        for packet in packets:
+            mcs = packet.mcs or 0
+            self._waiting.append((self._rates[mcs if 0 <= mcs < len(self._rates) else 0], packet))
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
         out = output_items[0]
@@ -214,26 +228,26 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
             modem = self._waiting[0][0]
             packets, sizes = self._fitting(modem, len(out) - done)
             if packets:
-                modem.modulate_into(packets, self._gap, out[done:])
-                for size in sizes:
-                    self._begin(done, size)
+                modem.modulate_into([packet.data for packet in packets], self._gap, out[done:])
+                for packet, size in zip(packets, sizes, strict=True):
+                    self._begin(done, size, packet)
                     done += size
                 self.sent += len(packets)
             else:
                 _, packet = self._waiting.popleft()
                 self._rest = self._whole[: self._size(modem, packet)]
-                modem.modulate_into([packet], self._gap, self._rest)
-                self._begin(done, len(self._rest))
+                modem.modulate_into([packet.data], self._gap, self._rest)
+                self._begin(done, len(self._rest), packet)
                 done += self._go_on(out[done:])
         return done
 
-    def _size(self, modem: BurstModem, packet: bytes) -> int:
+    def _size(self, modem: BurstModem, packet: AirPacket) -> int:
         """Samples of a packet's burst and gap."""
-        return modem.samples_of(len(packet)) + self._gap
+        return modem.samples_of(len(packet.data)) + self._gap
 
-    def _fitting(self, modem: BurstModem, room: int) -> tuple[list[bytes], list[int]]:
+    def _fitting(self, modem: BurstModem, room: int) -> tuple[list[AirPacket], list[int]]:
         """The next packets whose bursts fit, all of one modem, and the samples of each."""
-        packets: list[bytes] = []
+        packets: list[AirPacket] = []
         sizes: list[int] = []
         while self._waiting and self._waiting[0][0] is modem and (size := self._size(*self._waiting[0])) <= room:
             packets.append(self._waiting.popleft()[1])
@@ -241,10 +255,15 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
             room -= size
         return packets, sizes
 
-    def _begin(self, place: int, size: int) -> None:
+    def _begin(self, place: int, size: int, packet: AirPacket) -> None:
         """A burst begins at a place of this call's samples."""
+        at = self.nitems_written(0) + place
         if self._tagged:
-            self._tag(0, self.nitems_written(0) + place, _LENGTH, _number(size))
+            self._tag(0, at, _LENGTH, _number(size))
+        if packet.at is not None:
+            self._tag(0, at, BURST_TIME, pmt.from_double(packet.at))
+        if packet.leave_at is not None:
+            self._tag(0, at, TX_TIME, whole_and_rest(packet.leave_at))
 
     def _go_on(self, out: Samples) -> int:
         """Send as much as fits of the burst that has begun; returns its number of samples."""
@@ -283,6 +302,9 @@ class BurstSink(ReceiverBlock):
         """SNR over the sampled band of the newest packets, dB; None before the first."""
         return self._demodulator.snr_db
 
+    def follow_clock(self, offset: Callable[[], float]) -> None:
+        self._demodulator.times.offset = offset
+
     def tap_symbols(self) -> SymbolTap:
         """Make the received constellation points visible."""
         return SymbolTap(self._demodulator.points)
@@ -299,6 +321,10 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._damaged = 0
         self._failed = False
         self._snr_db: float | None = None
+        self._first = 0
+        """Number of the first sample that the engine was fed."""
+        self._lag, self._slack = phy.lag, phy.gap // 2
+        self.times = StreamTimes(phy.sample_rate)
         self._port = PduPort(self)
 
     @property
@@ -326,17 +352,22 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
+        count = len(input_items[0])
+        self.times.arrived(self.nitems_read(0) + count, self.get_tags_in_window(0, 0, count))
         self._send(self._packets(input_items[0]))
-        return len(input_items[0])
+        return count
 
-    def _send(self, packets: list[Heard]) -> None:
-        if len(self._modem.rungs) == 1:
-            self._port.send([packet.data for packet in packets])
-        else:
-            for packet in packets:
-                self._port.send_pdu(pdu_heard(packet.data, packet.rung, packet.snr_db))
+    def _send(self, packets: list[DemodulatedPacket]) -> None:
+        self._port.send([self._on_air(packet) for packet in packets])
 
-    def _packets(self, samples: Samples) -> list[Heard]:
+    def _on_air(self, packet: DemodulatedPacket) -> AirPacket:
+        modem = self._modem.rates[packet.mcs]
+        end = self._first + packet.end
+        first = end - self._lag - modem.samples_of(len(packet.data))
+        mcs = packet.mcs if len(self._modem.rates) > 1 else None
+        return AirPacket(packet.data, mcs, packet.snr_db, self.times.at(first, end, self._slack))
+
+    def _packets(self, samples: Samples) -> list[DemodulatedPacket]:
         assert self._engine is not None
         try:
             return self._engine.feed(samples)
@@ -346,6 +377,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
                 _log.exception("%s: starts again after %s", self.name(), error)
             self._end_engine()
             self._engine = self._modem.receiver()
+            self._first = self.nitems_read(0) + len(samples)
             return []
 
     def _end_engine(self) -> None:

@@ -6,6 +6,7 @@ its state was; after a hier block's ``release`` only its creator still refers to
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from types import TracebackType
@@ -51,6 +52,13 @@ class _Holds:
         """Forget the stream connections, as GNU Radio's method does, and let go of their blocks."""
         self._impl.disconnect_all()  # type: ignore[attr-defined]
         self._held.clear()
+
+    def disconnect_messages(self) -> None:
+        """Forget the message connections. The flowgraph does not run."""
+        while self._messages:
+            # GNU Radio disconnects a hier block's own port, but then raises, because nothing has subscribed to it.
+            with suppress(RuntimeError):
+                self.msg_disconnect(*self._messages.pop())  # type: ignore[attr-defined]
 
 
 class Flowgraph(_Holds, gr.top_block):  # type: ignore[misc]
@@ -108,10 +116,7 @@ class HierBlock(_Holds, gr.hier_block2):  # type: ignore[misc]
 
     def release(self) -> None:
         """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
-        while self._messages:
-            # GNU Radio disconnects a hier block's own port, but then raises, because nothing has subscribed to it.
-            with suppress(RuntimeError):
-                self.msg_disconnect(*self._messages.pop())
+        self.disconnect_messages()
         self.disconnect_all()
 
 
@@ -171,6 +176,9 @@ class ReceiverBlock(HierBlock):
     def snr_db(self) -> float | None:
         """SNR over the sampled band of the newest packets, dB; None before the first."""
         return None
+
+    def follow_clock(self, offset: Callable[[], float]) -> None:
+        """See :class:`gr_ros2.phy.base.PacketReceiver`."""
 
     def tap_symbols(self) -> SymbolSource | None:
         """Make the received constellation points visible."""

@@ -3,7 +3,7 @@
 Invariant: the word of a length has the format of the 32-bit header of GNU Radio's OFDM frames
 (``packet_header_default``): 12 bits length, 12 bits frame number, CRC-8. In the number field, GNU Radio counts frames.
 Here the field holds the parity of the length in the extended Golay code (24, 12, 8). So the most likely length is
-right wherever a packet with a code can be decoded. With an adaptive rate the field also holds the rung.
+right wherever a packet with a code can be decoded. With an adaptive rate the field also holds the MCS.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from gr_ros2.phy.fec import Bits, Soft
 WORD_BITS = 32
 LENGTHS = 1 << 12
 """Number of lengths that can be distinguished."""
-RUNGS = 8
-"""Number of rungs of an adaptive rate that can be distinguished."""
-_RUNG_MARKS = (0x01C, 0x1C0, 0x2E2)
-"""Value added to the number field for each bit of a rung. They were searched for: with all lengths and rungs, any two
+RATES = 8
+"""Number of rates of an adaptive rate that can be distinguished."""
+_MCS_MARKS = (0x01C, 0x1C0, 0x2E2)
+"""Value added to the number field for each bit of an MCS. They were searched for: with all lengths and rates, any two
 words still differ in 8 bits."""
 _FIELD_BITS, _CRC_BITS = 12, 8
 _WEIGHTS = 1 << np.arange(_FIELD_BITS)
@@ -78,9 +78,9 @@ class LengthWord:
         return self.read(soft)
 
 
-def rung_mark(rung: int) -> int:
-    """Value added to the number field of the words of a rung, 0 to 7."""
-    return reduce(xor, (mark for bit, mark in enumerate(_RUNG_MARKS) if rung >> bit & 1), 0)
+def mcs_mark(mcs: int) -> int:
+    """Value added to the number field of the words of an MCS, 0 to 7."""
+    return reduce(xor, (mark for bit, mark in enumerate(_MCS_MARKS) if mcs >> bit & 1), 0)
 
 
 def header_bits(lengths: Sequence[int], numbers: Any) -> Bits:

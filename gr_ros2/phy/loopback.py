@@ -7,11 +7,12 @@ would do nothing is left out, since each Python block costs as much time per pac
 
 from __future__ import annotations
 
+import time
 import weakref
 from collections.abc import Sequence
 from typing import Any
 
-from gr_ros2.link.lateness import Lateness
+from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.branch import Branch
@@ -20,6 +21,7 @@ from gr_ros2.phy.delay import PacketDelay
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.phy.window import CreditWindow
+from gr_ros2.settings.airtime import AirtimeRule
 from gr_ros2.settings.config import ChannelConfig
 
 
@@ -34,6 +36,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         the flowgraph takes them (:class:`CreditWindow`)
     :param paced: credits are granted to the source; False for a source without port `credit`. A PHY without samples
         has no airtime, so it does not set a rate
+    :param rule: what limits the airtime; None = nothing
     :param delay_s: s that a packet takes beside its airtime
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
@@ -50,6 +53,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         channel: ChannelConfig | None = None,
         throttled: bool = True,
         paced: bool = True,
+        rule: AirtimeRule | None = None,
         delay_s: float = 0.0,
         instrumented: bool = False,
         further: Sequence[tuple[ChannelConfig, Any]] = (),
@@ -62,7 +66,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         last = source
         if throttled and phy.has_airtime:
             airtime_of = phy.airtime if phy.any_length else None
-            self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, times=True)
+            limit = None if rule is None else AirtimeLimit(rule, phy.airtime(), now=time.monotonic())
+            self._gate = AirtimeGate(phy.airtime(), airtime_of=airtime_of, limit=limit, times=True)
             last = self._follow(last, self._gate)
         sent = self._transmit(last) if phy.has_samples else last
         self.branches = [self._branch(sent, *each) for each in further]
@@ -101,10 +106,6 @@ class LoopbackLink(PacketPath, Flowgraph):
             self._loss.epoch = now
         for branch in self.branches:
             branch.run_began(now)
-
-    def gate_lateness(self) -> Lateness | None:
-        """Delays of the gate; None if there is no gate."""
-        return None if self._gate is None else self._gate.lateness
 
     def passed_at(self) -> Sequence[float]:
         """s, monotonic, when each packet passed the gate; () if there is no gate."""

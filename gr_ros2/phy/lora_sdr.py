@@ -24,7 +24,7 @@ from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.phy.burst import CRC_LEN, Octets
 from gr_ros2.phy.burst_blocks import TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
-from gr_ros2.phy.pdus import PDUS, pdu_of
+from gr_ros2.phy.pdus import PDUS, AirPacket, pdu_of
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit
 
 MAX_PAYLOAD = 255
@@ -148,7 +148,7 @@ class SdrTransmitter(TransmitterBlock):
         lora = load()
         lift_message_limit()
         factor, rate = frame.spreading_factor, frame.coding_rate
-        self._framer = _Framer(frame)
+        self._framer = _SdrFramer(frame)
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
         modulator = lora.modulate(factor, frame.oversampling, 1, [frame.sync_word], frame.gap, _PREAMBLE)
         self.msg_connect((self, "pdus"), (self._framer, "pdus"))
@@ -168,7 +168,7 @@ class SdrTransmitter(TransmitterBlock):
         return self._framer.refused
 
 
-class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
+class _SdrFramer(TakesPackets, gr.basic_block):  # type: ignore[misc]
     """Message port `pdus` in, `pdus` out: nibbles of each packet's frame."""
 
     def __init__(self, frame: SdrFrame) -> None:
@@ -176,9 +176,9 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._frame = frame
         self.message_port_register_out(PDUS)
 
-    def take_packets(self, packets: list[bytes], rung: int) -> None:  # noqa: ARG002 - one rate
+    def take_packets(self, packets: list[AirPacket]) -> None:
         for packet in packets:
-            self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet)))
+            self.message_port_pub(PDUS, pdu_of(self._frame.wrap(packet.data)))
 
 
 class SdrReceiver(ReceiverBlock):

@@ -45,7 +45,7 @@ class ModemPhy(PacketPhy):
     def any_length(self) -> bool:
         return True
 
-    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:  # noqa: ARG002 - one rate
+    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:  # noqa: ARG002 - one rate
         length = self.packet_len if packet_len is None else packet_len
         bits = BITS * (length + self.options.overhead_bytes)
         return float(self.options.overhead_s + bits / self.options.bit_rate)

@@ -13,17 +13,17 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.rate import Mcs
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
-from gr_ros2.phy.ofdm_modem import OfdmLadder, OfdmModem
-from gr_ros2.phy.ofdm_rate import RUNGS, rung_of
+from gr_ros2.phy.ofdm_modem import AdaptiveOfdmModem, OfdmModem
+from gr_ros2.phy.ofdm_rate import RATES, mcs_of
 from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, packet_success, psk_symbol_error, qam_symbol_error
 from gr_ros2.settings.fields import AUTO, Auto
 
-RungName = Literal["bpsk-cc", "qpsk-cc", "8psk-cc", "16qam-cc", "64qam-cc", "16qam", "64qam"]
+RateName = Literal["bpsk-cc", "qpsk-cc", "8psk-cc", "16qam-cc", "64qam-cc", "16qam", "64qam"]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -46,7 +46,7 @@ class OfdmOptions(BurstOptions):
     :param rate: ``adaptive`` = the sender chooses modulation and code of each packet by what its receivers report
         (version 1, and a way back), and the header of each burst says which; ``payload_modulation`` and ``fec`` are
         then left out. The same at both ends
-    :param rungs: names of the modulations and codes that ``adaptive`` may choose from, the most robust one first;
+    :param rates: names of the modulations and codes that ``adaptive`` may choose from, the most robust one first;
         auto = all: bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc, 16qam, 64qam
     :param gap: zero samples after each packet, up to 100000; auto = 32, with stock two symbols. The stock receiver
         needs one symbol and half an FFT length, below which it keeps the last packet waiting for the next, and is
@@ -61,7 +61,7 @@ class OfdmOptions(BurstOptions):
     scramble: Annotated[bool, Field(title="Scrambling")] = False
     detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | Auto = AUTO
     rate: Literal["fixed", "adaptive"] = "fixed"
-    rungs: Annotated[tuple[RungName, ...], Field(min_length=1)] | Auto = AUTO
+    rates: Annotated[tuple[RateName, ...], Field(min_length=1)] | Auto = AUTO
 
 
 class OfdmPhy(BurstPhy):
@@ -87,31 +87,31 @@ class OfdmPhy(BurstPhy):
             )
         edge = None if chosen.carriers == AUTO else chosen.carriers
         pilots = None if chosen.pilots == AUTO else chosen.pilots
-        self._rungs = self._adaptive(options) if chosen.rate == "adaptive" else ()
+        self._rates = self._adaptive(options) if chosen.rate == "adaptive" else ()
         self.layout = OfdmLayout(fft_len, cp_len, chosen.payload_modulation, chosen.scramble, edge, pilots)
         self._stock: StockFrame | None = None
         threshold = chosen.detection_threshold
         if threshold == "stock":
             self._stock = self._checked_stock()
             self.gap = self._stock.gap
-        elif self._rungs:
-            self.layout = self._rungs[0].layout
-            self.modem: OfdmModem = OfdmLadder([phy.modem_of(rung) for rung, phy in enumerate(self._rungs)])
+        elif self._rates:
+            self.layout = self._rates[0].layout
+            self.modem: OfdmModem = AdaptiveOfdmModem([phy.modem_of(mcs) for mcs, phy in enumerate(self._rates)])
         else:
             self.modem = self.modem_of(None)
 
-    def modem_of(self, rung: int | None) -> OfdmModem:
+    def modem_of(self, mcs: int | None) -> OfdmModem:
         """The modem of our own receiver.
 
-        :param rung: number that the header carries, see :class:`OfdmModem`
+        :param mcs: number that the header carries, see :class:`OfdmModem`
         """
         layout, threshold = self.layout, self.options.detection_threshold
         mask = layout.mask(self.packet_len + layout.fill(self.packet_len) + CRC_LEN)
-        frames = self.frames(order="little", multiple=layout.multiple, mask=mask, rung=rung)
-        return OfdmModem(frames, layout, None if threshold == AUTO else threshold, rung)
+        frames = self.frames(order="little", multiple=layout.multiple, mask=mask, mcs=mcs)
+        return OfdmModem(frames, layout, None if threshold == AUTO else threshold, mcs)
 
     def _adaptive(self, options: dict[str, Any]) -> tuple[OfdmPhy, ...]:
-        """The PHYs of the rungs."""
+        """The PHYs of the rates."""
         chosen, default = self.options, OfdmOptions()
         for name in ("payload_modulation", "fec", "detection_threshold"):
             value = getattr(chosen, name)
@@ -126,14 +126,14 @@ class OfdmPhy(BurstPhy):
                 "set rate to fixed"
             )
         names = self._names()
-        if list(names) != [name for name in RUNGS if name in names]:
-            raise ConfigError(f"phy ofdm: rungs = {names}: each once, the most robust one first: {', '.join(RUNGS)}")
-        fixed = {**options, "rate": "fixed", "rungs": AUTO}
-        made = (dict(zip(("payload_modulation", "fec"), RUNGS[name][:2], strict=True)) for name in names)
-        return tuple(OfdmPhy(self.packet_len, self.sample_rate, **{**fixed, **rung}) for rung in made)
+        if list(names) != [name for name in RATES if name in names]:
+            raise ConfigError(f"phy ofdm: rates = {names}: each once, the most robust one first: {', '.join(RATES)}")
+        fixed = {**options, "rate": "fixed", "rates": AUTO}
+        made = (dict(zip(("payload_modulation", "fec"), RATES[name][:2], strict=True)) for name in names)
+        return tuple(OfdmPhy(self.packet_len, self.sample_rate, **{**fixed, **mcs}) for mcs in made)
 
     def pad_all(self) -> None:
-        if self._rungs:
+        if self._rates:
             raise ConfigError(
                 "phy ofdm: rate = 'adaptive' sends bursts of different lengths, and this front end needs them all of "
                 "one length; set rate to fixed, or choose another front end"
@@ -142,15 +142,15 @@ class OfdmPhy(BurstPhy):
 
     def _names(self) -> tuple[str, ...]:
         chosen: OfdmOptions = self.options
-        return tuple(RUNGS) if chosen.rungs == AUTO else chosen.rungs
+        return tuple(RATES) if chosen.rates == AUTO else chosen.rates
 
     @property
-    def ladder(self) -> tuple[Rung, ...]:
-        return tuple(rung_of(name, phy) for name, phy in zip(self._names(), self._rungs, strict=False))
+    def mcs_table(self) -> tuple[Mcs, ...]:
+        return tuple(mcs_of(name, phy) for name, phy in zip(self._names(), self._rates, strict=False))
 
     @property
-    def rungs(self) -> tuple[Phy, ...]:
-        return self._rungs or (self,)
+    def rates(self) -> tuple[Phy, ...]:
+        return self._rates or (self,)
 
     def _checked_stock(self) -> StockFrame:
         chosen, symbol = self.options, self.layout.symbol_samples
@@ -179,8 +179,8 @@ class OfdmPhy(BurstPhy):
         return self.layout.power(self.frame_bits())
 
     def computed_pdr(self, snr_db: float) -> float:
-        if self._rungs:
-            return self._rungs[0].computed_pdr(snr_db)
+        if self._rates:
+            return self._rates[0].computed_pdr(snr_db)
         noise = self.burst_power() / 10 ** (snr_db / 10)
         snr = point_power(self.options.payload_modulation) * self.options.fft_len / noise
         if self._stock is None and self.modem.frames.coded:

@@ -4,7 +4,7 @@ reference.
 Invariants: a detected preamble is a burst only if its two sync words are those of the layout; the channel is a short
 impulse response, so its estimate at one carrier uses all carriers; the estimate is tracked through the payload with the
 decided payload symbols, weighted by their certainty; if packets may have different lengths, the header carries the
-length; with an adaptive rate it also carries the rung, whose modulation and code the payload has.
+length; with an adaptive rate it also carries the MCS, whose modulation and code the payload has.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.fec import Bits, Soft
-from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, rung_mark
+from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, mcs_mark
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
 
@@ -77,13 +77,13 @@ class OfdmModem(BurstModem):
     :param frames: the frames that bursts carry, lowest bit of a byte first
     :param layout: carriers and constellation
     :param threshold: threshold of the preamble's metric, 0..1; None = from the share of false alarms
-    :param rung: with an adaptive rate the number of its rung, which the header carries; None = a fixed rate
+    :param mcs: with an adaptive rate the number of its MCS, which the header carries; None = a fixed rate
     """
 
     _counted = True
     """Whether the headers of GNU Radio's blocks, which count frames, are understood."""
 
-    def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None, rung: int | None = None) -> None:
+    def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None, mcs: int | None = None) -> None:
         super().__init__(frames)
         self._threshold = threshold
         self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
@@ -103,7 +103,7 @@ class OfdmModem(BurstModem):
         self._known = np.zeros(len(self._carriers), np.complex64)
         self._known[self._pilots] = layout.pilot_symbols[0]
         self._header_mask = layout.header_mask()
-        self._prepare_header(rung)
+        self._prepare_header(mcs)
         words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
         self._words = words[:, self._carriers].astype(np.complex64)
         self._twice, self._once = np.flatnonzero(self._words[0]), np.flatnonzero(self._words[0] == 0)
@@ -112,7 +112,7 @@ class OfdmModem(BurstModem):
         self._prepare_search(words)
         self._prepare_estimate()
 
-    def _prepare_header(self, rung: int | None) -> None:
+    def _prepare_header(self, mcs: int | None) -> None:
         frames = self.frames
         self._word: LengthWord | None = None
         self.headers: Bits
@@ -120,13 +120,13 @@ class OfdmModem(BurstModem):
         if frames.fixed:
             self.headers = header_bits([-(-frames.bits(frames.packet_len) // 8)], 0)
             return
-        if rung is None:
+        if mcs is None:
             fields = [frames.length(length) for length in frames.lengths]
             marks = [frames.fill(length) * _FILL_MARK for length in frames.lengths]
             self._word = LengthWord(frames.lengths, fields, marks)
         else:
             fields = [length + CRC_LEN for length in frames.lengths]
-            self._word = LengthWord(frames.lengths, fields, rung_mark(rung))
+            self._word = LengthWord(frames.lengths, fields, mcs_mark(mcs))
         self.headers = self._word.bits
 
     def _header(self, packet_len: int) -> Samples:
@@ -140,7 +140,7 @@ class OfdmModem(BurstModem):
         return np.asarray(soft[:WORD_BITS] * (1 - 2.0 * self._header_mask[:WORD_BITS]), np.float32)
 
     def _said(self, soft: Soft) -> tuple[int, int]:
-        """Rung, and bytes of the packet, from soft bits of the header."""
+        """Mcs, and bytes of the packet, from soft bits of the header."""
         return 0, self.frames.packet_len if self._word is None else self._word.read_header(self._word_soft(soft))
 
     def _prepare_search(self, words: NDArray[np.complex128]) -> None:
@@ -169,7 +169,7 @@ class OfdmModem(BurstModem):
         self._degrees = 2 * len(self._carriers) - len(delays)
 
     @property
-    def rungs(self) -> Sequence[OfdmModem]:
+    def rates(self) -> Sequence[OfdmModem]:
         return (self,)
 
     def symbols_of(self, packet_len: int) -> int:
@@ -181,7 +181,7 @@ class OfdmModem(BurstModem):
 
     @property
     def span(self) -> int:
-        return min(modem.samples_of(self.frames.lengths[0]) for modem in self.rungs) - self._back
+        return min(modem.samples_of(self.frames.lengths[0]) for modem in self.rates) - self._back
 
     @property
     def preamble_samples(self) -> int:
@@ -234,7 +234,7 @@ class OfdmModem(BurstModem):
         return Search(positions)
 
     def _head(self, rows: Complexes) -> tuple[_Channel, int, int]:
-        """Evaluates sync words and header: the channel, the rung, and the bytes of the packet."""
+        """Evaluates sync words and header: the channel, the MCS, and the bytes of the packet."""
         all_used = np.ones((1, len(self._data)), bool)
         channel = self._first_estimate(rows[:2])
         channel, likely, _, _ = self._decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
@@ -245,11 +245,11 @@ class OfdmModem(BurstModem):
         clock = _SymbolClock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
         snr = self._snr(rows[:2])
-        channel, rung, length = self._head(rows)
-        sent = self.rungs[rung]
+        channel, mcs, length = self._head(rows)
+        sent = self.rates[mcs]
         end = start + sent.samples_of(length) - self._back
         if end > len(samples):
-            return Reading(length, None, samples[:0], snr, end, rung)
+            return Reading(length, None, samples[:0], snr, end, mcs)
         count = sent.symbols_of(length) - HEAD_SYMBOLS
         points = sent.points_of(length)
         used = np.arange(count * len(self._data)).reshape(count, -1) < points
@@ -262,21 +262,21 @@ class OfdmModem(BurstModem):
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
             clock = _SymbolClock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
-        return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end, rung)
+        return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end, mcs)
 
     def points_of(self, packet_len: int) -> int:
         """Payload points of the burst of a packet of ``packet_len`` bytes."""
         return -(-self.frames.bits(packet_len) // self.constellation.bits)
 
     def constants(self) -> ModemConstants:
-        constellations = [modem.constellation for modem in self.rungs]
-        most = [modem.points_of(modem.frames.packet_len) for modem in self.rungs]
+        constellations = [modem.constellation for modem in self.rates]
+        most = [modem.points_of(modem.frames.packet_len) for modem in self.rates]
         values = {
             **self.lengths(),
-            "frame_bits": np.concatenate([modem.lengths()["frame_bits"] for modem in self.rungs]),
-            "rung_count": len(self.rungs),
+            "frame_bits": np.concatenate([modem.lengths()["frame_bits"] for modem in self.rates]),
+            "mcs_count": len(self.rates),
             "counted": self._counted,
-            "headers": np.concatenate([modem.headers for modem in self.rungs]),
+            "headers": np.concatenate([modem.headers for modem in self.rates]),
             "header_mask": self._header_mask,
             "size": self._size,
             "prefix": self._prefix,
@@ -456,27 +456,27 @@ class OfdmModem(BurstModem):
         return -slope * self._size / (2 * np.pi)
 
 
-class OfdmLadder(OfdmModem):
-    """A modem that reads the bursts of all rungs of an adaptive rate, and sends the most robust one.
+class AdaptiveOfdmModem(OfdmModem):
+    """A modem that reads the bursts of all rates of an adaptive rate, and sends the most robust one.
 
-    :param rungs: the modems of the rungs, the most robust one first
+    :param rates: the modems of the rates, the most robust one first
     """
 
     _counted = False
 
-    def __init__(self, rungs: Sequence[OfdmModem]) -> None:
-        first = rungs[0]
+    def __init__(self, rates: Sequence[OfdmModem]) -> None:
+        first = rates[0]
         super().__init__(first.frames, first._layout, first._threshold, 0)
-        self._rungs = tuple(rungs)
-        self._signs = 2 * np.concatenate([modem.headers for modem in rungs]).astype(np.float32) - 1
+        self._rates = tuple(rates)
+        self._signs = 2 * np.concatenate([modem.headers for modem in rates]).astype(np.float32) - 1
 
     @property
-    def rungs(self) -> Sequence[OfdmModem]:
-        return self._rungs
+    def rates(self) -> Sequence[OfdmModem]:
+        return self._rates
 
     def _said(self, soft: Soft) -> tuple[int, int]:
-        rung, row = divmod(int(np.argmax(self._signs @ self._word_soft(soft))), len(self.frames.lengths))
-        return rung, self.frames.lengths[row]
+        mcs, row = divmod(int(np.argmax(self._signs @ self._word_soft(soft))), len(self.frames.lengths))
+        return mcs, self.frames.lengths[row]
 
 
 def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:

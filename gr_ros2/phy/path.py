@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gr_ros2.core.errors import PhyError
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy, SymbolSource
 from gr_ros2.phy.channel import Channel, PacketLoss
@@ -71,6 +72,15 @@ class PacketPath:
             losses={} if self._loss is None else self._loss.dropped,
         )
 
+    def gate_lateness(self) -> Lateness | None:
+        """Delays of the gate; None if there is no gate."""
+        return None if self._gate is None else self._gate.lateness
+
+    @property
+    def changeable(self) -> bool:
+        """Whether a channel was built in that can be changed while it runs."""
+        return self._loss is not None
+
     def samples(self) -> Samples | None:
         """Newest samples at the receiver's antenna, after the channel; None without a tap, or if no samples arrived."""
         return None if self._tap is None else self._tap.samples()
@@ -84,6 +94,20 @@ class PacketPath:
         """SNR of the newest packets received, dB over the sampled band; None before the first, or if the PHY does not
         measure it."""
         return None if self._receiver is None else self._receiver.snr_db
+
+    @property
+    def transmits(self) -> bool:
+        """Whether packets may pass the gate; True without one."""
+        return self._gate is None or self._gate.transmits
+
+    def transmit(self, *, on: bool) -> None:
+        """Switch sending off, at once for all packets that have not reached the device, or on again.
+
+        :raises PhyError: if there is no gate
+        """
+        if self._gate is None:
+            raise PhyError(f"{self._medium}: packets pass at once, so sending cannot be switched off")
+        self._gate.transmit(on=on)
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Set the SNR of the received signal, dB, None = no noise; see :meth:`Channel.set_snr_db`.

@@ -5,16 +5,18 @@ packets at once sends them in one message, a *bundle*, if all blocks that read i
 blocks of this package; all other blocks get one PDU per packet.
 
 Invariants: a PDU is a PMT pair of a dictionary and a u8vector; a bundle is a pair of the symbol ``bundle`` and a
-u8vector with the length (u32, big-endian) and the bytes of each packet; of the metadata, blocks of this package read
-``rung`` and ``snr_db`` only; the rest is for people and other blocks. A bundle has no metadata, so packets with a rung
-are not bundled.
+u8vector with the head (``_HEAD_OF``) and the bytes of each packet. Of the metadata of a PDU, blocks of this package
+read ``mcs``, ``snr_db``, ``received_at``, ``begins_at`` and ``leave_at`` only, and a bundle carries the same; the rest
+is for people and other blocks.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from math import isfinite, nan
+from struct import Struct
+from typing import Any, ClassVar, NamedTuple
 from weakref import WeakSet
 
 import pmt
@@ -23,8 +25,12 @@ PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 """The message ports of the blocks: packets, and the credits that request them."""
 
 _BUNDLE = pmt.intern("bundle")
-_RUNG, _SNR_DB = pmt.intern("rung"), pmt.intern("snr_db")
-_LENGTH_LEN = 4
+_MCS, _SNR_DB, _RECEIVED_AT, _BEGINS_AT, _LEAVE_AT = (
+    pmt.intern(key) for key in ("mcs", "snr_db", "received_at", "begins_at", "leave_at")
+)
+_HEAD_OF = Struct(">Ibfdd")
+"""In a bundle, before each packet: its length in bytes, ``mcs`` (-1 for none), and ``snr_db``, ``at`` and ``leave_at``
+of :class:`AirPacket` (NaN for none)."""
 _NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
 _OFFSET = 8
@@ -48,26 +54,64 @@ def pdu_of(data: bytes, metadata: Any = _NO_METADATA) -> Any:
     return pmt.cons(metadata, u8vector(data))
 
 
-def with_rung(metadata: Any, rung: int) -> Any:
-    """Metadata that says with which rung of an adaptive rate a packet is sent."""
-    return pmt.dict_add(metadata, _RUNG, pmt.from_long(rung))
+class AirPacket(NamedTuple):
+    """A packet on its way to or from the air. Times are s on the machine's monotonic clock.
+
+    :param mcs: with an adaptive rate the MCS that it is sent with; None for a fixed rate
+    :param snr_db: SNR of its burst, dB; None where it is not measured
+    :param at: when its burst begins or began; None where that is not known
+    :param leave_at: when its burst has to begin; None for as soon as possible
+    """
+
+    data: bytes
+    mcs: int | None = None
+    snr_db: float | None = None
+    at: float | None = None
+    leave_at: float | None = None
 
 
-def pdu_heard(data: bytes, rung: int, snr_db: float) -> Any:
-    """A packet that was received as a PDU that says with which rung, and the SNR of its burst in dB."""
-    return pdu_of(data, pmt.dict_add(with_rung(_NO_METADATA, rung), _SNR_DB, pmt.from_double(snr_db)))
+def pdu_to_send(packet: AirPacket, metadata: Any = _NO_METADATA) -> Any:
+    """A packet as a PDU whose metadata also says its MCS and when its burst has to begin, if it has them."""
+    if packet.mcs is not None:
+        metadata = pmt.dict_add(metadata, _MCS, pmt.from_long(packet.mcs))
+    if packet.leave_at is not None:
+        metadata = pmt.dict_add(metadata, _LEAVE_AT, pmt.from_double(packet.leave_at))
+    return pdu_of(packet.data, metadata)
 
 
-def rung_of(message: Any) -> int:
-    """The rung that the metadata of a PDU says; 0 if it says none."""
-    rung = _said(message, _RUNG)
-    return int(pmt.to_long(rung)) if pmt.is_integer(rung) else 0
+def with_begin(pdu: Any, begins_at: float) -> Any:
+    """A PDU with metadata that says when the packet's burst begins, s."""
+    metadata = pmt.car(pdu)
+    metadata = metadata if pmt.is_dict(metadata) else _NO_METADATA
+    return pmt.cons(pmt.dict_add(metadata, _BEGINS_AT, pmt.from_double(begins_at)), pmt.cdr(pdu))
 
 
-def snr_db_of(message: Any) -> float | None:
-    """The SNR in dB that the metadata of a PDU says; None if it says none."""
-    snr_db = _said(message, _SNR_DB)
-    return float(pmt.to_double(snr_db)) if pmt.is_number(snr_db) and not pmt.is_complex(snr_db) else None
+def pdu_heard(packet: AirPacket) -> Any:
+    """A packet that was received as a PDU."""
+    metadata = _NO_METADATA if packet.mcs is None else pmt.dict_add(_NO_METADATA, _MCS, pmt.from_long(packet.mcs))
+    for key, value in ((_SNR_DB, packet.snr_db), (_RECEIVED_AT, packet.at)):
+        if value is not None:
+            metadata = pmt.dict_add(metadata, key, pmt.from_double(value))
+    return pdu_of(packet.data, metadata)
+
+
+def mcs_of(message: Any) -> int | None:
+    """The MCS that the metadata of a PDU says; None if it says none."""
+    mcs = _said(message, _MCS)
+    return int(pmt.to_long(mcs)) if pmt.is_integer(mcs) else None
+
+
+def leave_at_of(message: Any) -> float | None:
+    """The time in s at which the burst of a PDU has to begin; None if its metadata says none."""
+    return _number(message, _LEAVE_AT)
+
+
+def _number(message: Any, key: Any) -> float | None:
+    value = _said(message, key)
+    if not pmt.is_number(value) or pmt.is_complex(value):
+        return None
+    number = float(pmt.to_double(value))
+    return number if isfinite(number) else None
 
 
 def _said(message: Any, key: Any) -> Any:
@@ -75,7 +119,7 @@ def _said(message: Any, key: Any) -> Any:
     return pmt.dict_ref(metadata, key, pmt.PMT_NIL) if pmt.is_dict(metadata) else pmt.PMT_NIL
 
 
-def packets_of(message: Any) -> tuple[list[bytes], str]:
+def packets_of(message: Any) -> tuple[list[AirPacket], str]:
     """The packets of a PDU or bundle and '', or no packets and the reason: ``not_a_pair`` or ``not_u8``."""
     if not pmt.is_pair(message):
         return [], "not_a_pair"
@@ -83,18 +127,36 @@ def packets_of(message: Any) -> tuple[list[bytes], str]:
     if not pmt.is_u8vector(vector):
         return [], "not_u8"
     data = octets(vector)
-    return (_unbundled(data) if pmt.eq(pmt.car(message), _BUNDLE) else [data]), ""
+    metadata = pmt.car(message)
+    if pmt.eq(metadata, _BUNDLE):
+        return _unbundled(data), ""
+    if not pmt.is_dict(metadata) or pmt.eq(metadata, _NO_METADATA):
+        return [AirPacket(data)], ""
+    received_at = _number(message, _RECEIVED_AT)
+    at = _number(message, _BEGINS_AT) if received_at is None else received_at
+    return [AirPacket(data, mcs_of(message), _number(message, _SNR_DB), at, leave_at_of(message))], ""
 
 
-def _unbundled(data: bytes) -> list[bytes]:
+def _unbundled(data: bytes) -> list[AirPacket]:
     """The packets of a bundle; a packet that is cut off ends it."""
     packets = []
-    start = _LENGTH_LEN
+    start = _HEAD_OF.size
     while start <= len(data):
-        end = start + int.from_bytes(data[start - _LENGTH_LEN : start], "big")
-        packets.append(data[start:end])
-        start = end + _LENGTH_LEN
+        length, mcs, *numbers = _HEAD_OF.unpack_from(data, start - _HEAD_OF.size)
+        end = start + length
+        packets.append(AirPacket(data[start:end], None if mcs < 0 else mcs, *map(_known, numbers)))
+        start = end + _HEAD_OF.size
     return packets
+
+
+def _known(number: float) -> float | None:
+    return number if isfinite(number) else None
+
+
+def _bundled(packet: AirPacket) -> bytes:
+    data, mcs, *numbers = packet
+    head = (nan if number is None else number for number in numbers)
+    return _HEAD_OF.pack(len(data), -1 if mcs is None else mcs, *head) + data
 
 
 class PduPort:
@@ -135,14 +197,13 @@ class PduPort:
         self.bundles = bool(readers) and readers <= known
         return bool(readers)
 
-    def send(self, packets: Sequence[bytes]) -> None:
-        """Send packets without metadata."""
+    def send(self, packets: Sequence[AirPacket]) -> None:
+        """Send packets: to readers that do not understand bundles, only packets that were received."""
         if self.bundles and len(packets) > 1:
-            parts = [part for packet in packets for part in (len(packet).to_bytes(_LENGTH_LEN, "big"), packet)]
-            self._publish(PDUS, pmt.cons(_BUNDLE, u8vector(b"".join(parts))))
+            self._publish(PDUS, pmt.cons(_BUNDLE, u8vector(b"".join(map(_bundled, packets)))))
         else:
             for packet in packets:
-                self._publish(PDUS, pdu_of(packet))
+                self._publish(PDUS, pdu_heard(packet))
 
     def send_pdu(self, pdu: Any) -> None:
         """Send one packet as a PDU with metadata."""

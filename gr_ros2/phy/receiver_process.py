@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Heard, Samples
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, DemodulatedPacket, Samples
 
 _START_S = 30.0
 """Time limit for loading Python and its libraries, on a small and busy computer."""
@@ -32,10 +32,10 @@ _SAMPLE_LEN = 8
 _log = logging.getLogger(__name__)
 
 
-class _Report(NamedTuple):
+class _ProcessReport(NamedTuple):
     """A report of the process: packets since the last report, and the current counters."""
 
-    packets: list[Heard]
+    packets: list[DemodulatedPacket]
     damaged: int
     points: Samples
     snr_db: float | None
@@ -48,12 +48,14 @@ class ReceiverProcess:
     :param deliver: called with the packets of each report, in a thread of its own
     """
 
-    def __init__(self, modem: BurstModem, deliver: Callable[[list[Heard]], None]) -> None:
+    def __init__(self, modem: BurstModem, deliver: Callable[[list[DemodulatedPacket]], None]) -> None:
         self._modem = modem
         self._deliver = deliver
-        self._report = _Report([], 0, np.empty(0, np.complex64), None)
+        self._report = _ProcessReport([], 0, np.empty(0, np.complex64), None)
         self._here: BurstReceiver | None = None
         """Receiver in this process that is used after the other process has ended."""
+        self._given = 0
+        """Samples that the other process was given."""
         self._process: Any = None
         self._thread: threading.Thread | None = None
         reading, writing = os.pipe()
@@ -90,18 +92,19 @@ class ReceiverProcess:
         """SNR over the sampled band, dB: the median of the newest packets; None before the first."""
         return self._report.snr_db if self._here is None else self._here.snr_db
 
-    def feed(self, samples: Samples) -> list[Heard]:
+    def feed(self, samples: Samples) -> list[DemodulatedPacket]:
         """Take the next samples, and wait while the process is behind; returns packets that were decoded in this
         process."""
         if self._here is None:
             try:
                 self._process.stdin.write(np.ascontiguousarray(samples))
                 self._process.stdin.flush()
+                self._given += len(samples)
                 return []
             except OSError as error:
                 self._continue_in_this_process(error)
         assert self._here is not None
-        return self._here.feed(samples)
+        return [packet._replace(end=packet.end + self._given) for packet in self._here.feed(samples)]
 
     def close(self) -> None:
         """End the process after it has processed all samples."""
@@ -165,6 +168,8 @@ def serve(descriptor: int) -> None:
                 _send_report(reports, receiver, packets)
 
 
-def _send_report(reports: BinaryIO, receiver: BurstReceiver, packets: list[Heard]) -> None:
-    pickle.dump(_Report(packets, receiver.damaged, receiver.points, receiver.snr_db), reports, pickle.HIGHEST_PROTOCOL)
+def _send_report(reports: BinaryIO, receiver: BurstReceiver, packets: list[DemodulatedPacket]) -> None:
+    pickle.dump(
+        _ProcessReport(packets, receiver.damaged, receiver.points, receiver.snr_db), reports, pickle.HIGHEST_PROTOCOL
+    )
     reports.flush()

@@ -156,6 +156,11 @@ class BlockThread:
         self._thread = threading.Thread(target=run, name=name, daemon=True)
         self._thread.start()
 
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
     def stop(self, patience_s: float = 1.0) -> None:
         """Wait until ``run`` has returned. Call this in the block's ``stop``, after ``run`` has been told to return."""
         if self._thread is not None:

@@ -31,7 +31,7 @@ from gr_ros2.phy.burst import Samples
 from gr_ros2.phy.burst_blocks import STOCK, AirOptions, TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders
-from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
+from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, pdu_of
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.theory import convolutional_success, qam_bit_error
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit
@@ -192,7 +192,7 @@ class WifiTransmitter(TransmitterBlock):
         super().__init__("gr_ros2_wifi_tx")
         lift_message_limit()
         wifi = phy.module
-        self._framer, self._bursts = _Framer(phy), _Bursts(phy.any_length)
+        self._framer, self._bursts = _WifiFramer(phy), _Bursts(phy.any_length)
         with _silenced():
             mapper = wifi.mapper(getattr(wifi, phy.encoding.constant), False)
         points = wifi.chunks_to_symbols()
@@ -242,7 +242,7 @@ def _fit_buffer(block: Any, symbols: int, samples: int) -> None:
         block.set_min_output_buffer(0, 2 * items)
 
 
-class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
+class _WifiFramer(TakesPackets, gr.basic_block):  # type: ignore[misc]
     """Message port `pdus` in, `pdus` out: the frame of each packet."""
 
     def __init__(self, phy: WifiPhy) -> None:
@@ -251,9 +251,9 @@ class _Framer(TakesPackets, gr.basic_block):  # type: ignore[misc]
         self._number = 0
         self.message_port_register_out(PDUS)
 
-    def take_packets(self, packets: list[bytes], rung: int) -> None:  # noqa: ARG002 - one rate
+    def take_packets(self, packets: list[AirPacket]) -> None:
         for packet in packets:
-            self.message_port_pub(PDUS, pdu_of(self._frames.wrap(packet, self._number)))
+            self.message_port_pub(PDUS, pdu_of(self._frames.wrap(packet.data, self._number)))
             self._number += 1
 
 
@@ -383,7 +383,7 @@ class _Decoder(KeptAlive, gr.sync_block):  # type: ignore[misc]
             self._begin(head)
             cursor = place
         packets += self._take(symbols[cursor:])
-        self._port.send(packets)
+        self._port.send([AirPacket(packet) for packet in packets])
         return len(symbols)
 
     def _begin(self, head: dict[str, Any]) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
+from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
@@ -94,8 +94,8 @@ class LinkLog:
 class LinkReport:
     """The traffic on the air: the frames in both directions, and the number of losses by reason."""
 
-    there: LinkLog
-    back: LinkLog
+    forward: LinkLog
+    reverse: LinkLog
     drops: dict[str, int]
 
 
@@ -152,7 +152,7 @@ class RaceRosLink:
         source = SourceConfig(subscriber_depth=DEPTH, compression=compression, **common, **self._settings["source"])
         sink = SinkConfig(publisher_depth=DEPTH, **common)
         phy = self._radio.with_frames_of(self._packet_len)
-        start = Start(1, reports=True, any_length=phy.any_length)
+        start = EndpointSetup(1, reports=True, any_length=phy.any_length)
         rng = random.Random(self._radio.seed)
         log = _FrameLog(phy, self._logs[direction])
         end = LiveEnd(lambda hears: make_endpoint(self._registry, source, sink, start=start, rng=rng, observer=hears))
@@ -328,7 +328,7 @@ class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
             if reason:
                 self.refused += 1
             for packet in packets:
-                self._tun.write(packet)
+                self._tun.write(packet.data)
         except OSError:
             self.refused += 1
         self.handled += 1

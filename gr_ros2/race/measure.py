@@ -34,7 +34,7 @@ class RaceCell:
     :param delivered: messages of ``sent`` that arrived unchanged; ``altered`` and ``duplicates`` are counted apart
     :param airtime_per_message: airtime of all frames since the first message, per message delivered
     :param air_bytes_per_message: bytes of all frames since the first message, per message delivered
-    :param air_bytes_back: share of these bytes that the receiving end sent
+    :param air_bytes_reverse: share of these bytes that the receiving end sent
     :param discovery_bytes: bytes of all frames before the first message
     :param first_message: time from joining the network to the first delivery
     :param drops: frames and messages that were dropped on the way, by name
@@ -56,7 +56,7 @@ class RaceCell:
     age_mean: float | None
     airtime_per_message: float | None
     air_bytes_per_message: float | None
-    air_bytes_back: float | None
+    air_bytes_reverse: float | None
     discovery_bytes: float
     first_message: float | None
     drops: dict[str, int]
@@ -158,10 +158,10 @@ def measure(
     times = latency(np.sort(t_delivered[done] - t_sent[done]))
     first, last = (t_sent[0], t_sent[-1]) if len(t_sent) else (np.inf, np.inf)
     ages = age(t_sent[done], t_delivered[done], float(last))
-    logs = (seen.air.there, seen.air.back)
+    logs = (seen.air.forward, seen.air.reverse)
     before, _ = _traffic(logs, -np.inf, first)
     size, airtime = _traffic(logs, first, np.inf)
-    back, _ = _traffic(logs[1:], first, np.inf)
+    reverse, _ = _traffic(logs[1:], first, np.inf)
     return RaceCell(
         contender=contender,
         load=load,
@@ -178,7 +178,7 @@ def measure(
         age_mean=None if ages is None else ages.mean,
         airtime_per_message=airtime / delivered if delivered else None,
         air_bytes_per_message=size / delivered if delivered else None,
-        air_bytes_back=back / size if size else None,
+        air_bytes_reverse=reverse / size if size else None,
         discovery_bytes=before,
         first_message=float(t_delivered[done].min()) - seen.began if delivered else None,
         drops={name: count for name, count in seen.air.drops.items() if count},

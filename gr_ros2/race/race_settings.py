@@ -21,7 +21,7 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.settings.config import PacketLen, Packets, Sampled, Seconds, Text, Traffic
+from gr_ros2.settings.config import PacketLen, PacketSettings, Sampled, Seconds, Text, Traffic
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
@@ -42,7 +42,7 @@ Load = Annotated[float, Field(gt=0, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class RaceSettings(Sampled, Packets, Traffic):
+class RaceSettings(Sampled, PacketSettings, Traffic):
     """One race: every contender at every load and every loss.
 
     :param source: `sim`, the odometry of a simulated robot at 35 Hz, or `bag:PATH`

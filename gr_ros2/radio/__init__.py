@@ -68,7 +68,8 @@ FRONT_ENDS = BackendTable(
             "pyserial",
             title="KISS Modem",
             phy="modem",
-            phy_options={"bit_rate": 1200.0, "overhead_bytes": 19, "overhead_s": 0.4},
+            # TXDELAY takes 0.3 s, the wait for a free channel 0.35 s, and another station's packets as long again.
+            phy_options={"bit_rate": 1200.0, "overhead_bytes": 19, "overhead_s": 1.5},
         ),
         "serial": FrontEndBackend(
             "gr_ros2.radio.serial",
@@ -91,4 +92,45 @@ FRONT_ENDS = BackendTable(
     FrontEndBackend,
 )
 
-__all__ = ["FRONT_ENDS", "FrontEndBackend"]
+
+@dataclass(frozen=True)
+class Preset:
+    """A kind of packet radio: what a link over one needs, as its YAML would say it.
+
+    :param front_end: a name of ``FRONT_ENDS``
+    :param summary: one line of help: the radio, and how it has to be set up
+    :param settings: of the front end
+    :param phy_options: of phy ``modem``
+    :param packet_len: bytes of the longest packet
+    """
+
+    front_end: str
+    summary: str
+    settings: Mapping[str, Any]
+    phy_options: Mapping[str, Any]
+    packet_len: int
+
+
+PRESETS: Mapping[str, Preset] = {
+    "sik": Preset(
+        "serial",
+        "SiK telemetry radios, RFD900: SERIAL_SPEED 57, AIR_SPEED 64, MAVLINK 0, ECC 0",
+        {"baud": 57_600},
+        # Both radios share 64,000 bits/s by turns. Of each turn, headers and the pause to the next take a fifth.
+        {"bit_rate": 24_000.0, "overhead_bytes": 5},
+        220,
+    ),
+    "lora-uart": Preset(
+        "serial",
+        "LoRa modules with a UART, E22 or E32: 57600 baud 8N1, transparent, air rate 19.2k",
+        # They do not listen before they send. Silence of twice a packet lets the other robot through.
+        {"baud": 57_600, "backoff_s": 0.15},
+        # SF7 at 500 kHz, code rate 4/5. The module waits for the end of the bytes, then sends its preamble.
+        {"bit_rate": 12_000.0, "overhead_bytes": 5, "overhead_s": 0.03},
+        # E32 modules send 58 bytes at a time, and E22 modules 32 to 240. 3 of them are framing.
+        55,
+    ),
+}
+"""Radios that several front ends could stand for, by the name that ``--radio`` takes. ``kiss`` is a front end."""
+
+__all__ = ["FRONT_ENDS", "PRESETS", "FrontEndBackend", "Preset"]

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, floor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pmt
@@ -22,6 +22,7 @@ from gnuradio import gr
 from numpy.typing import NDArray
 
 from gr_ros2.phy.base import LENGTH_TAG
+from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, seconds_of, whole_and_rest
 from gr_ros2.phy.threads import KeepsThreadState
 
 _LENGTH = pmt.intern(LENGTH_TAG)
@@ -29,6 +30,18 @@ _REMEMBERED = 64
 """Number of bursts whose times are kept. A receiver is never that many bursts behind."""
 
 Samples = NDArray[np.complex64]
+
+
+class Burst(NamedTuple):
+    """The samples of one packet.
+
+    :param at: s, monotonic, when it begins; None where nothing says so
+    :param leave_at: s, when it has to begin, on the clock of the tag; None for as soon as possible
+    """
+
+    samples: Samples
+    at: float | None = None
+    leave_at: float | None = None
 
 
 class BurstCutter:
@@ -42,10 +55,11 @@ class BurstCutter:
         self._longest, self._tagged = longest, tagged
         self._parts: list[Samples] = []
         self._missing = 0
+        self._times: dict[Any, float | None] = {}
 
     def cut(
         self, block: Any, samples: Samples, fits: Callable[[int], bool] = lambda _: True
-    ) -> tuple[list[Samples], int]:
+    ) -> tuple[list[Burst], int]:
         """Take samples from the start of a block's input.
 
         :param block: the block, which has one input
@@ -54,17 +68,18 @@ class BurstCutter:
             samples of a burst that does not fit are not taken
         :return: the bursts that are complete, and the number of samples taken
         """
-        bursts: list[Samples] = []
+        bursts: list[Burst] = []
         taken = 0
         while taken < len(samples):
             if not self._missing:
-                self._missing = self._length(block, taken)
+                self._missing = self._begin(block, taken)
             part = samples[taken : taken + self._missing]
             held = sum(map(len, self._parts))
             if len(part) == self._missing:
                 if not fits(held + len(part)):
                     break
-                bursts.append(np.concatenate([*self._parts, part]))
+                times = self._times
+                bursts.append(Burst(np.concatenate([*self._parts, part]), times.get(BURST_TIME), times.get(TX_TIME)))
                 self._parts = []
             else:
                 self._parts.append(part.copy())
@@ -72,13 +87,12 @@ class BurstCutter:
             self._missing -= len(part)
         return bursts, taken
 
-    def _length(self, block: Any, at: int) -> int:
-        """Samples of the burst that begins at a sample of the input."""
-        if not self._tagged:
-            return self._longest
+    def _begin(self, block: Any, at: int) -> int:
+        """Samples of the burst that begins at a sample of the input; notes its times."""
         first = block.nitems_read(0) + at
-        (tag,) = block.get_tags_in_range(0, first, first + 1, _LENGTH)
-        return int(pmt.to_long(tag.value))
+        tags = {tag.key: tag.value for tag in block.get_tags_in_range(0, first, first + 1)}
+        self._times = {key: seconds_of(tags[key]) for key in (BURST_TIME, TX_TIME) if key in tags}
+        return int(pmt.to_long(tags[_LENGTH])) if self._tagged else self._longest
 
 
 @dataclass(frozen=True)
@@ -134,6 +148,9 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         self._cutter = BurstCutter(layout.samples, tagged)
         self._sample_rate = sample_rate
         self._clock = clock
+        self.clock_offset: Callable[[], float] | None = None
+        """s to add to the device's clock for the machine's; None where the device has no clock, or cannot send by it. A
+        burst that has to begin at a time then goes on without one."""
         self.clipped = 0
         """Number of samples that were beyond full scale."""
         self._sending: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
@@ -161,12 +178,15 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         bursts, taken = self._cutter.cut(self, input_items[0], fits)
         self.consume(0, taken)
         made = 0
-        for burst in bursts:
+        for burst, _, leave_at in bursts:
             total = self._layout.total_of(len(burst))
             begin = made + self._layout.lead
             out[made : made + total] = 0
             out[begin : begin + len(burst)] = self._within_scale(burst * self._scale)
             self.add_item_tag(0, self.nitems_written(0) + made, _LENGTH, pmt.from_long(total))
+            if leave_at is not None and self.clock_offset is not None:
+                at = leave_at - self._layout.lead / self._sample_rate - self.clock_offset()
+                self.add_item_tag(0, self.nitems_written(0) + made, TX_TIME, whole_and_rest(at))
             made += total
             self._note(total)
         return made
@@ -209,7 +229,6 @@ class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._clock = clock
         self.blanked = 0
         """Number of samples set to zero."""
-        self.set_tag_propagation_policy(gr.TPP_DONT)
 
     def work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
         out = output_items[0]

@@ -18,7 +18,7 @@ from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.settings.config import AnyLink, DiagnosticsConfig, Text, build
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import SHARED_KEYS, read_settings, with_shared
 from gr_ros2.settings.registry import Registry, check_outputs
 
@@ -35,6 +35,9 @@ class LinkConfig(AnyLink):
     :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
     :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings
         (docs/how-to/radios.md)
+    :param transmit: whether it sends: auto = yes, where no radio is connected; a radio needs true, the word of the
+        person who answers for it; false = it only receives
+    :param open: a radio may send without a key, so that anybody can read and forge what crosses
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
@@ -43,6 +46,8 @@ class LinkConfig(AnyLink):
     registry: str = ""
     name: Text = "link"
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
+    transmit: bool | Auto = AUTO
+    open: Annotated[bool, Field(title="Without a key")] = False
     record: Annotated[str, Field(title="Recording of what is received")] = ""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
 
@@ -50,6 +55,10 @@ class LinkConfig(AnyLink):
     def _known(self) -> LinkConfig:
         if not self.registry and not self.version:
             raise ValueError("registry is missing, and version 0 needs the same one at every robot")
+        if self.medium != "exclusive":
+            raise ValueError(
+                f"medium = {self.medium!r}: a live link has no medium access yet; leave it out, or run a scenario"
+            )
         if "name" not in self.front_end:
             raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
         for key, name, table in (
@@ -63,6 +72,20 @@ class LinkConfig(AnyLink):
         if self.phy.sample_rate == AUTO and PHY.load(self.phy.name).has_samples:
             raise ValueError("phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s")
         self.ros_source.src_id()
+        band, frequency = self.airtime.of_band, self.front_end.get("frequency")
+        if band is not None and band.in_clear and not self.front_end.get("callsign"):
+            raise ValueError(
+                f"airtime.band = {self.airtime.band!r}: a station says its callsign in clear ({band.source}), which "
+                "front_end kiss alone does, in each packet; set front_end.name to kiss, and front_end.callsign"
+            )
+        if band is not None and band.highest_hz and isinstance(frequency, int | float):
+            half = 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate / 2
+            if not band.lowest_hz <= frequency - half < frequency + half <= band.highest_hz:
+                raise ValueError(
+                    f"front_end.frequency = {frequency:g}: with phy.sample_rate = {2 * half:g} not within the "
+                    f"{band.lowest_hz / 1e6:g} to {band.highest_hz / 1e6:g} MHz of airtime.band = "
+                    f"{self.airtime.band!r}; set another frequency or band"
+                )
         return self
 
     @property

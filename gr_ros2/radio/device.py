@@ -8,8 +8,9 @@ names front end, args and remedy. The same holds for a device that stops giving 
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import sqrt
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,9 +21,10 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
+from gr_ros2.radio.energy import EnergyCounter
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters, Hertz, SharedAir
 from gr_ros2.radio.stream_events import BURSTS_OUT, GapCounter
-from gr_ros2.settings.config import STRICT, Count, Seconds, Text
+from gr_ros2.settings.config import STRICT, Count, Seconds, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
 
 TOLERANCE = 1e-4
@@ -34,6 +36,10 @@ GAIN_TOLERANCE = 0.5
 SILENT_S = 3.0
 """A device without a sample given or taken for this time, s, counts as dead; a change of direction takes a tenth."""
 
+_TIMED_S = 0.001
+"""``timing_error_s`` of a device that tags what it receives with the time, and sends at a time."""
+_FOLLOWED_S = 1.0
+"""s after which the clock of a device is compared with the machine's again: 50 ppm make 50 us of it."""
 _LEAD_S = 0.002
 """How long before its airtime begins a device gets a packet, s, so that packets follow each other without a pause. If
 there must be a pause, the device gets the packet when the pause is over."""
@@ -91,6 +97,7 @@ class DeviceFrontEnd(FrontEnd):
 
     Options = DeviceOptions
     has_radio = True
+    may_return = True
     any_length = True
     example_args: ClassVar[str]
     """Example of ``args``, for error messages."""
@@ -104,17 +111,32 @@ class DeviceFrontEnd(FrontEnd):
         self._blanker: Blanker | None = None
         if chosen.half_duplex:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
-        self._gaps = GapCounter()
+        self._gaps, self._energy = GapCounter(), EnergyCounter()
         self._given, self._taken = _Progress(), _Progress()
         self._transmitting: Any = None
         self._receiving: Any = None
+        self._offset: float | None = None
+        self._offset_at = 0.0
         with self.one_line():
             self._transmitting = self._open_transmitter()
             try:
                 self._receiving = self._open_receiver()
+                self._follow_clock()
             except BaseException:
                 self.close()
                 raise
+
+    @classmethod
+    def on_air(cls, options: Mapping[str, Any]) -> str:
+        chosen: Any = build(cls.Options, options, f"front_end {cls.name}")
+        power = cls._power_dbm(chosen.gain_tx, chosen.level)
+        power_said = "a power that is not known here" if power is None else f"about {power:.0f} dBm"
+        return f"at {chosen.frequency:,.0f} Hz with gain_tx {chosen.gain_tx:g} dB, level {chosen.level:g}, {power_said}"
+
+    @classmethod
+    def _power_dbm(cls, gain_db: float, level: float) -> float | None:  # noqa: ARG003
+        """Mean power of a burst at the port, dBm; None if it is not known."""
+        return None
 
     @property
     def receive_frequency(self) -> float:
@@ -134,6 +156,27 @@ class DeviceFrontEnd(FrontEnd):
     def _open_receiver(self) -> Any:
         """The block that receives, ready to run."""
 
+    def _device_time(self) -> float | None:
+        """s of the device's clock now, by which it sends and tags; None if it has none."""
+        return None
+
+    def _follow_clock(self) -> None:
+        """Compare the clock of the device with the machine's."""
+        before = time.monotonic()
+        at = self._device_time()
+        after = time.monotonic()
+        if at is not None:
+            self._offset, self._offset_at = (before + after) / 2 - at, after
+            self.timing_error_s, self._shaper.clock_offset = _TIMED_S, self._device_offset
+
+    def _device_offset(self) -> float:
+        assert self._offset is not None
+        return self._offset
+
+    @property
+    def clock_offset(self) -> Callable[[], float] | None:
+        return None if self._offset is None else self._device_offset
+
     @property
     def sink(self) -> Any:
         return self._shaper
@@ -147,19 +190,22 @@ class DeviceFrontEnd(FrontEnd):
         graph.connect(self._receiving, self._gaps)
         if self._blanker is not None:
             graph.connect(self._receiving, self._blanker)
+        graph.connect(self.source, self._energy)
 
     def _silence(self) -> float:
         """How long nothing is sent after each burst, s."""
         return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
 
-    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
-        samples = self.phy.on_rung(rung).airtime_samples(packet_len)
+    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
+        samples = self.phy.on_mcs(mcs).airtime_samples(packet_len)
         return self.layout.total_of(samples) / self.phy.sample_rate + self._silence()
 
     def ahead(self) -> float:
         return 0.0 if self._silence() else _LEAD_S
 
     def check(self, now: float) -> None:
+        if self._offset is not None and now - self._offset_at > _FOLLOWED_S:
+            self._follow_clock()
         if self._given.still_s(self._gaps.nitems_read(0), now) > SILENT_S:
             raise self._dead("no samples")
         taken = self._transmitting.nitems_read(0)
@@ -177,11 +223,13 @@ class DeviceFrontEnd(FrontEnd):
         """Losses, and what the device reports about them.
 
         ``clipped``: samples beyond full scale. ``blanked``: samples not received because this robot was sending.
-        ``overflows``: places where received samples were lost before they came here. Those of
+        ``overflows``: places where received samples were lost before they came here. ``energy``: signals above the
+        noise, with or without a packet in them. Those of
         :meth:`_device_counters` are added.
         """
         counted = self._device_counters()
         passed = {BURSTS_OUT: counted.pop(BURSTS_OUT)} if BURSTS_OUT in counted else {}
+        passed["energy"] = self._energy.bursts
         if self._blanker is not None:
             passed["blanked"] = self._blanker.blanked
         overflows = {} if self._gaps.gaps is None else {"overflows": self._gaps.gaps}

@@ -24,12 +24,16 @@ class Framing(ABC):
 
     :param longest: bytes of the longest packet that is accepted
     :param dropped: counts frames that are dropped, by reason: ``malformed``, ``too_long``
+    :param rssi: the radio adds a byte behind each packet that it received: the strength of the signal
+    :ivar rssi_dbm: that of the newest packet, dBm; None before the first
     """
 
     delimiter: ClassVar[bytes]
 
-    def __init__(self, longest: int, dropped: Counter[str] | None = None) -> None:
+    def __init__(self, longest: int, dropped: Counter[str] | None = None, *, rssi: bool = False) -> None:
         self._longest = longest
+        self._rssi = rssi
+        self.rssi_dbm: int | None = None
         self._most = 2 * longest + 8  # SLIP may double every byte
         self._begun = bytearray()
         self._skipping = False
@@ -59,7 +63,9 @@ class Framing(ABC):
             frame, skipped = bytes(self._begun), self._skipping
             self._begun.clear()
             self._skipping = False
-            if frame and not skipped and (packet := self._packet(frame)) is not None:
+            if self._rssi and len(frame) == 1:
+                self.rssi_dbm = frame[0] - 256  # as the modules' manuals have it
+            elif frame and not skipped and (packet := self._packet(frame)) is not None:
                 yield packet
         self._add(rest)
 

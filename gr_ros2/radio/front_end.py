@@ -8,7 +8,9 @@ a thread. `close` releases everything and may be called twice. `counters` counts
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field
@@ -73,8 +75,13 @@ class FrontEnd(ABC):
     """Whether bursts may have different lengths. If not, all bursts and packets are as long as the longest."""
     carries_packets: ClassVar[bool] = False
     """Whether it carries packets and not samples, because the device behind it modulates them itself."""
+    may_return: ClassVar[bool] = False
+    """Whether a device that has vanished can be opened again in this process."""
     find_with: ClassVar[str] = ""
     """Command that lists the devices present, for errors and `gr-ros2 doctor`; '' = there is none."""
+    timing_error_s: float = 0.01
+    """s by which a burst may begin later than asked, and by which the time of a received burst may be wrong. Medium
+    access keeps as much silence between the packets of two robots."""
     refuses: ClassVar[frozenset[str]] = frozenset()
     """Options of its base class that it does not support. GRC does not offer them."""
 
@@ -99,6 +106,14 @@ class FrontEnd(ABC):
             return phy.has_airtime and not phy.has_samples
         return phy.has_samples or cls.loops_back
 
+    @classmethod
+    def on_air(cls, options: Mapping[str, Any]) -> str:  # noqa: ARG003 - the radio knows, and does not tell
+        """Where and how loud it sends with these settings, as far as that is known here, in a few words.
+
+        :raises ConfigError: for a setting that it needs to say so, and that is missing or wrong
+        """
+        return "at the frequency and power that the radio is set to"
+
     @property
     @abstractmethod
     def sink(self) -> Any:
@@ -122,17 +137,36 @@ class FrontEnd(ABC):
         """Frequency at which it receives, Hz; None if there is no radio."""
         return None
 
-    def airtime(self, packet_len: int | None = None, rung: int = 0) -> float:
+    @property
+    def rssi_dbm(self) -> int | None:
+        """Strength of the newest packet received, dBm; None if the device does not tell it."""
+        return None
+
+    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
         """Time from the start of one packet to the earliest start of the next, s.
 
         :param packet_len: length of the packet, bytes; None: that of the longest
-        :param rung: with an adaptive rate, the rung that it is sent with
+        :param mcs: with an adaptive rate, the MCS that it is sent with
         """
-        return self.phy.airtime(packet_len, rung) + float(self.options.guard_s)
+        return self.phy.airtime(packet_len, mcs) + float(self.options.guard_s)
 
     def ahead(self) -> float | None:
         """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a
         packet then arrives when its airtime is over."""
+        return None
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """The clock of the link, s, monotonic."""
+        return time.monotonic
+
+    def follow(self, passed: Callable[[], int | None]) -> None:  # noqa: B027 - only a simulated clock needs it
+        """Learn how many packets have passed to this front end; None while one should pass now."""
+
+    @property
+    def clock_offset(self) -> Callable[[], float] | None:
+        """A function that returns the s to add to the clock of the device, which tags what it receives and sends at a
+        time, for the machine's monotonic clock. None where the device has no clock."""
         return None
 
     @property

@@ -13,8 +13,8 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.radio.ax25 import HEADER_LEN, Callsign, information, ui_header
 from gr_ros2.radio.framing import Kiss
-from gr_ros2.radio.packet_port import Connection, PacketFrontEnd
-from gr_ros2.radio.serial_device import StreamOptions, open_stream
+from gr_ros2.radio.packet_port import Connection
+from gr_ros2.radio.serial_device import StreamFrontEnd, StreamOptions, open_stream
 from gr_ros2.settings.config import STRICT
 
 _MAX_PORT = 15
@@ -41,12 +41,12 @@ class KissOptions(StreamOptions):
         return self
 
 
-class KissFrontEnd(PacketFrontEnd):
+class KissFrontEnd(StreamFrontEnd):
     """See :class:`KissOptions`."""
 
     name = "kiss"
+    timing_error_s = 0.1
     Options = KissOptions
-    has_radio = True
 
     def _connect(self) -> Connection:
         options, longest = self.options, self.phy.packet_len

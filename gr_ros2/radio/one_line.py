@@ -12,7 +12,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.radio import FRONT_ENDS, FrontEndBackend
+from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.topic_choice import words_of
 
@@ -52,14 +52,18 @@ def one_line(
     """A link's settings, as its YAML file would have them.
 
     :param robot: 0..254; its topics are in the namespace ``/robot_N``
-    :param radio: a name of ``gr_ros2.radio.FRONT_ENDS``
+    :param radio: a name of ``gr_ros2.radio.FRONT_ENDS`` or ``PRESETS``
     :param registry: CSV path or the name of a built-in one; None finds the topics on the ROS graph
     :param flags: value of each option of ``FLAGS`` that was given
     :param topics: which topics of the registry, or without one of the ROS graph; None sends all of them
     :raises ConfigError: for an unknown radio, an option that the radio does not have, or a missing option that it needs
     :raises BackendMissingError: when software that the radio needs is not installed
     """
-    known = {item.name: item for item in fields(FRONT_ENDS.load(radio).Options)}
+    preset = PRESETS.get(radio)
+    front_end = preset.front_end if preset else radio
+    if front_end not in FRONT_ENDS:
+        raise ConfigError(f"radio: no {radio!r}; known are {', '.join([*FRONT_ENDS, *PRESETS])}")
+    known = {item.name: item for item in fields(FRONT_ENDS.load(front_end).Options)}
     names = {name: setting for name, flag in FLAGS.items() if (setting := flag.setting(known)) is not None}
     for flag in flags:
         if flag not in names:
@@ -77,13 +81,15 @@ def one_line(
         "name": f"robot_{robot}",
         "registry": registry or "",
         "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
-        "phy": _phy(FRONT_ENDS[radio]),
-        "front_end": {"name": radio, **chosen},
+        **({"packet_len": preset.packet_len} if preset else {}),
+        "phy": _phy(front_end, preset.phy_options if preset else FRONT_ENDS[front_end].phy_options),
+        "front_end": {"name": front_end, **(preset.settings if preset else {}), **chosen},
     }
 
 
-def _phy(row: FrontEndBackend) -> dict[str, Any]:
+def _phy(front_end: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    row = FRONT_ENDS[front_end]
     phy: dict[str, Any] = {"name": row.phy}
     if PHY.load(row.phy).has_samples:
         phy["sample_rate"] = row.sample_rate
-    return {**phy, **({"options": dict(row.phy_options)} if row.phy_options else {})}
+    return {**phy, **({"options": dict(options)} if options else {})}

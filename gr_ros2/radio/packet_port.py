@@ -143,6 +143,7 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         for end in self._ends:
             end.setblocking(False)
         self._stopped = threading.Event()
+        self._stopped.set()
         self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
@@ -158,6 +159,11 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         self._wake()
         self._thread.stop(_JOIN_S)
         return True
+
+    @property
+    def alive(self) -> bool:
+        """Whether its thread runs, or is not meant to."""
+        return self._stopped.is_set() or self._thread.alive
 
     def close(self) -> None:
         """Close the connection. The block has stopped, or never ran. Idempotent."""
@@ -245,6 +251,7 @@ class PacketFrontEnd(FrontEnd):
 
     carries_packets = True
     any_length = True
+    timing_error_s = 0.02
 
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
@@ -269,6 +276,10 @@ class PacketFrontEnd(FrontEnd):
     @property
     def packets(self) -> Any:
         return self._port
+
+    def check(self, now: float) -> None:  # noqa: ARG002 - it does not depend on time
+        if not self._port.alive:
+            raise RadioError(f"front_end {self.name}: its thread has ended; start the link again")
 
     def counters(self) -> FrontEndCounters:
         """Counters of what passed and what did not.

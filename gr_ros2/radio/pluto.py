@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from math import log10
 from typing import Annotated, Any
 
 from gnuradio import blocks, iio
@@ -36,6 +37,8 @@ from gr_ros2.settings.fields import AUTO, Auto
 SLOWEST, FASTEST = 521e3, 61.44e6
 """Range of the sample rate, samples/s. Below 2.083 million, GNU Radio's block loads a decimating filter by itself."""
 
+_FULL_POWER_DBM = 7.0
+"""Of a sine at full scale, as Analog Devices' data of the ADALM-PLUTO has it."""
 _CHANNELS = [True, True]
 _LARGEST_ATTENUATION = 89.75
 _AUTOMATIC_FILTER = ("Auto", "", 0.0, 0.0)
@@ -73,6 +76,10 @@ class PlutoFrontEnd(DeviceFrontEnd):
     refuses = frozenset({"antenna_tx", "antenna_rx"})
     example_args = "ip:192.168.2.1 or usb:1.5.5"
     find_with = "iio_info -S"
+
+    @classmethod
+    def _power_dbm(cls, gain_db: float, level: float) -> float | None:
+        return _FULL_POWER_DBM + gain_db + 20 * log10(level)
 
     def _open_transmitter(self) -> Any:
         rate, options = self.phy.sample_rate, self.options

@@ -13,6 +13,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.channel import PacketLoss
@@ -31,6 +32,7 @@ class Radio(PacketPath, HierBlock):
     :param front_end: carries the samples; ``close`` closes it too
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
+    :param limit: what limits the airtime; None = nothing
     :param changeable: add a channel that can be changed while running, if the front end has no radio
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
@@ -45,6 +47,7 @@ class Radio(PacketPath, HierBlock):
         *,
         channel: ChannelConfig | None = None,
         record: str = "",
+        limit: AirtimeLimit | None = None,
         changeable: bool = False,
         instrumented: bool = False,
     ) -> None:
@@ -65,7 +68,15 @@ class Radio(PacketPath, HierBlock):
         self._simulated = (changeable or instrumented) and not front_end.has_radio
         self._recorder: SigmfRecorder | None = None
         airtime_of = front_end.airtime if phy.any_length else None
-        self._gate = AirtimeGate(front_end.airtime(), airtime_of=airtime_of, ahead=front_end.ahead())
+        self._gate = self.gate = AirtimeGate(
+            front_end.airtime(),
+            airtime_of=airtime_of,
+            ahead=front_end.ahead(),
+            limit=limit,
+            timed=front_end.clock_offset is not None,
+            clock=front_end.clock,
+        )
+        front_end.follow(self._at_rest)
         self.msg_connect(self, "pdus", self._gate, "pdus")
         self.msg_connect(self._gate, "credit", self, "credit")
         last: Any = self._gate
@@ -81,6 +92,11 @@ class Radio(PacketPath, HierBlock):
             last = self._follow(last, self._loss)
         self._follow(last, self)
 
+    def _at_rest(self) -> int | None:
+        """How many packets the front end gets as samples, of those that have passed; None while one is due."""
+        passed = self.gate.at_rest()
+        return None if passed is None else passed - self.refused
+
     def _connect_samples(self, record: str, instrumented: bool) -> None:
         """Connect the transmitter to the front end, and the front end to the receiver, where they exist."""
         front_end = self.front_end
@@ -94,6 +110,8 @@ class Radio(PacketPath, HierBlock):
         # GNU Radio does not tell a block that samples have ended. So a receiver in another process could not finish
         # before the sink.
         heard = self._receive(front_end.source, faded=faded, shown=instrumented, own_process=not front_end.ends)
+        if front_end.clock_offset is not None and self._receiver is not None:
+            self._receiver.follow_clock(front_end.clock_offset)
         if record:
             frequency = front_end.receive_frequency
             about = SigmfRecording(

@@ -8,29 +8,64 @@ that was opened. If opening fails half-way, everything is released too.
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import cached_property
+from math import inf
 from typing import Any
 
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import own_settings
+from gr_ros2.gr.ends import account_of, own_settings
+from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import configured
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
+from gr_ros2.radio.findings import about, introduce, peers, ping
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.radio import Radio
+from gr_ros2.radio.switch import TransmitSwitch
+from gr_ros2.radio.waiting import shortcut
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
+from gr_ros2.state.airtime import AirtimeFile
 
+_STOP_S, _RETRY_S = 10.0, 1.0
+"""s that a flowgraph may take to stop when its device has vanished, and s between two attempts to open it."""
+STALLED_S = 10.0
+"""s after which a thread that sends counts as stuck: longer than a busy computer makes it wait."""
 _log = logging.getLogger(__name__)
+
+
+def permitted(config: LinkConfig, front_end: type[FrontEnd]) -> bool:
+    """Whether a link may send.
+
+    :raises ConfigError: for a radio that would send without a word of permission, or without a key
+    """
+    if config.transmit is False or not front_end.has_radio:
+        return config.transmit is not False
+    on_air = f"front_end {front_end.name} sends {front_end.on_air(config.front_end_options)}"
+    if config.transmit is not True:
+        raise ConfigError(
+            f"{on_air}: say once that it may, with --transmit or transmit: true in the file (docs/how-to/radios.md, "
+            "Before you send); --listen-only only receives"
+        )
+    if not config.key and not config.open:
+        raise ConfigError(
+            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
+            "new FILE), or --open, open: true in the file"
+        )
+    return True
 
 
 class RobotLink(Flowgraph):
@@ -41,7 +76,7 @@ class RobotLink(Flowgraph):
         says
     :param observer: called with everything that is sent and received. If it raises, it is not called again, and the
         link continues
-    :param clock: clock of events and blocks, s, monotonic
+    :param clock: clock of events and blocks, s, monotonic; None: that of the front end
     :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
     :raises ConfigError: when the parts do not fit together
     :raises MiddlewareError: when the ROS graph cannot be joined
@@ -54,15 +89,21 @@ class RobotLink(Flowgraph):
         *,
         middleware: Middleware | None = None,
         observer: LinkObserver | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
         instrumented: bool = False,
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
         self._registry = config.load_registry()
-        self._clock = clock
+        self._clock = clock or time.monotonic
+        self._own_clock = clock is not None
         self._started: float | None = None
         self._instrumented = instrumented
+        self._retry_at = inf
+        """When a device that has vanished is tried again, s; infinite while there is one."""
+        self._interruptions = self._passed_before = 0
+        self._worked = False
+        """Whether the front end has worked once; if not, nothing has vanished."""
         self._stack = ExitStack()
         self._observers = Observers[LinkObserver](() if observer is None else (observer,))
         try:
@@ -75,12 +116,13 @@ class RobotLink(Flowgraph):
         config = self.config
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
-        self.front_end: FrontEnd = FRONT_ENDS.load(config.front_end_name)(self.phy, **config.front_end_options)
-        self._stack.callback(self.front_end.close)
-        self.radio = Radio(
-            self.phy, self.front_end, channel=config.channel, record=config.record, instrumented=self._instrumented
-        )
-        self._stack.callback(self.radio.close)
+        self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
+        self.sends = permitted(config, self._front_end_class)
+        """Whether it may send at all."""
+        self._open_radio()
+        self._stack.callback(self._close_radio)
+        if not self._own_clock:
+            self._clock = self.front_end.clock
         self.calls: LiveCalls | None = None
         """The services that cross the link; None with version 0 and where the front end loops back."""
         graphs = self._graphs(middleware)
@@ -88,7 +130,13 @@ class RobotLink(Flowgraph):
             self._two_blocks(graphs, observer)
         else:
             self._one_block(graphs, observer)
+        self._connect_radio()
         self.source.use_credit()
+        if config.version:
+            introduce(self.end, about(config, self.phy), lambda: self.radio.snr_db, self._clock())
+        if isinstance(graphs[0], ServiceGraph):
+            switch = TransmitSwitch(graphs[0], self.node_name, lambda on: self.transmit(on=on))
+            self._stack.callback(switch.close)
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
             self._diagnostics = Diagnostics(
@@ -96,37 +144,116 @@ class RobotLink(Flowgraph):
             )
             self._stack.callback(self._diagnostics.stop)
 
+    def _open_radio(self) -> None:
+        """Open the front end, and make the radio around it.
+
+        :raises RadioError: when it cannot be opened
+        """
+        self.front_end = self._front_end_class(self.phy, **self.config.front_end_options)
+        try:
+            self.radio = Radio(
+                self.phy,
+                self.front_end,
+                channel=self.config.channel,
+                record=self.config.record,
+                limit=self._limit,
+                instrumented=self._instrumented,
+            )
+        except BaseException:
+            self.front_end.close()
+            raise
+
+    def _close_radio(self) -> None:
+        self.radio.close()
+
+    def _connect_radio(self) -> None:
+        """Connect the radio with the blocks of ROS."""
+        sends, receives = self._blocks
+        if self.sends:  # without credit, nothing leaves
+            self.msg_connect(sends, "pdus", self.radio, "pdus")
+            self.msg_connect(self.radio, "credit", sends, "credit")
+        self.msg_connect(self.radio, "pdus", receives, "pdus")
+
+    def _lose(self, error: RadioError) -> None:
+        """The device has vanished: close it, and wait for it. The rest of the link keeps its state."""
+        _log.warning("%s; waiting for it", error)
+        self._interruptions += 1
+        stopping = threading.Thread(target=super().stop, daemon=True)
+        stopping.start()
+        stopping.join(_STOP_S)
+        if stopping.is_alive():  # the driver does not return; a new process is needed
+            raise error
+        self._passed_before += self.radio.counts().passed
+        self.disconnect_messages()
+        self.disconnect_all()
+        self.radio.close()
+        self._retry_at = self._clock() + _RETRY_S
+
+    def _retry(self) -> None:
+        """Open the device again, if it is there."""
+        if self._clock() < self._retry_at:
+            return
+        transmits = self.radio.gate.account()["transmits"]
+        try:
+            self._open_radio()
+        except RadioError as error:
+            _log.debug("link %s: %s", self.config.name, error)
+            self._retry_at = self._clock() + _RETRY_S
+            return
+        self._retry_at = inf
+        self.radio.gate.transmit(on=transmits)
+        self._connect_radio()
+        super().start()
+        _log.warning("link %s: front end %s is back", self.config.name, self.front_end.name)
+
+    @cached_property
+    def _limit(self) -> AirtimeLimit | None:
+        """What limits the airtime, with what earlier starts of this robot have sent."""
+        rule = self.config.airtime.rule
+        if rule is None:
+            return None
+        file = AirtimeFile(account_of(self.config.ros_source))
+        self._stack.callback(file.close)
+        longest, now = self.front_end.airtime(), time.monotonic()
+        return AirtimeLimit(rule, longest, now=now, spent=file.spent, save=file.save)
+
+    def transmit(self, *, on: bool) -> None:
+        """Switch sending off, at once for all packets that have not reached the device, or on again."""
+        self.radio.transmit(on=on)
+        _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
+
     def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
         """Both directions share one endpoint, so that received packets can change what is sent."""
         both = RosLink(
-            self._registry,
-            self.config.ros_source,
+            self._registry if self.sends else Registry.empty(),
+            self.config.ros_source if self.sends else replace(self.config.ros_source, registry="", topics=()),
             self._sink_config(),
             middleware=graphs,
+            reports=self.sends,
             half_duplex=getattr(self.front_end.options, "half_duplex", False),
             any_length=self.phy.any_length,
-            ladder=self.phy.ladder,
+            mcs_table=self.phy.mcs_table,
+            airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
             observer=observer,
             clock=self._clock,
         )
         self._stack.callback(both.close)
         self.source, self.sink, self.calls = both.source, both.sink, both.calls
-        self.msg_connect(both, "pdus", self.radio, "pdus")
-        self.msg_connect(self.radio, "credit", both, "credit")
-        self.msg_connect(self.radio, "pdus", both, "pdus")
+        self.end = both.end
+        """What sends and receives; where the front end loops back, what receives."""
+        self._blocks = both, both
 
     def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
         """A robot that receives its own packets has two endpoints: one sends and one receives."""
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        carried: dict[str, Any] = {"any_length": self.phy.any_length, "ladder": self.phy.ladder}
+        carried: dict[str, Any] = {"any_length": self.phy.any_length, "mcs_table": self.phy.mcs_table}
         self.source = RosSource(self._registry, middleware=graphs[0], **carried, **common, **source)
         self._stack.callback(self.source.close)
         self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
         self._stack.callback(self.sink.close)
-        self.msg_connect(self.source, "pdus", self.radio, "pdus")
-        self.msg_connect(self.radio, "credit", self.source, "credit")
-        self.msg_connect(self.radio, "pdus", self.sink, "pdus")
+        self.end = self.sink.live
+        self._blocks = self.source, self.sink
 
     @property
     def node_name(self) -> str:
@@ -176,24 +303,62 @@ class RobotLink(Flowgraph):
 
     def stop(self) -> None:
         """Stop, leave the ROS graph and close the front end. Idempotent. A stopped link cannot start again."""
+        self._retry_at = inf
         super().stop()
         # A device is released with its blocks. The flowgraph would keep them as long as it exists itself.
         self.disconnect_all()
         self._stack.close()
 
     def check(self) -> None:
-        """Check the device. Call this from time to time while the link runs, for instance with each call of `stats`.
+        """Check the device and the threads that send. Call this from time to time while the link runs.
 
-        :raises RadioError: when the device gives or takes no more samples; GNU Radio does not report this
+        A device that has vanished is waited for, and opened again.
+
+        :raises RadioError: when a device that cannot come back gives or takes no more samples, which GNU Radio does not
+            report; when its driver does not stop; when a thread that sends does not go on
         """
-        if self._running:
+        if self._retry_at < inf:
+            self._retry()
+        if not self._running:
+            return
+        for thread, stalled_s in (
+            ("sending thread", self.source.stalled_s(self._clock())),
+            ("thread that paces packets", self.radio.gate.stalled_s()),
+        ):
+            if stalled_s > STALLED_S:
+                raise RadioError(
+                    f"link {self.config.name}: the {thread} has not gone on for {stalled_s:.0f} s; start the link "
+                    "again, and report what it was doing (py-spy dump)"
+                )
+        try:
             self.front_end.check(self._clock())
+            self._worked = True
+        except RadioError as error:
+            if not (self.front_end.may_return and self._worked):
+                raise
+            self._lose(error)
+
+    def ping(self, robot: int) -> dict[str, Any]:
+        """Ask another robot, which answers at once; returns what has come of all questions to it so far.
+
+        :raises ConfigError: with version 0
+        """
+        return {**ping(self.end, robot, self._clock()), **self.source.rate()}
 
     @property
     def remark(self) -> str:
         """A remark for the person who starts the link; often empty."""
         open_to_all = self.config.version and not self.config.key
         return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
+
+    def _lost_devices(self) -> dict[str, int]:
+        return {"interruptions": self._interruptions} if self._interruptions else {}
+
+    def findings(self) -> list[str]:
+        """What a person should know about this link and its surroundings: one line each, mostly none."""
+        robots = [peer["robot"] for peer in peers(self.end, self._clock())]
+        line = shortcut(self.source.middleware.discover(), self.config.ros_source.src_id(), robots)
+        return [] if line is None else [line]
 
     @property
     def finished(self) -> bool:
@@ -213,9 +378,10 @@ class RobotLink(Flowgraph):
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             "source": self.source.stats(),
             "sink": self.sink.stats(),
+            "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
             "packets": {
-                "out": counts.passed,
+                "out": self._passed_before + counts.passed,
                 "backlog": counts.backlog,
                 "refused": self.radio.refused,
                 "in": self.sink.handled,
@@ -228,12 +394,14 @@ class RobotLink(Flowgraph):
                 "sample_rate": phy.sample_rate if phy.has_samples else None,
                 "airtime_s": self.front_end.airtime(),
                 "snr_db": self.radio.snr_db,
+                "rssi_dbm": self.front_end.rssi_dbm,
                 **self.source.rate(),
             },
             "front_end": {
                 "name": self.front_end.name,
                 "passed": front_end.passed,
-                "lost": {**front_end.lost, **self.radio.recorded()},
+                "lost": {**front_end.lost, **self._lost_devices(), **self.radio.recorded()},
             },
+            "airtime": self.radio.gate.account(),
             "incomplete": self.incomplete(),
         }

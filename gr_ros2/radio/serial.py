@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.radio.framing import Cobs, Framing, Slip
-from gr_ros2.radio.packet_port import Connection, PacketFrontEnd
-from gr_ros2.radio.serial_device import StreamOptions, open_stream
+from gr_ros2.radio.packet_port import Connection
+from gr_ros2.radio.serial_device import StreamFrontEnd, StreamOptions, open_stream
 from gr_ros2.settings.config import STRICT
 
 _FRAMINGS: dict[str, type[Framing]] = {"cobs": Cobs, "slip": Slip}
@@ -20,19 +21,24 @@ class SerialOptions(StreamOptions):
 
     :param framing: how packets are told apart in the stream, the same at every robot: ``cobs`` adds one byte in 254,
         ``slip`` is RFC 1055
+    :param rssi: the radio adds a byte of signal strength behind each packet (E22 modules: bit 7 of REG3)
     """
 
     framing: Literal["cobs", "slip"] = "cobs"
+    rssi: Annotated[bool, Field(title="Byte of signal strength")] = False
 
 
-class SerialFrontEnd(PacketFrontEnd):
+class SerialFrontEnd(StreamFrontEnd):
     """See :class:`SerialOptions`."""
 
     name = "serial"
     Options = SerialOptions
-    has_radio = True
 
     def _connect(self) -> Connection:
         options = self.options
-        framing = _FRAMINGS[options.framing](self.phy.packet_len, self._counters)
-        return open_stream(self.name, options.device, options.baud, framing)
+        self._framing = _FRAMINGS[options.framing](self.phy.packet_len, self._counters, rssi=options.rssi)
+        return open_stream(self.name, options.device, options.baud, self._framing)
+
+    @property
+    def rssi_dbm(self) -> int | None:
+        return self._framing.rssi_dbm

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import random
 import socket
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 import serial
@@ -14,10 +15,11 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
+from gr_ros2.phy import Phy
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import SharedAir
-from gr_ros2.radio.packet_port import StreamConnection
-from gr_ros2.settings.config import STRICT
+from gr_ros2.radio.packet_port import PacketFrontEnd, StreamConnection
+from gr_ros2.settings.config import STRICT, Seconds
 
 _TCP = "tcp://"
 _CONNECT_S = 3.0
@@ -43,11 +45,29 @@ class StreamOptions(SharedAir):
 
     :param device: ``/dev/ttyUSB0``; or ``tcp://HOST:PORT``, for instance of direwolf or of a serial server
     :param baud: speed of a serial line, the same as in the modem's settings
+    :param backoff_s: s of further silence after each packet, at random from 0 to this, where modems share a frequency
+        and do not listen before they send: without it, two can send at the same moments for ever
     """
 
     device: Annotated[Device, Field(title="Device or address")]
     baud: Annotated[int, Field(ge=50, le=4_000_000, title="Speed of the serial line (baud)")] = 57_600
+    backoff_s: Annotated[Seconds, Field(title="Random silence after a packet (s)")] = 0.0
     half_duplex: bool = True
+
+
+class StreamFrontEnd(PacketFrontEnd):
+    """A packet radio on a stream of bytes."""
+
+    Options = StreamOptions
+    has_radio = True
+
+    def __init__(self, phy: Phy, **options: Any) -> None:
+        self._rng = random.Random()
+        super().__init__(phy, **options)
+
+    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
+        share = 1.0 if packet_len is None else self._rng.random()
+        return super().airtime(packet_len, mcs) + share * float(self.options.backoff_s)
 
 
 def open_stream(front_end: str, device: str, baud: int, framing: Framing) -> StreamConnection:

@@ -177,7 +177,7 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             return len(samples)
         bursts, taken = self._bursts.cut(self, samples)
         for burst in bursts:
-            self._record(burst)
+            self._record(burst.samples)
         return taken
 
     def _record(self, samples: NDArray[np.complex64]) -> None:

@@ -61,6 +61,10 @@ class SoapyFrontEnd(DeviceFrontEnd):
         self.check_gain("rx", block.get_gain(_CHANNEL), has.minimum(), has.maximum(), has.step())
         return block
 
+    def _device_time(self) -> float | None:
+        at: float | None = None if self._transmitting is None else self._transmitting.device_time()
+        return at
+
     def check(self, now: float) -> None:
         if trouble := self._transmitting.trouble:
             raise RadioError(

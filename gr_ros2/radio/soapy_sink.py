@@ -16,7 +16,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
+from ctypes import POINTER, byref, c_bool, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.stream_events import BURSTS_OUT
 
 _TX, _CHANNEL = 0, 0
-_END_BURST = 1 << 1
+_END_BURST, _HAS_TIME = 1 << 1, 1 << 2
 _TIMEOUT, _NOT_SUPPORTED, _UNDERFLOW = -1, -5, -7
 _EVENTS = {_UNDERFLOW: "underflows", -6: "late", -3: "corrupted"}
 """Names of the events that a device reports, by SoapySDR's code."""
@@ -72,6 +72,8 @@ def _library() -> Any:
         ("getGain", c_double, [c_void_p, c_int, c_size_t]),
         ("getGainRange", _Range, [c_void_p, c_int, c_size_t]),
         ("listAntennas", POINTER(c_char_p), [c_void_p, c_int, c_size_t, POINTER(c_size_t)]),
+        ("hasHardwareTime", c_bool, [c_void_p, c_char_p]),
+        ("getHardwareTime", c_longlong, [c_void_p, c_char_p]),
         ("setupStream", c_void_p, [c_void_p, c_int, c_char_p, POINTER(c_size_t), c_size_t, c_void_p]),
         ("activateStream", c_int, [c_void_p, c_void_p, c_int, c_longlong, c_size_t]),
         ("deactivateStream", c_int, [c_void_p, c_void_p, c_int, c_longlong]),
@@ -148,6 +150,12 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
     def sample_rate(self) -> float:
         """Sample rate of the device, samples/s."""
         return float(_soapy.SoapySDRDevice_getSampleRate(self._device, _TX, _CHANNEL))
+
+    def device_time(self) -> float | None:
+        """s of the device's clock; None if it has none."""
+        if not _soapy.SoapySDRDevice_hasHardwareTime(self._device, b""):
+            return None
+        return float(_soapy.SoapySDRDevice_getHardwareTime(self._device, b"")) * 1e-9
 
     def antennas(self) -> list[str]:
         """Names of the ports that the device can send from."""
@@ -230,18 +238,21 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         bursts, taken = self._cutter.cut(self, input_items[0])
         for burst in bursts:
-            self._send(burst)
+            self._send(burst.samples, burst.leave_at)
             self.ask()
         return taken
 
-    def _send(self, burst: NDArray[np.complex64]) -> None:
+    def _send(self, burst: NDArray[np.complex64], leave_at: float | None) -> None:
+        """:param leave_at: s of the device's clock; None for now"""
         deadline = time.monotonic() + self._patience
+        at_ns = 0 if leave_at is None else round(leave_at * 1e9)
         done = result = 0
         while done < len(burst) and (result > 0 or (result in _AGAIN and time.monotonic() < deadline)):
             rest = burst[done:]
-            where, flags = c_void_p(rest.ctypes.data), c_int(_END_BURST)
+            timed = leave_at is not None and not done  # the rest of a burst follows its begin
+            where, flags = c_void_p(rest.ctypes.data), c_int(_END_BURST | (_HAS_TIME if timed else 0))
             result = _soapy.SoapySDRDevice_writeStream(
-                self._device, self._stream, byref(where), len(rest), byref(flags), 0, _CALL_US
+                self._device, self._stream, byref(where), len(rest), byref(flags), at_ns, _CALL_US
             )
             done += max(0, result)
             if result == _UNDERFLOW:

@@ -55,6 +55,9 @@ class UhdFrontEnd(DeviceFrontEnd):
     def _device_counters(self) -> dict[str, int]:
         return dict(self._events.counted)
 
+    def _device_time(self) -> float | None:
+        return None if self._receiving is None else float(self._receiving.get_time_now().get_real_secs())
+
     def _open_transmitter(self) -> Any:
         return self._set_up(uhd.usrp_sink(self.device_args, _stream(), LENGTH_TAG), "tx")
 

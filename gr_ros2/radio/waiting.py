@@ -5,7 +5,8 @@ Invariant: a line is returned only if it has changed. A look changes nothing on 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from gr_ros2.core.names import INFRASTRUCTURE
@@ -17,6 +18,29 @@ if TYPE_CHECKING:
 ALL_THERE = "every topic has a publisher"
 _SHOWN = 6
 """Largest number of topics that a line names. Further topics are only counted."""
+
+
+_OF_A_LINK = re.compile(r"/gr_ros2_link_([0-9]+)/statistics")
+"""A topic that every link publishes (``diagnostics``)."""
+
+
+def shortcut(infos: Sequence[TopicInfo], own: int, heard: Iterable[int]) -> str | None:
+    """One line if another robot's link is on this robot's ROS graph: something other than the radio connects the two.
+
+    :param infos: what is on the graph
+    :param own: this robot
+    :param heard: the robots that are heard by radio
+    """
+    found = [match for info in infos if info.publishers and (match := _OF_A_LINK.fullmatch(info.topic)) is not None]
+    others = sorted({int(match[1]) for match in found} - {own})
+    if not others:
+        return None
+    nodes = ", ".join(f"gr_ros2_link_{robot}" for robot in others)
+    also = ", which is heard by radio too" if set(others) & set(heard) else ""
+    return (
+        f"{nodes} is on this robot's ROS graph{also}: something other than the radio connects the robots, such as a "
+        "cable or Wi-Fi; set another ROS_DOMAIN_ID at each, or ROS_LOCALHOST_ONLY=1"
+    )
 
 
 class Waiting:

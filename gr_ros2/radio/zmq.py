@@ -1,7 +1,9 @@
 """The `zmq` front end: bursts of samples over ZeroMQ, between processes or machines without radios.
 
 Every robot publishes at one address and subscribes to the addresses of the others. Each packet is one message: a
-header, then its samples.
+header, then its samples. Instead of the others there may be a medium process (:mod:`gr_ros2.radio.medium`), which sends
+what all of them together make of the air at this robot. In lock step it also sends the time, as messages without
+samples, which the robot sends back when it has sent all that begins before.
 
 Invariants: only bursts are sent, so silence costs nothing. A burst is sent completely or not at all. Nobody waits for a
 peer. What is sent while a peer is away, or while the cable is unplugged, is lost as on the air. Either end may be
@@ -18,12 +20,15 @@ import os
 import queue
 import struct
 import threading
+import time
 import weakref
 from collections import Counter
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Callable, Iterable
+from math import isfinite, nan
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pmt
 import zmq
 from gnuradio import gr
 from numpy.typing import NDArray
@@ -32,22 +37,29 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
+from gr_ros2.phy.stream_times import BURST_TIME
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS, FrontEnd, FrontEndCounters, FrontEndOptions
 from gr_ros2.settings.config import STRICT
 
-HEADER = struct.Struct("<4sIQd")
-"""Magic, number of the sender (random at each start), number of the burst, samples/s. The samples follow as complex64,
-little-endian."""
-MAGIC = b"GRI0"
+HEADER = struct.Struct("<4sIQdd")
+"""Magic, number of the sender (random at each start), number of the burst, samples/s, and the time in s of the first
+sample on the clock of the medium process, NaN without one. The samples follow as complex64, little-endian."""
+MAGIC = b"GRI1"
 
-_SAMPLE = np.dtype("<c8")
+SAMPLE = np.dtype("<c8")
 _HEARTBEAT_MS, _DEAD_MS = 250, 1000
 """Interval and limit of heartbeats. The connection to a peer that is silent up to the limit is closed, with all bursts
 that wait for it. Then a new connection is tried."""
 _RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
 _WAIT_S = 0.1
+_LOOK_S = 2e-4
+"""s between two looks whether all has been sent that begins before the time of the medium process."""
+_MOST_STEP_S = 1.0
+"""s by which one word of a medium process moves the clock at most."""
+_ANSWER_S = 0.5
+"""s after which a time is not answered; the medium process sends it again."""
 MAX_SENDERS = 256
 """Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
 _MAX_PORT = 65535
@@ -92,11 +104,43 @@ class ZmqOptions(FrontEndOptions):
     :param connect: addresses of the other robots, ``10.0.0.2:5555``
     :param burst_queue: bursts that may wait for a slow peer, and for this computer when received, 1..10000; beyond,
         new ones are dropped
+    :param medium_process: what ``connect`` names: none = other robots; lockstep or real =
+        ``gr-ros2 medium`` with this ``time``
     """
 
     bind: Annotated[OwnAddress, Field(title="Own address")]
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
     burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue (bursts)")] = 300
+    medium_process: Annotated[Literal["none", "lockstep", "real"], Field(title="Medium process")] = "none"
+
+
+class MediumClock:
+    """The clock of a link in lock step: it goes as a medium process says, and stands still without one.
+
+    Invariants: it never goes back, also when the medium process is started again.
+    """
+
+    def __init__(self) -> None:
+        self._now = time.monotonic()
+        self._medium = -1
+        self._offset = nan
+
+    def __call__(self) -> float:
+        return self._now
+
+    def tick(self, medium: int, at: float) -> None:
+        """It is ``at`` on the clock of a medium process, which has drawn this number at its start."""
+        if medium != self._medium:
+            self._medium, self._offset = medium, self._now - at
+        self._now = min(max(self._now, at + self._offset), self._now + _MOST_STEP_S)
+
+    def there(self, at: float) -> float:
+        """A time of this clock on that of the medium process; NaN before its first word."""
+        return at - self._offset
+
+    def here(self, at: float) -> float:
+        """A time of the medium process on this clock."""
+        return at + self._offset
 
 
 class ZmqFrontEnd(FrontEnd):
@@ -104,6 +148,7 @@ class ZmqFrontEnd(FrontEnd):
 
     name = "zmq"
     Options = ZmqOptions
+    timing_error_s = 0.005
     any_length = True
 
     def __init__(self, phy: Phy, **options: Any) -> None:
@@ -112,20 +157,23 @@ class ZmqFrontEnd(FrontEnd):
         # Close the sockets first: a context that is garbage-collected together with them waits for them without end.
         self._let_go = weakref.finalize(self, _let_go, self._context, self._sockets)
         self._counters: Counter[str] = Counter()
+        self._passed: Callable[[], int | None] = lambda: None
+        self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
         try:
             publisher = self._socket(zmq.PUB)
-            _open(publisher.bind, "bind", self.options.bind)
+            open_socket(publisher.bind, "bind", self.options.bind)
             subscriber = self._socket(zmq.SUB)
             subscriber.subscribe(b"")
             for address in self.options.connect:
-                _open(subscriber.connect, "connect", address)
+                open_socket(subscriber.connect, "connect", address)
         except RadioError:
-            self.close()
+            self._let_go()
             raise
         self._sockets.remove(subscriber)  # its thread closes it
-        arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters)
-        self._sink = _BurstPublisher(publisher, phy, self._counters)
-        self._source = _BurstSubscriber(arrivals)
+        self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
+        told = None if self._medium_clock is None else self._told
+        arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters, told)
+        self._source = _BurstSubscriber(arrivals, self._medium_clock)
 
     @property
     def sink(self) -> Any:
@@ -134,6 +182,27 @@ class ZmqFrontEnd(FrontEnd):
     @property
     def source(self) -> Any:
         return self._source
+
+    def ahead(self) -> float | None:
+        return None if self.options.medium_process == "none" else 0.0
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        return time.monotonic if self._medium_clock is None else self._medium_clock
+
+    def follow(self, passed: Callable[[], int | None]) -> None:
+        self._passed = passed
+
+    def _told(self, medium: int, at: float) -> None:
+        """The medium process has told the time: answer when all has been sent that begins before."""
+        assert self._medium_clock is not None
+        self._medium_clock.tick(medium, at)
+        limit = time.monotonic() + _ANSWER_S
+        while self._passed() != self._counters["bursts_out"]:
+            if time.monotonic() > limit:
+                return
+            time.sleep(_LOOK_S)
+        self._sink.answer(at)
 
     def counters(self) -> FrontEndCounters:
         """Counters of what passed and what did not.
@@ -147,26 +216,38 @@ class ZmqFrontEnd(FrontEnd):
         return FrontEndCounters({name: self._counters[name] for name in ("bursts_out", "bursts_in")}, lost)
 
     def close(self) -> None:
+        self._sink.close()
         self._let_go()
 
     def _socket(self, kind: int) -> Any:
         socket = self._context.socket(kind)
         self._sockets.append(socket)
-        socket.linger = 0
-        socket.sndhwm = self.options.burst_queue
-        # libzmq aborts the process if a receive queue with a limit is full while the heartbeats replace the connection
-        # (libzmq issues 3937 and 4767). So it has no limit, and _Arrivals keeps it empty.
-        socket.rcvhwm = 0
-        socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
-        socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
-        socket.setsockopt(zmq.CONNECT_TIMEOUT, _DEAD_MS)
-        socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
-        socket.setsockopt(zmq.IPV6, any("[" in address for address in (self.options.bind, *self.options.connect)))
-        # One burst is one message. A larger message does not come from this front end.
-        socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + 2 * self.phy.airtime_samples() * _SAMPLE.itemsize)
+        addresses = (self.options.bind, *self.options.connect)
+        prepare(socket, self.options.burst_queue, 2 * self.phy.airtime_samples(), addresses)
         return socket
+
+
+def prepare(socket: Any, most: int, samples: int, addresses: Iterable[str]) -> None:
+    """Set up a socket for bursts.
+
+    :param most: bursts that may wait to be sent
+    :param samples: of the longest message
+    :param addresses: to which it will be bound or connected
+    """
+    socket.linger = 0
+    socket.sndhwm = most
+    # libzmq aborts the process if a receive queue with a limit is full while the heartbeats replace the connection
+    # (libzmq issues 3937 and 4767). So it has no limit, and _Arrivals keeps it empty.
+    socket.rcvhwm = 0
+    socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAD_MS)
+    socket.setsockopt(zmq.HEARTBEAT_TTL, _DEAD_MS)
+    socket.setsockopt(zmq.CONNECT_TIMEOUT, _DEAD_MS)
+    socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
+    socket.setsockopt(zmq.IPV6, any("[" in address for address in addresses))
+    # One burst is one message. A larger message does not come from this front end.
+    socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + samples * SAMPLE.itemsize)
 
 
 def _let_go(context: Any, sockets: list[Any]) -> None:
@@ -175,35 +256,55 @@ def _let_go(context: Any, sockets: list[Any]) -> None:
     context.term()
 
 
-def _open(action: Callable[[str], object], key: str, address: str) -> None:
+def open_socket(action: Callable[[str], object], key: str, address: str, whom: str = "front_end zmq") -> None:
+    """Bind or connect a socket.
+
+    :raises RadioError: when the address cannot be used
+    """
     try:
         action(address)
     except zmq.ZMQError as error:
         whose = "an address of this machine and a free port" if key == "bind" else "another robot's address"
         raise RadioError(
-            f"front_end zmq: {key} = {address!r}: {error.strerror}; write {whose}, as tcp://HOST:PORT or ipc:///PATH"
+            f"{whom}: {key} = {address!r}: {error.strerror}; write {whose}, as tcp://HOST:PORT or ipc:///PATH"
         ) from error
 
 
 class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Sends the samples of each packet as one message."""
 
-    def __init__(self, socket: Any, phy: Phy, counters: Counter[str]) -> None:
+    def __init__(self, socket: Any, phy: Phy, counters: Counter[str], clock: MediumClock | None) -> None:
         super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
         self._socket = socket
         self._sample_rate = phy.sample_rate
         self._cutter = BurstCutter(phy.airtime_samples(), phy.any_length)
         self._sender = int.from_bytes(os.urandom(4), "little")
         self._counters = counters
+        self._medium_clock = clock
+        self._sending = threading.Lock()  # flowgraph and arrivals send
 
     def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
         bursts, taken = self._cutter.cut(self, input_items[0])
         for burst in bursts:
-            number = self._counters["bursts_out"]
-            header = HEADER.pack(MAGIC, self._sender, number, self._sample_rate)
-            self._socket.send(header + burst.astype(_SAMPLE, copy=False).tobytes(), zmq.NOBLOCK)
-            self._counters["bursts_out"] = number + 1
+            at = nan if burst.at is None or self._medium_clock is None else self._medium_clock.there(burst.at)
+            self._send(at, burst.samples.astype(SAMPLE, copy=False).tobytes())
+            self._counters["bursts_out"] += 1
         return taken
+
+    def answer(self, at: float) -> None:
+        """Tell the medium process that all has been sent that begins before ``at``."""
+        self._send(at, b"")
+
+    def _send(self, at: float, samples: bytes) -> None:
+        header = HEADER.pack(MAGIC, self._sender, self._counters["bursts_out"], self._sample_rate, at)
+        with self._sending:
+            if not self._socket.closed:  # by close(), while arrivals were about to answer
+                self._socket.send(header + samples, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Send nothing from now on. Idempotent."""
+        with self._sending:
+            self._socket.close(linger=0)
 
 
 class _Arrivals:
@@ -213,17 +314,25 @@ class _Arrivals:
     most ``most`` bursts wait, in the order of their arrival; the thread ends, and closes the socket, with the context.
     """
 
-    def __init__(self, socket: Any, sample_rate: float, most: int, counters: Counter[str]) -> None:
+    def __init__(
+        self,
+        socket: Any,
+        sample_rate: float,
+        most: int,
+        counters: Counter[str],
+        told: Callable[[int, float], None] | None = None,
+    ) -> None:
         self._socket = socket
         self._sample_rate = sample_rate
         self._most = most
         self._senders: dict[int, int] = {}
         self._counters = counters
-        self._waiting: queue.SimpleQueue[NDArray[np.complex64]] = queue.SimpleQueue()
+        self._told = told
+        self._waiting: queue.SimpleQueue[tuple[float, NDArray[np.complex64]]] = queue.SimpleQueue()
         threading.Thread(target=self._run, name="zmq-arrivals", daemon=True).start()
 
-    def take(self, timeout_s: float) -> NDArray[np.complex64] | None:
-        """The samples of the oldest burst that waits, or None if none has come in time."""
+    def take(self, timeout_s: float) -> tuple[float, NDArray[np.complex64]] | None:
+        """Time and samples of the oldest burst that waits, or None if none has come in time."""
         try:
             return self._waiting.get(timeout=timeout_s)
         except queue.Empty:
@@ -240,34 +349,40 @@ class _Arrivals:
 
     def arrived(self, message: bytes) -> None:
         """Keep the samples of a message, unless it is refused or the queue is full."""
-        samples = self._samples(message)
-        if samples is None:
+        burst = self._burst(message)
+        if burst is None:
             return
         # Only this thread adds to the queue, so there is room for what it has seen room for.
         if self._waiting.qsize() >= self._most:
             self._count("overflows", f"{self._most} bursts wait, this computer is too slow; new ones are dropped")
             return
         self._counters["bursts_in"] += 1
-        self._waiting.put(samples)
+        self._waiting.put(burst)
 
-    def _samples(self, message: bytes) -> NDArray[np.complex64] | None:
+    def _burst(self, message: bytes) -> tuple[float, NDArray[np.complex64]] | None:
         size = len(message) - HEADER.size
-        if size < 0 or size % _SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
+        if size < 0 or size % SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
             self._count("malformed", f"a message of {len(message)} bytes is no burst of samples")
             return None
-        _, sender, number, sample_rate = HEADER.unpack_from(message)
+        _, sender, number, sample_rate, at = HEADER.unpack_from(message)
         if sample_rate != self._sample_rate:
             self._count(
                 "wrong_rate",
                 f"a peer sends {sample_rate:g} samples/s, not {self._sample_rate:g}; set the same phy at both ends",
             )
             return None
-        samples = np.frombuffer(message, _SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
+        if not size and self._told is not None:
+            if isfinite(at):
+                self._told(sender, at)
+            else:
+                self._count("malformed", "a time that is no finite number")
+            return None
+        samples = np.frombuffer(message, SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
         if not np.isfinite(samples).all():
             self._count("malformed", "a burst has samples that are no finite numbers")
             return None
         self._follow(sender, number)
-        return samples
+        return at, samples
 
     def _follow(self, sender: int, number: int) -> None:
         before = self._senders.pop(sender, None)
@@ -289,9 +404,10 @@ class _Arrivals:
 class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Gives the samples of the bursts that have arrived."""
 
-    def __init__(self, arrivals: _Arrivals) -> None:
+    def __init__(self, arrivals: _Arrivals, clock: MediumClock | None) -> None:
         super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
         self.arrivals = arrivals
+        self._medium_clock = clock
         self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
         self.set_blkd_input_timer_value(AGAIN_MS)
 
@@ -301,7 +417,10 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             burst = self.arrivals.take(_WAIT_S)
             if burst is None:
                 return 0
-            self._rest = burst
+            at, self._rest = burst
+            if self._medium_clock is not None and isfinite(at):
+                when = pmt.from_double(self._medium_clock.here(at))
+                self.add_item_tag(0, self.nitems_written(0), BURST_TIME, when)
         count = min(len(self._rest), len(output_items[0]))
         output_items[0][:count] = self._rest[:count]
         self._rest = self._rest[count:]

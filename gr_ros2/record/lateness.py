@@ -65,7 +65,7 @@ def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: 
     sent = lost = sent_after = lost_after = 0
     for messages in trace.messages():
         submitted = ~np.isnan(messages.t_sent)
-        gone = submitted & (messages.row != LedgerRow.DELIVERED) & (messages.row != LedgerRow.IN_FLIGHT)
+        gone = submitted & ~messages.delivered & (messages.row != LedgerRow.IN_FLIGHT)
         after = np.zeros(len(submitted), dtype=bool)
         for due, happened in moments:
             after |= (messages.t_sent >= due) & (messages.t_sent <= happened + AFTER_S)

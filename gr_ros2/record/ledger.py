@@ -25,6 +25,7 @@ from gr_ros2.link.events import (
     Delivered,
     Lost,
     Missed,
+    PacketId,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -104,8 +105,8 @@ class _SourceBook:
     packets_sent: int = 0
     air: Counter[str] = field(default_factory=Counter)
     last_received: int = -1
-    in_air: deque[tuple[int, bytes]] = field(default_factory=deque)
-    waiting: dict[bytes, deque[tuple[int, tuple[SentEntry, ...]]]] = field(default_factory=dict)
+    in_air: deque[tuple[int, PacketId]] = field(default_factory=deque)
+    waiting: dict[PacketId, deque[tuple[int, tuple[SentEntry, ...]]]] = field(default_factory=dict)
 
 
 class Ledger:
@@ -118,7 +119,7 @@ class Ledger:
         self._unmatched: list[tuple[int, int, bytes, float]] = []
         self._faults: list[str] = []
         self._finished = False
-        self._packets_handed_up = 0
+        self._received = 0
         self._rejected: Counter[str] = Counter()
 
     # -- feeding ------------------------------------------------------------------------------------------------
@@ -140,20 +141,17 @@ class Ledger:
             else:
                 self._refused(source, event)
 
-    def packet_received(self, data: bytes) -> tuple[int, int] | None:
-        """Take bytes that the PHY handed to the sink, valid or not.
+    def packet_received(self, identity: PacketId) -> int | None:
+        """Take a packet that the sink has opened.
 
-        :return: source and number, from 0 per source, of the packet sent with these bytes; None if there is none
+        :return: its number, from 0 per source; None if no such packet was sent
         """
         with self._lock:
             if self._finished:
                 return None
-            self._packets_handed_up += 1
-            digest = digest_of(data)
-            for source in self._sources.values():
-                if digest in source.waiting:
-                    return source.src_id, _arrived(source, digest)
-        return None
+            self._received += 1
+            source = self._sources.get(identity.src_id)
+            return None if source is None or identity not in source.waiting else _arrived(source, identity)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> float | None:
         """Take an event of the receiver.
@@ -195,14 +193,13 @@ class Ledger:
         new messages, also ``air_<kind>`` for each of :data:`gr_ros2.link.events.AirKind`."""
         with self._lock:
             crc_failed = self._rejected["crc"]
-            rejected = sum(self._rejected.values())
             air = sum((source.air for source in self._sources.values()), Counter[str]())
             kinds = {f"air_{kind}": air[kind] for kind in get_args(AirKind)}
             return {
                 "sent": sum(source.packets_sent for source in self._sources.values()),
-                "received": self._packets_handed_up - rejected,
+                "received": self._received,
                 "crc_failed": crc_failed,
-                "malformed": rejected - crc_failed,
+                "malformed": self._rejected.total() - crc_failed,
                 **{f"rejected_{kind}": count for kind, count in sorted(self._rejected.items())},
                 **(kinds if air.total() > air["new"] else {}),
             }
@@ -271,9 +268,8 @@ class Ledger:
                 message.last_packet = ordinal
                 if message.sent == 1:
                     self._retire(source, message)
-        digest = digest_of(event.data)
-        source.in_air.append((ordinal, digest))
-        source.waiting.setdefault(digest, deque()).append((ordinal, event.entries))
+        source.in_air.append((ordinal, event.identity))
+        source.waiting.setdefault(event.identity, deque()).append((ordinal, event.entries))
 
     def _retire(self, source: _SourceBook, newer: _OpenMessage) -> None:
         """Close older messages with the same key that cannot arrive any more. Keys are reused after a while."""
@@ -353,29 +349,29 @@ class Ledger:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
 
-def _arrived(source: _SourceBook, digest: bytes) -> int:
-    """Take the arrival of a packet of this source. It is the first packet with these bytes that was sent after the
-    newest received packet; if there is none, the oldest packet with these bytes.
+def _arrived(source: _SourceBook, identity: PacketId) -> int:
+    """Take the arrival of a packet of this source. A packet may be sent again, and the numbers of version 0 come round:
+    it is the first with this identity that was sent after the newest received packet; if there is none, the oldest.
 
     :return: its number
     """
-    copies = source.waiting[digest]
+    copies = source.waiting[identity]
     ordinal, entries = next((copy for copy in copies if copy[0] > source.last_received), copies[0])
     copies.remove((ordinal, entries))
     if not copies:
-        del source.waiting[digest]
+        del source.waiting[identity]
     for entry in entries:
         message = source.messages.get(entry.serial)
         if message is not None and not entry.repeat:
             message.received += 1
     source.last_received = max(source.last_received, ordinal)
     while source.in_air and source.in_air[0][0] < source.last_received - REORDER_WINDOW:
-        old, old_digest = source.in_air.popleft()
-        rest = source.waiting.get(old_digest)
+        old, old_identity = source.in_air.popleft()
+        rest = source.waiting.get(old_identity)
         if rest and rest[0][0] == old:
             rest.popleft()
             if not rest:
-                del source.waiting[old_digest]
+                del source.waiting[old_identity]
     return ordinal
 
 

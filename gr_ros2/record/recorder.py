@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
+from math import inf
 from typing import Any
 
-from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.record.ledger import Ledger, TopicLedger
 from gr_ros2.record.metrics import TopicMetrics, topic_metrics
 from gr_ros2.record.path_error import path_error, rms_error
 from gr_ros2.record.positions import PositionReader, position_reader
 from gr_ros2.record.result import AgeResult, LatencyResult, TopicResult
 from gr_ros2.record.trace import Floats, PacketLog, Trace, Track, make_trace
-from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
 
 
 class Recorder:
@@ -43,8 +44,9 @@ class Recorder:
         self.ledger = Ledger()
         self.sent: dict[tuple[int, int], Track] = {}
         self.received: dict[tuple[int, int], Track] = {}
-        self._lengths: Counter[tuple[AirKind, int, int]] = Counter()
-        """Number of packets sent, by what they were for, their length in bytes and their rung."""
+        self._lengths: Counter[tuple[int, AirKind, int, int]] = Counter()
+        """Number of packets sent, by their sender, what they were for, their length in bytes and their MCS."""
+        self._air_from, self._air_to = inf, -inf
         self._packets = {src_id: PacketLog() for src_id in namespaces}
         self._books: list[TopicLedger] = []
         self._registry = registry
@@ -61,7 +63,8 @@ class Recorder:
         """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
             self._packets.setdefault(src_id, PacketLog()).sent(event)
-            self._lengths[event.kind, len(event.data), event.rung] += 1
+            self._air_from, self._air_to = min(self._air_from, event.now), max(self._air_to, event.now)
+            self._lengths[src_id, event.kind, len(event.data), event.mcs] += 1
         self.ledger.sender_event(src_id, event)
         if isinstance(event, Accepted):
             self._follow(self.sent, src_id, event.topic_id, event.payload, event.now)
@@ -69,11 +72,10 @@ class Recorder:
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """Take an event of the receiver, at ``now`` on the sender's clock. A delivery is reported once it is
         republished."""
-        if isinstance(event, Received | Rejected):
-            packet = self.ledger.packet_received(event.data)
-            if packet is not None:
-                src_id, number = packet
-                self._packets[src_id].received(number, now)
+        if isinstance(event, Received):
+            number = self.ledger.packet_received(event.identity)
+            if number is not None:
+                self._packets[event.identity.src_id].received(number, now)
         submitted = self.ledger.receiver_event(event, now)
         if isinstance(event, Delivered):
             if self._on_delivery is not None:
@@ -104,21 +106,25 @@ class Recorder:
 
     def airtime(self, of_packet: Callable[[int | None, int], float] | None) -> dict[str, Any]:
         """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
-        per byte delivered; of the packets of each :data:`gr_ros2.link.events.AirKind`, where there were several; and
-        the bytes of all packets sent per message delivered.
+        per byte delivered; of the packets of each :data:`gr_ros2.link.events.AirKind`, where there were several, and
+        the same of each sender; the time from the first packet to the end of the last; and the bytes of all packets
+        sent per message delivered.
 
         To be called after :meth:`finish`.
 
-        :param of_packet: s that a packet of this many bytes, sent with this rung, takes, or the longest packet for
+        :param of_packet: s that a packet of this many bytes, sent with this MCS, takes, or the longest packet for
             None; None stands for a PHY without samples
         """
         longest = total = mean = None
-        sent_bytes = sum(length * count for (_, length, _), count in self._lengths.items())
+        sent_bytes = sum(length * count for (_, _, length, _), count in self._lengths.items())
         spent: Counter[str] = Counter()
+        senders: dict[str, Counter[str]] = {}
         if of_packet is not None:
             longest = of_packet(None, 0)
-            for (kind, length, rung), count in self._lengths.items():
-                spent[kind] += of_packet(length, rung) * count  # type: ignore[assignment]
+            for (src_id, kind, length, mcs), count in self._lengths.items():
+                seconds = of_packet(length, mcs) * count
+                spent[kind] += seconds  # type: ignore[assignment]
+                senders.setdefault(str(src_id), Counter())[kind] += seconds  # type: ignore[assignment]
             total = float(spent.total())
             mean = total / self._lengths.total() if total else longest
         return {
@@ -129,6 +135,8 @@ class Recorder:
             if total is not None and self._delivered_bytes
             else None,
             **({"airtime_of_kinds_s": dict(spent)} if len(spent) > 1 else {}),
+            "airtime_of_senders_s": {src_id: dict(kinds) for src_id, kinds in senders.items()},
+            "air_span_s": self._air_to - self._air_from + (mean or 0) if self._lengths else 0.0,
             "bytes_per_message": sent_bytes / self._delivered if self._delivered else None,
         }
 
@@ -174,6 +182,8 @@ class Recorder:
     def _name(self, src_id: int, topic_id: int) -> str:
         topic = self._topic(topic_id)
         namespace = self._namespaces.get(src_id, f"source_{src_id}")
+        if topic_id == MAX_TOPICS:  # the first id above them is that of a robot's table of topics
+            return f"the topics that /{namespace.strip('/')} announces"
         return topic.on_graph(namespace) if topic is not None else f"/{namespace.strip('/')}/topic_{topic_id}"
 
     def _topic_result(self, book: TopicLedger, numbers: TopicMetrics) -> TopicResult:

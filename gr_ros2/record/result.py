@@ -116,11 +116,14 @@ class ReceiverResult:
 
     :param number: from 2; the topics of the first receiver are in the result itself
     :param name: of a robot that receives from several; '' for a receiver without name
+    :param packets, phy: as in the result, of the senders that this receiver can hear
     """
 
     number: _Count
     topics: tuple[TopicResult, ...]
     name: str = ""
+    packets: dict[str, Any] = field(default_factory=dict)
+    phy: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, config=_READ)
@@ -133,7 +136,7 @@ class Result:
     :param phy: name, channels (one per direction), sample_rate, runs_on (what processed the samples), airtime_s (of one
         packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte),
         bytes_per_message (of all packets sent, per delivered message), airtime_of_kinds_s (of new packets, repairs,
-        reports, hellos), …
+        reports, hellos), airtime_of_senders_s (the same by source id), air_span_s (first to last packet), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why

@@ -5,14 +5,15 @@ Invariant: all numbers come from the runs' own files; a dash means that a run do
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gr_ros2.link.ledger_rows import LedgerRow, row_order
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
 from gr_ros2.report.figures import latency_figure, ledger_figure
-from gr_ros2.report.page import Run, Section, latencies, lead_of, save, write_page
+from gr_ros2.report.page import Picture, Run, Section, drawing, latencies, lead_of, render_page, save, write_summary
 from gr_ros2.report.table import Grid, milliseconds, number
 from gr_ros2.report.timelines import Deliveries, age_figure, delivery_figure
 
@@ -41,8 +42,8 @@ _DASH = "–"
 
 
 def compare_grid(runs: Sequence[Run]) -> Grid:
-    """A section per topic and a column per run. The numbers of the link come last. Numbers that no run has are left
-    out."""
+    """What differs, with a column per run: the settings, a section per topic, and the link. What is equal in all runs
+    is left out, and so are their names where they head the columns."""
     by_topic = [{topic.topic: topic for topic in run.result.topics} for run in runs]
     sections = []
     for name in dict.fromkeys(name for topics in by_topic for name in topics):
@@ -72,17 +73,55 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
             )
         )
     link += [("link", what, *(milliseconds(result.phy.get(key)) for result in results)) for what, key in _PHY.items()]
-    kept = [tuple(line for line in section if set(line[2:]) != {_DASH}) for section in [*sections, link]]
-    return Grid("Side by side", ("Topic", "Number", *(run.label for run in runs)), tuple(filter(None, kept)), texts=2)
+    labels = tuple(run.label for run in runs)
+    lines_of = [_settings([result.config for result in results]), *sections, link]
+    kept = [tuple(line for line in section if len(set(line[2:])) > 1 and line[2:] != labels) for section in lines_of]
+    title = "What differs" if any(kept) else "Nothing differs"
+    return Grid(title, ("", "", *labels), tuple(filter(None, kept)), texts=2)
 
 
-def write_comparison(runs: Sequence[Run], out: Path, first: Sequence[Grid] = ()) -> list[Path]:
-    """Write ``compare.html``, its figures and the table of all numbers.
+def _settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """A line per setting. Where a block follows from another setting, such as packet_len, only the latter is named."""
+    flat = [dict(_flat(config)) for config in configs]
+    names = dict.fromkeys(name for settings in flat for name in settings)
+    lines = {name: ("setting", name, *(settings.get(name, _DASH) for settings in flat)) for name in names}
+    return [
+        line
+        for name, line in lines.items()
+        if "." not in name or lines.get(name.rpartition(".")[2], ("", ""))[2:] != line[2:]
+    ]
 
-    :param first: tables that are placed before the table of all numbers
+
+def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{above}{key}.")
+        else:
+            yield above + key, str(value)
+
+
+def write_comparison(
+    runs: Sequence[Run], out: Path, first: Sequence[Grid] = (), *, pictures: bool = False
+) -> list[Path]:
+    """Write ``compare.html``, which has its figures in it, and the table of all numbers.
+
+    :param first: tables that are placed before that of what differs
+    :param pictures: write the figures as PNG and SVG too
     :return: the files written, the page first
     :raises ConfigError: when they cannot be written
     """
+    title = " · ".join(run.label for run in runs)
+    with drawing(out, pictures) as drawn:
+        sections = [
+            Section(sentences=[f"{run.label}: {lead_of(run)}" for run in runs], grids=[*first, compare_grid(runs)]),
+            Section(pictures=_draw(runs, drawn)),
+        ]
+        return render_page(
+            out / COMPARISON_FILE, title, f"{len(runs)} runs side by side", sections, write_summary(runs, out)
+        )
+
+
+def _draw(runs: Sequence[Run], out: Path) -> list[Picture]:
     messages = {run.label: run.messages() for run in runs}
     panels: dict[str, dict[str, Messages]] = {}
     for label, topics in messages.items():
@@ -97,7 +136,7 @@ def write_comparison(runs: Sequence[Run], out: Path, first: Sequence[Grid] = ())
         if topic.topic == name
     }
     deliveries = {label: Deliveries.of(topics) for label, topics in messages.items()}
-    pictures = [
+    return [
         save(latency_figure(latencies(runs)), out, "latency", "End-to-end latency"),
         save(ledger_figure(ledgers), out, "ledger", "Where every sent message went; in brackets how many were sent"),
         save(delivery_figure(deliveries, duration), out, "delivery", "PDR and goodput over time, all topics together"),
@@ -108,9 +147,3 @@ def write_comparison(runs: Sequence[Run], out: Path, first: Sequence[Grid] = ())
             "Age of the newest message delivered, per topic",
         ),
     ]
-    title = " · ".join(run.label for run in runs)
-    sections = [
-        Section(sentences=[f"{run.label}: {lead_of(run)}" for run in runs], grids=[*first, compare_grid(runs)]),
-        Section(pictures=pictures),
-    ]
-    return write_page(out / COMPARISON_FILE, title, f"{len(runs)} runs side by side", sections, runs)

@@ -7,33 +7,37 @@ left out.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from gr_ros2.link.lateness import LATE_S
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow, arrived, row_order
+from gr_ros2.link.ledger_rows import ROWS, LedgerRow, row_order
 from gr_ros2.record.result import Result, air_uses
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.table import milliseconds
 
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
-_TREND = 1.5
-"""A latency that changes by less than this factor from the first to the last deliveries counts as unchanged."""
+_BEHIND = 0.01
+"""A link falls behind if its latency grows by more than this share of the run. Otherwise its queues just fluctuate."""
+_UNSEEN = 0.0005
+"""Smaller shares of the air are not named."""
+_CHANNELS = 4
+"""Most senders that are named with the use of their channels."""
 
 
 def explanation(result: Result, trace: Trace) -> list[str]:
-    """Sentences about the messages, the capacity of the link, the packets, the latency and the computer's lateness."""
+    """Sentences about the computer's lateness, the messages, the capacity of the link, the packets and the latency."""
     packets = trace.packets()
     return [
+        *lateness_lines(result),
         *_outcome(result),
+        *air_lines(result),
         *_capacity(result, trace, packets),
         *_packets(result, packets),
         *_in_flight(trace, packets),
-        *_trend(trace),
-        *repair_lines(result),
-        *_lateness(result),
+        *_trend(result, trace),
     ]
 
 
@@ -45,15 +49,16 @@ def _outcome(result: Result) -> Iterator[str]:
     if not sent:
         yield "No message was sent."
         return
-    parts = [
-        f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {ROWS[row].words if row in ROWS else row.replace('_', ' ')}"
-        for row in dict.fromkeys([LedgerRow.DELIVERED, *row_order([ledger])])
-    ]
+    words = {row: ROWS[row].words if row in ROWS else row.replace("_", " ") for row in row_order([ledger])}
+    words = {LedgerRow.DELIVERED.value: "delivered", **words}
+    if LedgerRow.REPAIRED in words:
+        words[LedgerRow.DELIVERED.value] = "delivered at the first try"
+    parts = [f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {what}" for row, what in words.items()]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
 
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
-    """Compare the packet rate that all messages would have needed with the capacity of the link."""
+    """Whether all messages, cut and packed as those that were sent, would have needed more air than there is."""
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
@@ -61,15 +66,9 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
         (m.row != LedgerRow.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages()
     )
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
-    channels = result.phy.get("channels", 1)
-    share = needed * airtime / result.duration_s / channels
-    each = "" if channels == 1 else f" on its {channels} channels"
-    yield (
-        f"A packet takes {milliseconds(airtime)} ms of air, so the link carries at most {channels / airtime:,.1f} "
-        f"packets/s{each}. "
-        f"All messages sent, cut and packed as they were, come to {needed / result.duration_s:,.1f} packets/s: "
-        + (f"{share:.1f} times what the link has." if share > 1 else f"{_percent(share)} of what the link has.")
-    )
+    share = needed * airtime / result.duration_s / result.phy.get("channels", 1)
+    if share > 1:
+        yield f"The messages do not fit: all of them would have needed {share:.1f} times the air that there is."
 
 
 def _packets(result: Result, packets: Packets) -> Iterator[str]:
@@ -79,21 +78,14 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     here = np.flatnonzero(~np.isnan(t_received))
     came = len(here)
     passed = int(here[-1]) + 1 if came else 0  # later packets may still be on their way
-    what = "packets with new messages" if air_uses(result) else "packets"
-    text = (
-        f"Of {len(t_sent):,} {what} that left the source, {came:,} ({_percent(came / len(t_sent))}) reached the "
-        f"sink intact, {passed - came:,} were lost on the way and {len(t_sent) - passed:,} had not come out of the "
-        "PHY by the end"
-    )
-    if result.phy.get("airtime_s") and result.config.get("time") != "unthrottled" and came:
-        span = max(result.duration_s, float(np.nanmax(t_received)))
-        used = (
-            came * (result.phy.get("airtime_mean_s") or result.phy["airtime_s"]) / span / result.phy.get("channels", 1)
-        )
-        text += f"; those that arrived took {_percent(used)} of the air"
+    text = f"Of {len(t_sent):,} packets with messages, {came:,} ({_percent(came / len(t_sent))}) arrived"
+    if passed - came:
+        text += f", {passed - came:,} were lost on the way"
+    if len(t_sent) - passed:
+        text += f", {len(t_sent) - passed:,} had not come out of the PHY by the end"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
-    if whole and came < passed:
+    if wanted > 1.05 and came < passed:
         unrepaired = " without repair" if air_uses(result) else ""
         yield (
             f"A message had {wanted:.1f} fragments on average and needs every one: of {whole:,} messages that left "
@@ -102,26 +94,44 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
         )
 
 
-def repair_lines(result: Result) -> Iterator[str]:
-    """What repair did, and what the air was used for."""
-    uses = air_uses(result)
-    if not uses:
+def air_lines(result: Result) -> Iterator[str]:
+    """How busy the air was, and with what."""
+    senders: dict[str, dict[str, float]] = result.phy.get("airtime_of_senders_s") or {}
+    span = result.phy.get("air_span_s")
+    if not senders or not span or result.config.get("time") == "unthrottled":
         return
-    ledger: Counter[str] = Counter()
-    for topic in result.topics:
-        ledger.update(topic.ledger)
-    repaired, given_up = ledger[LedgerRow.REPAIRED], ledger[LedgerRow.GIVEN_UP]
-    if repaired or given_up:
-        yield (
-            f"Repair recovered {repaired:,} messages ({_percent(repaired / ledger.total())} of those sent) that had "
-            f"lost a packet; {given_up:,} were given up."
+    spent: Counter[str] = Counter()
+    for kinds in senders.values():
+        spent.update(kinds)
+    shared = result.config.get("duplex") == "half" or len(senders) == 1
+    if shared:
+        yield f"The air was busy {_busy(spent, span)}."
+    elif len(senders) <= _CHANNELS:
+        sending = {str(topic.src_id) for topic in result.topics}
+        back = [src_id for src_id in senders if src_id not in sending]
+        names = {src_id: f"the channel back from receiver {number}" for number, src_id in enumerate(back, 1)}
+        if len(back) == 1:
+            names[back[0]] = "the channel back"
+        each = (
+            f"{names.get(src_id, f'the channel of robot {src_id}')} {_busy(kinds, span)}"
+            for src_id, kinds in senders.items()
         )
+        yield f"How busy the air was: {'; '.join(each)}."
     else:
-        yield "No message needed repair."
-    spent = ", ".join(f"{use.packets:,} for {_KINDS[use.kind]} ({_percent(use.share)})" for use in uses)
-    delivered = arrived(ledger)
-    per_message = f"; {result.packets['sent'] / delivered:.2f} packets for each message delivered" if delivered else ""
-    yield f"Packets sent, and their share of the air used: {spent}{per_message}."
+        yield f"The air was busy, on an average robot's channel, {_busy(spent, span * len(senders))}."
+
+
+def _busy(kinds: Mapping[str, float], span: float) -> str:
+    """Share of the time, with its parts where there are several."""
+    share = sum(kinds.values()) / span
+    text = f"{_percent(min(share, 1.0))} of the time"
+    by_share = sorted(kinds.items(), key=lambda kind: -kind[1])
+    parts = [
+        (_KINDS.get(kind, kind), part) for kind, spent in by_share if (part := spent / span) > _UNSEEN or part == share
+    ]
+    if len(parts) > 1:
+        return f"{text} ({', '.join(f'{name} {_percent(part)}' for name, part in parts)})"
+    return f"{text}, with {parts[0][0]}" if parts else text
 
 
 def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
@@ -141,15 +151,17 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
                 under_way += 1
             else:
                 gone += 1
-    if waiting + under_way + gone:
-        yield (
-            f"Of the messages in flight at the end, {gone:,} had left the source whole and waited in the PHY or on the "
-            f"air, {under_way:,} had left in part, and {waiting:,} had not left the source's queue."
-        )
+    where = {
+        "had left the source whole and waited in the PHY or on the air": gone,
+        "had left in part": under_way,
+        "had not left the source's queue": waiting,
+    }
+    if parts := [f"{count:,} {what}" for what, count in where.items() if count]:
+        yield f"Of the messages in flight at the end, {', '.join(parts)}."
 
 
-def _trend(trace: Trace) -> Iterator[str]:
-    """Whether the latency increased during the run."""
+def _trend(result: Result, trace: Trace) -> Iterator[str]:
+    """Whether the link fell behind."""
     t_sent = np.concatenate([m.t_sent[m.delivered] for m in trace.messages()] or [np.empty(0)])
     t_delivered = np.concatenate([m.t_delivered[m.delivered] for m in trace.messages()] or [np.empty(0)])
     if len(t_sent) < 10:
@@ -157,28 +169,25 @@ def _trend(trace: Trace) -> Iterator[str]:
     latency = (t_delivered - t_sent)[np.argsort(t_delivered, kind="stable")]
     tenth = len(latency) // 10
     first, last = float(np.median(latency[:tenth])), float(np.median(latency[-tenth:]))
-    text = (
-        f"The median latency was {_seconds(first)} among the first tenth of the deliveries and {_seconds(last)} among "
-        "the last: "
-    )
-    if first > 0 and last / first > _TREND:
-        yield text + "messages waited longer and longer."
-    elif last > 0 and first / last > _TREND:
-        yield text + "the wait became shorter."
-    else:
-        yield text + "it stayed the same."
+    if last - first > _BEHIND * result.duration_s:
+        yield (
+            f"The link fell behind: the median latency was {_seconds(first)} among the first tenth of the deliveries "
+            f"and {_seconds(last)} among the last."
+        )
 
 
-def _lateness(result: Result) -> Iterator[str]:
-    """Whether the computer kept up with the run's clock."""
+def lateness_lines(result: Result) -> Iterator[str]:
+    """Whether the computer kept up with the run's clock: one sentence where it did not."""
     late = result.lateness
     if late is None or not late.moments:
         return
     part, worst = max(late.worst_s.items(), key=lambda item: item[1])
     others = ", ".join(f"{name} {_seconds(value)}" for name, value in late.worst_s.items() if name != part)
+    times = "once" if late.moments == 1 else f"{late.moments:,} times"
     text = (
-        f"The computer was up to {_seconds(worst)} late ({part}{'; ' + others if others else ''}), {late.moments:,} "
-        f"times by {milliseconds(LATE_S)} ms or more, {_percent(min(late.share, 1.0))} of the run"
+        f"The computer did not keep up with the clock: it was up to {_seconds(worst)} late "
+        f"({part}{'; ' + others if others else ''}), {times} by {milliseconds(LATE_S)} ms or more, "
+        f"{_percent(min(late.share, 1.0))} of the run"
     )
     if late.lost:
         text += (

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyarrow as pa
@@ -29,7 +31,8 @@ from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers
 from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2.report.explain import explanation
 from gr_ros2.report.figures import air_figure, latency_figure, ledger_figure, path_figure, save_figure
-from gr_ros2.report.table import PAPER, Grid, air_grid, ledger_grid, notes, paper_grid, summary_grid
+from gr_ros2.report.snr_map import map_of
+from gr_ros2.report.table import PAPER, Grid, air_grid, ledger_grid, notes, paper_grid, paper_results, summary_grid
 from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
 
 REPORT_FILE = "report.html"
@@ -106,30 +109,42 @@ def read_runs(directories: Iterable[str | Path]) -> list[Run]:
     return runs
 
 
-def write_report(runs: Sequence[Run], out: Path) -> list[Path]:
-    """Write ``report.html``, its figures and the table of all numbers.
+def write_report(runs: Sequence[Run], out: Path, *, pictures: bool = False) -> list[Path]:
+    """Write ``report.html``, which has everything in it; of several runs also the table of all numbers.
 
     :param out: folder, made if missing; it may be the folder of a single run itself
+    :param pictures: write the figures as PNG and SVG and the table of all numbers beside it
     :return: the files written, the report first
     :raises ConfigError: when they cannot be written
     """
     several = len(runs) > 1
+    with drawing(out, pictures) as drawn:
+        return _write_report(runs, out, drawn, several or pictures)
+
+
+def _write_report(runs: Sequence[Run], out: Path, drawn: Path, tables: bool) -> list[Path]:
+    several = len(runs) > 1
     results = [replace(run.result, scenario=run.label) for run in runs]
-    joint = [save(latency_figure(latencies(runs)), out, "latency", _LATENCY)] if several else []
-    sections = [Section(grids=[paper_grid(results), summary_grid(results)], pictures=joint)]
-    sections += [_run_section(run, out, f"{stem(run.label)}_" if several else "", several) for run in runs]
+    joint = [save(latency_figure(latencies(runs)), drawn, "latency", _LATENCY)] if several else []
+    papers = [paper_grid(results)] if paper_results([run.result for run in runs]) else []
+    sections = [Section(grids=[*papers, summary_grid(results)], pictures=joint)]
+    sections += [_run_section(run, drawn, f"{stem(run.label)}_" if several else "", several) for run in runs]
     title = ", ".join(run.label for run in runs)
     lead = f"{len(runs)} runs" if several else lead_of(runs[0])
-    return write_page(out / REPORT_FILE, title, lead, sections, runs)
+    return render_page(out / REPORT_FILE, title, lead, sections, write_summary(runs, out) if tables else [])
 
 
-def write_page(path: Path, title: str, lead: str, sections: Sequence[Section], runs: Sequence[Run]) -> list[Path]:
-    """Write an HTML page, and the table of all numbers in the same folder.
+@contextmanager
+def drawing(out: Path, pictures: bool) -> Iterator[Path]:
+    """The folder for the figures of a page: the page's own, or one that is removed when the page is written.
 
-    :return: the files written, the page first
-    :raises ConfigError: when they cannot be written
+    :param pictures: whether the figures stay
     """
-    return render_page(path, title, lead, sections, _write_summary(runs, path.parent))
+    if pictures:
+        yield out
+        return
+    with TemporaryDirectory(prefix="gr-ros2-") as folder:
+        yield Path(folder)
 
 
 def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], tables: Sequence[Path]) -> list[Path]:
@@ -147,11 +162,11 @@ def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], 
         sections=sections,
         paper=PAPER,
         version=__version__,
-        files=f"Beside it: {', '.join(table.name for table in tables)} with every number.",
+        files=f"Beside it: {', '.join(table.name for table in tables)} with every number." if tables else "",
     )
     write_whole(path, text, write_text)
     pictures = [file for section in sections for picture in section.pictures for file in (picture.png, picture.svg)]
-    return [path, *tables, *pictures]
+    return [path, *tables, *(file for file in pictures if file.parent == path.parent)]
 
 
 def save(figure: Figure, out: Path, name: str, caption: str, wide: bool = False) -> Picture:
@@ -194,7 +209,7 @@ def lead_of(run: Run) -> str:
     return " · ".join(parts)
 
 
-_LATENCY = "Figure 6 of the paper: end-to-end latency, share of the delivered messages that took at most so long"
+_LATENCY = "End-to-end latency: share of the delivered messages that took at most so long"
 
 
 def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
@@ -223,8 +238,11 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     for place, path in enumerate(trace.paths()):
         figure = path_figure(path.sent, path.received, path.topic, path.published_as)
         stem = "path" if not place else f"path{path.topic.replace('/', '_')}"
-        caption = f"Figure 7 of the paper: the path of {path.topic}, sent and received"
+        caption = f"The path of {path.topic}, sent and received"
         pictures.append(save(figure, out, prefix + stem, caption))
+    if (world := map_of(result)) is not None:
+        caption = "SNR over the world for a receiver that stands still; white: obstacles; lines: where the robots drove"
+        pictures.append(save(world, out, f"{prefix}snr-map", caption))
     pictures.append(save(latency_figure(latencies([run])), out, f"{prefix}latency", _LATENCY))
     pictures.append(
         save(
@@ -276,7 +294,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     return pictures
 
 
-def _write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
+def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
     """One line per run and topic with every number of ``result.json``, as CSV and Parquet."""
     lines: list[dict[str, Any]] = []
     rows = sorted({row for run in runs for topic in run.result.topics for row in topic.ledger})

@@ -37,6 +37,9 @@ class Grid:
 PAPER_TABLE_6 = {"ofdm": ("OFDM", 38.0, 1328, 12, 0.01, 228.6), "direct": ("Direct", 15.0, 452, 452, 1.00, 21767.9)}
 """The paper's table 6 by PHY: config, duration [s], sent, received, PDR, goodput [B/s]."""
 
+PAPER_SCENARIOS = ("paper-ofdm", "paper-ofdm-paced", "paper-direct")
+"""Scenarios that repeat the paper's experiments."""
+
 _TABLE_6 = ("Duration [s]", "Sent", "Recv", "PDR", "Goodput [B/s]")
 
 
@@ -82,8 +85,9 @@ def ledger_grid(result: Result) -> Grid:
     found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
     first = [LedgerRow.DELIVERED, *(row for row in (LedgerRow.REPAIRED,) if row in found)]
     rows = list(dict.fromkeys([*first, *sorted(found)]))
+    headings = ["first try" if row == LedgerRow.DELIVERED and LedgerRow.REPAIRED in found else row for row in rows]
     lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
-    return Grid("Where every sent message went", ("Topic", "sent", *rows), (tuple(lines),))
+    return Grid("Where every sent message went", ("Topic", "sent", *headings), (tuple(lines),))
 
 
 def air_grid(result: Result) -> Grid | None:
@@ -112,6 +116,7 @@ def as_table(grid: Grid) -> Table:
     """A grid for the terminal."""
     # The table is narrow, so that ten columns fit a terminal of 80 characters.
     table = Table(box=box.SIMPLE_HEAD, title=grid.title, title_justify="left", pad_edge=False, collapse_padding=True)
+    table.min_width = len(grid.title)  # a title is wrapped to the width of its table
     for place, heading in enumerate(grid.headings):
         if place < grid.texts:
             table.add_column(escape(heading), no_wrap=place == 0, overflow="fold")
@@ -150,9 +155,27 @@ def notes(result: Result) -> list[str]:
     return lines
 
 
+def packets_line(result: Result) -> str:
+    """The packets of a run. What did not happen is left out."""
+    counts = [
+        f"{count:,} {name.replace('_', ' ')}"
+        for name, count in result.packets.items()
+        if name in ("sent", "received") or (count and not name.startswith("air_"))
+    ]
+    return f"packets: {', '.join(counts)}"
+
+
+def paper_results(results: Sequence[Result]) -> list[Result]:
+    """Those of the paper's own scenarios."""
+    return [result for result in results if result.scenario in PAPER_SCENARIOS]
+
+
 def _path_note(topic: TopicResult) -> str:
     rms = number(topic.rms_error_m, "{:.3f} m")
-    return f"{topic.topic}: path error {topic.path_error_m:.3f} m along the path, RMS {rms} at equal times"
+    return (
+        f"{topic.topic}: the received path runs {topic.path_error_m:.3f} m beside the sent path; at equal times the "
+        f"positions are {rms} apart (RMS)"
+    )
 
 
 def _table_6(result: Result, topic: TopicResult) -> tuple[str, ...]:

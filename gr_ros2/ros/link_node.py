@@ -23,6 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.systemd import notify
 from gr_ros2.radio.config import load_link
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.waiting import Waiting
@@ -178,9 +179,11 @@ def main(args: Sequence[str] | None = None) -> None:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         waiting = Waiting(node.link.source)
+        notify("READY=1")
         while not (asked or node.link.finished):
             executor.spin_once(timeout_sec=_LOOK_S)
             node.link.check()
+            notify("WATCHDOG=1")
             if (waits_for := waiting.look()) is not None:
                 node.get_logger().info(waits_for)
     except ExternalShutdownException:

@@ -16,11 +16,11 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import LiveEnd, Start, make_endpoint, own_settings
+from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.rate import Rung
+from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
@@ -50,14 +50,14 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
 
 
 def live_ends(
-    ways: Sequence[Scenario], registry: Registry, *, any_length: bool, ladder: Sequence[Rung] = ()
+    ways: Sequence[Scenario], registry: Registry, *, any_length: bool, mcs_table: Sequence[Mcs] = ()
 ) -> list[LiveEnd]:
     """The ends of a link that speaks version 1, see :func:`gr_ros2.run.robots.halves_of_robots`.
 
     :param any_length: whether the PHY carries shorter packets in less time
-    :param ladder: the rungs of an adaptive rate; () for a fixed rate
+    :param mcs_table: the rates of an adaptive rate; () for a fixed rate
     """
-    start = start_of_run(ways, any_length=any_length, ladder=ladder)
+    start = start_of_run(ways, any_length=any_length, mcs_table=mcs_table)
     return [
         LiveEnd(partial(_endpoint, registry, halves, start, random.Random(ways[0].seed)))
         for halves in halves_of_robots(ways)
@@ -67,7 +67,7 @@ def live_ends(
 def _endpoint(
     registry: Registry,
     halves: Halves,
-    start: Start,
+    start: EndpointSetup,
     rng: random.Random,
     observer: Callable[[SenderEvent], None],
 ) -> Endpoint:
@@ -127,6 +127,7 @@ class Direction:
             self.sink,
             channel=scenario.channel,
             throttled=scenario.time != "unthrottled",
+            rule=scenario.airtime.rule,
             instrumented=instrumented,
             further=list(zip(scenario.receivers, sinks, strict=True)),
         )
@@ -190,7 +191,7 @@ def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
 class ReportDirection:
     """The way back for one receiver's reports alone, ready to start. It carries no topics.
 
-    :param there: the direction of the messages
+    :param forward: the direction of the messages
     :param ends: the sender, which hears the reports, and the receiver, which sends them
     :param src_id: of the receiver
     :param channel: between the receiver and the sender
@@ -200,7 +201,7 @@ class ReportDirection:
 
     def __init__(
         self,
-        there: Direction,
+        forward: Direction,
         phy: Phy,
         ends: tuple[LiveEnd, LiveEnd],
         src_id: int,
@@ -211,17 +212,18 @@ class ReportDirection:
         stack: ExitStack,
         instrumented: bool = False,
     ) -> None:
-        common: dict[str, Any] = {"version": 1, "packet_len": there.scenario.packet_len, "observer": observer}
-        source = RosSource(Registry.empty(), middleware=there.output, end=ends[1], robot_id=src_id, **common)
+        common: dict[str, Any] = {"version": 1, "packet_len": forward.scenario.packet_len, "observer": observer}
+        source = RosSource(Registry.empty(), middleware=forward.output, end=ends[1], robot_id=src_id, **common)
         stack.callback(source.close)
-        sink = RosSink(Registry.empty(), middleware=there.input, end=ends[0], **common)
+        sink = RosSink(Registry.empty(), middleware=forward.input, end=ends[0], **common)
         stack.callback(sink.close)
         self.link = LoopbackLink(
             phy,
             source,
             sink,
             channel=channel,
-            throttled=there.scenario.time != "unthrottled",
+            throttled=forward.scenario.time != "unthrottled",
+            rule=forward.scenario.airtime.rule,
             delay_s=delay_s,
             instrumented=instrumented,
         )

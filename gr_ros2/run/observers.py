@@ -16,6 +16,7 @@ from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
 from gr_ros2.record.ledger import Ledger
@@ -48,9 +49,15 @@ class LiveLink(Protocol):
     def channel(self) -> ChannelConfig: ...
     @property
     def snr_db(self) -> float | None: ...
+    @property
+    def changeable(self) -> bool: ...
+    def gate_lateness(self) -> Lateness | None: ...
     def counts(self) -> LinkCounts: ...
     def samples(self) -> Samples | None: ...
     def symbols(self) -> Samples | None: ...
+    @property
+    def transmits(self) -> bool: ...
+    def transmit(self, *, on: bool) -> None: ...
     def set_snr_db(self, snr_db: float | None) -> None: ...
     def set_frequency_offset(self, frequency_offset: float) -> None: ...
     def set_packet_loss(self, probability: float) -> None: ...
@@ -67,6 +74,8 @@ class LiveRun:
     :param links: every direction's flowgraph
     :param ledger: the state of every message sent so far; None where only one end of the link is in this process
     :param clock: s, the clock of the run's events
+    :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
+        where the names of ``topics`` are shown
     """
 
     name: str
@@ -78,6 +87,7 @@ class LiveRun:
     links: Sequence[LiveLink]
     ledger: Ledger | None
     clock: Callable[[], float] = time.monotonic
+    received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
 
 
 class RunObserver(LinkObserver, Protocol):

@@ -19,12 +19,18 @@ DELIVERED_BAG = "delivered"
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a run: s since its start, s it takes (0 = until the bag ends), messages sent and delivered."""
+    """Progress of a run.
+
+    :param elapsed_s: s since its start
+    :param duration_s: s that it takes, 0 = until the bag ends
+    :param domains: ROS domains of the first source's and the first sink's graph; None where others cannot join it
+    """
 
     elapsed_s: float
     duration_s: float
     sent: int
     delivered: int
+    domains: tuple[int | None, int | None] = (None, None)
 
 
 @dataclass

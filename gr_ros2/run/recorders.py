@@ -6,6 +6,7 @@ Invariant: each recorder gets the events of all senders, and those of its own re
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -106,9 +107,20 @@ class FurtherRecorders:
         """See :meth:`gr_ros2.record.ledger.Ledger.unresolved`."""
         return sum(recorder.ledger.unresolved() for recorder in self._recorders)
 
-    def finish(self, duration_s: float, t_end: float, drained: bool) -> tuple[ReceiverResult, ...]:
-        """See :meth:`gr_ros2.record.recorder.Recorder.finish`."""
+    def finish(
+        self, duration_s: float, t_end: float, drained: bool, numbers: Callable[[Recorder], dict[str, Any]]
+    ) -> tuple[ReceiverResult, ...]:
+        """See :meth:`gr_ros2.record.recorder.Recorder.finish`.
+
+        :param numbers: of the PHY, by the recorder of a receiver
+        """
         return tuple(
-            ReceiverResult(number, recorder.finish(duration_s, t_end, drained), name)
+            ReceiverResult(
+                number,
+                recorder.finish(duration_s, t_end, drained),
+                name,
+                packets=recorder.ledger.packets(),
+                phy=numbers(recorder),
+            )
             for number, (recorder, name) in enumerate(zip(self._recorders, self._names, strict=True), 2)
         )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import ChannelConfig, replaced
+from gr_ros2.settings.config import ScenarioChannel, replaced
 
 
 def repetitions(scenario: Scenario) -> Iterator[Scenario]:
@@ -25,5 +25,5 @@ def _reseeded(scenario: Scenario, k: int) -> Scenario:
     return replace(scenario, seed=seed, sim=sim, channel=channel, back=back, reports=reports, receivers=receivers)
 
 
-def _reseeded_channel(channel: ChannelConfig, k: int) -> ChannelConfig:
+def _reseeded_channel(channel: ScenarioChannel, k: int) -> ScenarioChannel:
     return replaced(channel, seed=channel.seed + k)

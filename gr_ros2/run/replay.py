@@ -69,24 +69,34 @@ def replay(
         raise BagError(f"{target}: exists already; choose another name or remove it")
     contents = bag_contents(source)
     recorded = contents.topics
-    scenario = replace(
-        scenario, source=f"bag:{source}", bag_speed=1.0, time=scenario.time if scenario.simulated else "samples"
+    scenario, registry = carrying(
+        replace(scenario, time=scenario.time if scenario.simulated else "samples"), contents, topics
     )
-    registry = scenario.load_registry()
-    names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in recorded}
-    if topics or not names:
-        scenario, registry = _made_for(scenario, registry, contents, topics)
-        names = source_names(scenario, registry)
-    else:
-        carried = tuple(registry[topic_id].name for topic_id in names.values())
-        scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
-    _check_types(names, registry, recorded, source)
+    names = source_names(scenario, registry)
     src_id = scenario.ros_source.src_id()
     with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
         bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
         outcome = run_simulated(scenario, None, on_progress, registry=registry, bag=bag)
     left_out = sorted({*recorded, *contents.left_out} - set(names))
     return Replayed(outcome, tuple(names), tuple(left_out), tuple(contents.remarks))
+
+
+def carrying(scenario: Scenario, contents: BagContents, topics: Sequence[str]) -> tuple[Scenario, Registry]:
+    """The scenario with a recording as its source, and the registry of what it carries, see :func:`replay`.
+
+    :raises ConfigError: see :func:`replay`
+    """
+    scenario = replace(scenario, source=f"bag:{contents.path}", bag_speed=1.0)
+    registry = scenario.load_registry()
+    names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in contents.topics}
+    if topics or not names:
+        scenario, registry = _made_for(scenario, registry, contents, topics)
+        names = source_names(scenario, registry)
+    else:
+        carried = tuple(registry[topic_id].name for topic_id in names.values())
+        scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
+    _check_types(names, registry, contents.topics, contents.path)
+    return scenario, registry
 
 
 def _made_for(
@@ -116,11 +126,11 @@ def _made_for(
         by_name = {name.lstrip("/"): value for name, value in given.items()}
         return {name: by_name[row.lstrip("/")] for name, row in names.items() if name in rows and row in by_name}
 
-    there, back = scenario.ros_source, scenario.ros_sink
+    sending, receiving = scenario.ros_source, scenario.ros_sink
     scenario = replace(
         scenario,
-        ros_source=replaced(there, topics=(), topic_options=options(there.topic_options)),
-        ros_sink=replaced(back, topic_options=options(back.topic_options)),
+        ros_source=replaced(sending, topics=(), topic_options=options(sending.topic_options)),
+        ros_sink=replaced(receiving, topic_options=options(receiving.topic_options)),
     )
     return scenario, Registry.from_rows(rows)
 

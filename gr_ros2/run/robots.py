@@ -7,39 +7,57 @@ order of :meth:`Scenario.directions`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gr_ros2.gr.ends import Start
-from gr_ros2.link.rate import Rung
-from gr_ros2.medium.base import Path, Paths, PathsAt
-from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.ends import EndpointSetup
+from gr_ros2.link.airtime_limit import sustained
+from gr_ros2.link.rate import Mcs
+from gr_ros2.mac import access_of
+from gr_ros2.medium.base import FixedPaths, Path, Surroundings
+from gr_ros2.medium.gains import paths_between
+from gr_ros2.medium.positions import Motion, Positions
+from gr_ros2.run.load import source_names
+from gr_ros2.run.scenario import RobotConfig, Scenario
+from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.recorded_motion import RecordedMotion
+from gr_ros2.sim.world import World
 from gr_ros2.wire import BROADCAST
 
-THERMAL_DBM_HZ = -174.0
-"""Noise of a resistor at 290 K, dBm in a band of 1 Hz."""
-LEAST_DB, MOST_DB = -30.0, 100.0
-"""SNRs below the first are not heard and do not disturb; above the second nothing gets better."""
-_SEEDS_APART = 7919
 Halves = tuple[SourceConfig | None, SinkConfig | None]
 """The settings of a robot's sending half and of its receiving half; None for a half that it does not have."""
 
 
 def start_of_run(
-    ways: Sequence[Scenario], *, any_length: bool, ladder: Sequence[Rung] = (), half_duplex: bool = False
-) -> Start:
+    ways: Sequence[Scenario],
+    *,
+    any_length: bool,
+    mcs_table: Sequence[Mcs] = (),
+    half_duplex: bool = False,
+    airtime_s: float = 0.0,
+) -> EndpointSetup:
     """The start of every robot of a run.
 
     :param ways: one scenario per direction
     :param any_length: whether the PHY carries shorter packets in less time
-    :param ladder: see :attr:`gr_ros2.phy.Phy.ladder`
+    :param mcs_table: see :attr:`gr_ros2.phy.Phy.mcs_table`
     :param half_duplex: whether all robots use one channel
+    :param airtime_s: of the longest packet
     """
     answered = _answered(ways)
-    return Start(ways[0].seed + 1, reports=answered, half_duplex=half_duplex, any_length=any_length, ladder=ladder)
+    rule = ways[0].airtime.rule
+    return EndpointSetup(
+        ways[0].seed + 1,
+        reports=answered,
+        half_duplex=half_duplex,
+        any_length=any_length,
+        mcs_table=mcs_table,
+        access=access_of(ways[0].medium, airtime_s, ways[0].seed),
+        airtime_share=1.0 if rule is None else sustained(rule),
+    )
 
 
 def halves_of_robots(ways: Sequence[Scenario]) -> list[Halves]:
@@ -47,74 +65,97 @@ def halves_of_robots(ways: Sequence[Scenario]) -> list[Halves]:
 
     :param ways: one scenario per direction
     """
-    there = ways[0]
+    forward = ways[0]
     if len(ways) > 1:
         sinks = [way.ros_sink for way in ways]
         if len(ways) == 2:
             sinks.reverse()  # each block is configured with the direction that it belongs to
         return [(way.ros_source, sink) for way, sink in zip(ways, sinks, strict=True)]
-    halves: list[Halves] = [(there.ros_source, None)]
-    own_id = there.ros_source.src_id()
-    for number in range(1 + len(there.receivers)):
-        sink = there.ros_sink
+    halves: list[Halves] = [(forward.ros_source, None)]
+    own_id = forward.ros_source.src_id()
+    for number in range(1 + len(forward.receivers)):
+        sink = forward.ros_sink
         if _answered(ways) and sink.robot_id in (AUTO, own_id):
             sink = replace(sink, robot_id=_free_id(own_id, number))
         halves.append((None, sink))
     return halves
 
 
-def paths_at(scenario: Scenario, sample_rate: float) -> PathsAt:
-    """For every robot the paths to those that can hear it, as a function of time. No gain changes yet.
+def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
+    """Who hears whom among the robots of a scenario.
 
     :param sample_rate: samples/s, which is the bandwidth of the noise
+    :raises ConfigError: where levels follow from positions that nothing tells
     """
     fixed = _between(scenario, sample_rate) if scenario.robots else _directed(scenario)
-    return lambda _: fixed
+    return _placed(scenario, fixed, sample_rate) if scenario.channel.from_positions else FixedPaths(fixed)
 
 
-def _between(scenario: Scenario, sample_rate: float) -> Paths:
+def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: float) -> Positions:
+    """The robots of a scenario where they are."""
+    channel = scenario.channel
+    robots = scenario.robots or (RobotConfig(),) * len(paths)
+    motion, world = _motion(scenario, len(paths))
+    return Positions(
+        channel,
+        motion,
+        sample_rate,
+        *zip(*(channel.levels(robot) for robot in robots), strict=True),
+        paths=paths,
+        world=world,
+    )
+
+
+def _motion(scenario: Scenario, count: int) -> tuple[Motion, World | None]:
+    """Where the robots of a scenario are, and among which obstacles."""
+    named: list[str | None] = [way.ros_source.namespace for way in scenario.directions()]
+    named += [None] * (count - len(named))
+    if scenario.bag_path is not None:
+        topics = source_names(scenario, scenario.load_registry())
+        recorded = RecordedMotion(scenario.bag_path, named, speed=scenario.bag_speed or 1.0, topics=topics)
+        return recorded.at, None
+    fleet = Fleet.of(scenario.sim)
+    free = [f"/robot_{number}" for number in fleet.robot_ids if f"/robot_{number}" not in named]
+    places = [name or (free.pop(0) if free else "/") for name in named]
+    numbers = {f"/robot_{number}": number for number in fleet.robot_ids}
+    for name in places:
+        if name not in numbers:
+            raise ConfigError(
+                f"channel.from = 'positions': {name} is none of the {len(numbers)} simulated robots, so nobody knows "
+                f"where it is; set sim.robots to {count} or more, and namespaces /robot_1, /robot_2, …"
+            )
+    ids = [numbers[name] for name in places]
+    return (lambda now: fleet.at(now, ids)), fleet.world
+
+
+def _between(scenario: Scenario, sample_rate: float) -> list[list[Path]]:
     """The paths between robots that all send and receive."""
-    paths: list[list[Path]] = []
-    for number, sender in enumerate(scenario.robots):
-        paths.append([])
-        for other, receiver in enumerate(scenario.robots):
-            snr_db = scenario.channel.snr_db
-            if scenario.gains_db is not None:
-                row = scenario.gains_db
-                gain_db = row[number][other] if isinstance(row, tuple) else row
-                noise_dbm = THERMAL_DBM_HZ + 10 * math.log10(sample_rate) + receiver.noise_figure_db
-                snr_db = None if gain_db is None else sender.tx_power_dbm + gain_db - noise_dbm
-                if snr_db is None or snr_db < LEAST_DB:
-                    continue
-            if other != number:
-                seed = scenario.channel.seed + _SEEDS_APART * (1 + number * BROADCAST + other)
-                snr_db = None if snr_db is None else min(snr_db, MOST_DB)
-                paths[-1].append(Path(other, replaced(scenario.channel, snr_db=snr_db, seed=seed)))
-    return paths
+    levels = [scenario.channel.levels(robot) for robot in scenario.robots]
+    return paths_between(scenario.channel, scenario.gains_db, levels, sample_rate)
 
 
-def _directed(scenario: Scenario) -> Paths:
+def _directed(scenario: Scenario) -> list[list[Path]]:
     """The paths of the short forms: one sender and its receivers, or two robots."""
     ways = scenario.directions()
     if len(ways) > 1:
         return [[Path(1 - number, way.channel)] for number, way in enumerate(ways)]
-    there = [Path(number, channel) for number, channel in enumerate((scenario.channel, *scenario.receivers), 1)]
+    forward = [Path(number, channel) for number, channel in enumerate((scenario.channel, *scenario.receivers), 1)]
     if scenario.reports is None:
-        return [there, *([] for _ in there)]
+        return [forward, *([] for _ in forward)]
     delay_s = scenario.reports.delay_s
-    return [there, *([Path(0, channel, delay_s)] for channel in scenario.report_channels())]
+    return [forward, *([Path(0, channel, delay_s)] for channel in scenario.report_channels())]
 
 
-def ears_of(scenario: Scenario, paths: Paths) -> list[list[int]]:
+def ears_of(scenario: Scenario, around: Surroundings) -> list[list[int]]:
     """For each recorder of a run the robots whose packets it counts: first that of the result, then those of further
     receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear."""
     ways = len(scenario.directions())
     if ways <= 2:
         return [list(range(ways)) for _ in range(1 + len(scenario.receivers))]
     heard: list[list[int]] = [[] for _ in range(ways)]
-    for number, hearers in enumerate(paths):
-        for path in hearers:
-            heard[path.receiver].append(number)
+    for number in range(ways):
+        for receiver in around.reached(number):
+            heard[receiver].append(number)
     return heard
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -21,13 +21,13 @@ from gr_ros2.core.guard import Guard, one_line
 from gr_ros2.gr.ends import LiveEnd
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers
-from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.record.lateness import lateness_result, modem_lateness
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
+from gr_ros2.run.domains import on_own_domains
 from gr_ros2.run.load import make_phys, recording
 from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
@@ -37,6 +37,7 @@ from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.robots import halves_of_robots
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulated_runner import run_simulated
+from gr_ros2.settings.config import robot_of
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -169,7 +170,8 @@ class _Run:
         # Only a run in real time needs GNU Radio.
         from gr_ros2.run.direction import Direction, ReportDirection, live_ends
 
-        self.scenario = scenario
+        self.config = dump(scenario)
+        self.scenario = scenario = on_own_domains(scenario, stack)
         self.registry = scenario.load_registry()
         ways = scenario.directions()
         phys = make_phys(ways, self.registry)
@@ -196,11 +198,11 @@ class _Run:
             live: list[LiveEnd] = []
             if scenario.version:
                 any_length = all(phy.any_length for phy in phys)
-                live = live_ends(ways, self.registry, any_length=any_length, ladder=self.phy.ladder)
+                live = live_ends(ways, self.registry, any_length=any_length, mcs_table=self.phy.mcs_table)
             ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
             further = [self.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
-            there = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
-            self.directions = [there]
+            forward = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
+            self.directions = [forward]
             if len(ways) > 1:
                 self.directions.append(Direction(ways[1], self.registry, phys[1], ends[1::-1], **common))
             self.links = [direction.link for direction in self.directions]
@@ -209,7 +211,7 @@ class _Run:
                 receivers = zip(live[1:], halves_of_robots(ways)[1:], scenario.report_channels(), strict=True)
                 for end, halves, channel in receivers:
                     pair, src_id = (live[0], end), robot_of(*halves)
-                    reporting = ReportDirection(there, self.phy, pair, src_id, channel=channel, **common)
+                    reporting = ReportDirection(forward, self.phy, pair, src_id, channel=channel, **common)
                     self.links.append(reporting.link)
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
@@ -286,6 +288,7 @@ class _Run:
             link.stop()
         self.run_observers.settle()
         self._check_recorders()
+        self._check_alone()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
@@ -294,15 +297,16 @@ class _Run:
             name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
         }
         trace = self.recorder.trace(begin, end, names)
+        numbers = partial(phy_numbers, self.phy, len(self.directions))
         result = Result(
             scenario=scenario.name,
             seed=scenario.seed,
             duration_s=played,
-            config=dump(scenario),
+            config=self.config,
             topics=topics,
-            receivers=self.further.finish(played, end, drained),
+            receivers=self.further.finish(played, end, drained, numbers),
             packets=self.recorder.ledger.packets(),
-            phy=phy_numbers(self.phy, len(self.directions), self.recorder),
+            phy=numbers(self.recorder),
             wall_s=time.monotonic() - wall,
             interrupted=self.interrupted,
             counters=self._counters(),
@@ -372,6 +376,31 @@ class _Run:
         self.recording.check()
         self.further.check()
 
+    def _check_alone(self) -> None:
+        """Check that the links sent only what this run's robots published, and that nobody else published what comes
+        out of them.
+
+        :raises RunError: when another program is on one of the graphs
+        """
+        heard = {} if self.listener is None else dict(self.listener.received)
+        for way in self.directions:
+            sent = {name: topic["submitted"] for name, topic in way.source.stats()["topics"].items()}
+            own = {} if self.sim is None else self.sim.published
+            self._compare(way.input, sent, own, own.keys())
+            came_out = {name: topic["delivered"] for name, topic in way.sink.stats()["topics"].items()}
+            self._compare(way.output, heard, came_out, way.output_topics())
+
+    def _compare(
+        self, graph: Middleware, found: Mapping[str, int], own: Mapping[str, int], names: Iterable[str]
+    ) -> None:
+        for name in names:
+            if found.get(name, 0) > own.get(name, 0):
+                raise RunError(
+                    f"{self.scenario.name}: {found[name]} messages were received on {name} and this run published "
+                    f"{own.get(name, 0)}: another program publishes there, on ROS domain {graph.domain_id}; end it, or "
+                    "set another domain_id"
+                )
+
     def _unresolved(self) -> int:
         """Messages whose result is open, at all receivers together."""
         return self.recorder.ledger.unresolved() + self.further.unresolved()
@@ -380,7 +409,8 @@ class _Run:
         self._check_recorders()
         if on_progress is not None:
             sent, delivered = self.recorder.progress()
-            now = Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered)
+            domains = (self.directions[0].input.domain_id, self.directions[0].output.domain_id)
+            now = Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered, domains)
             self.progress_guard(on_progress, now)
 
     def _incomplete(self) -> list[str]:
@@ -391,11 +421,11 @@ class _Run:
         return [*self.run_observers.incomplete(), *self.listener.incomplete()]
 
     def _counters(self) -> dict[str, Any]:
-        there, *back = (way.counters() for way in self.directions)
+        forward, *back = (way.counters() for way in self.directions)
         heard = {} if self.listener is None else dict(self.listener.received)
         unheard = {} if self.listener is None else self.listener.lost()
         return {
-            **there,
+            **forward,
             **({"back": back[0]} if back else {}),
             "listener": heard,
             **({"listener_lost": unheard} if unheard else {}),

@@ -22,13 +22,15 @@ from gr_ros2.phy import PHY
 from gr_ros2.settings.config import (
     STRICT,
     AnyLink,
-    ChannelConfig,
+    Decibels,
     OneWay,
     OverChannel,
     Populated,
+    ScenarioChannel,
     Seconds,
     Sending,
     Traffic,
+    Transceiver,
     build,
     replaced,
 )
@@ -47,7 +49,6 @@ _BACK_SEED = 100_003
 
 
 Time = Literal["real", "unthrottled", "samples", "packets"]
-Decibels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -78,6 +79,8 @@ class Back(OneWay):
     :param channel: what lies between them
     """
 
+    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
+
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Reports(OverChannel):
@@ -87,20 +90,14 @@ class Reports(OverChannel):
     :param delay_s: s that a report takes beside its airtime
     """
 
+    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     delay_s: Seconds = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig(Sending):
+class RobotConfig(Transceiver, Sending):
     """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
-    namespace: ``/robot_1``, ``/robot_2``, …
-
-    :param tx_power_dbm: power that it transmits, dBm
-    :param noise_figure_db: of its receiver, dB
-    """
-
-    tx_power_dbm: Decibels = 20.0
-    noise_figure_db: Decibels = 6.0
+    namespace: ``/robot_1``, ``/robot_2``, …"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -120,6 +117,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
         each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
         ``phy.sample_rate``; null = ``channel.snr_db`` between all
+    :param own_domains: ends whose ``domain_id`` is auto are on ROS domains that no other program of this computer uses;
+        false = they are on ROS_DOMAIN_ID
     :param seed: of the simulator, the channel and the sender
     """
 
@@ -127,11 +126,13 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     sim: SimSettings = Field(default_factory=SimSettings)
     back: Back | None = None
     reports: Reports | None = None
-    receivers: tuple[ChannelConfig, ...] = ()
+    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
+    receivers: tuple[ScenarioChannel, ...] = ()
     robots: Annotated[tuple[RobotConfig, ...], Field(max_length=BROADCAST)] = ()
     duplex: Literal["full", "half"] = "full"
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     localhost_only: bool | Auto = True
+    own_domains: bool = True
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
@@ -152,8 +153,32 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
         if self.duplex == "half" and not self.simulated:
             raise ValueError("duplex = 'half': one channel for all is simulated only; set time to packets or samples")
+        if self.medium != "exclusive" and self.duplex != "half":
+            raise ValueError(f"medium = {self.medium!r}: each robot has a channel of its own; set duplex: half")
+        if self.airtime.rule is not None and self.time == "unthrottled":
+            raise ValueError("airtime: packets take no airtime with time = 'unthrottled'; set time to real, or packets")
         self._check_robots()
+        self._check_positions()
         return self
+
+    def _check_positions(self) -> None:
+        others = [part.channel for part in (self.back, self.reports) if part is not None]
+        for name in ScenarioChannel.__annotations__:
+            if any(getattr(channel, name) != getattr(self.channel, name) for channel in (*others, *self.receivers)):
+                key = f"channel.{name.removesuffix('_')}"
+                raise ValueError(f"{key}: one world has one; give it in channel alone, not under back or receivers")
+        if not self.channel.from_positions:
+            return
+        if self.gains_db is not None:
+            raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
+        if not self.simulated:
+            raise ValueError(f"channel.from = 'positions': time = {self.time!r}; set time to packets or samples")
+        if not PHY.load(self.phy.name).has_samples:
+            raise ValueError(
+                f"channel.from = 'positions': phy {self.phy.name} has no samples, so no level; choose another"
+            )
+        if self.channel.walls_db and self.bag_path is not None:
+            raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
         if not self.robots:
@@ -161,7 +186,10 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
                 raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
             return
         if not self.simulated:
-            raise ValueError(f"robots: time = {self.time!r}; they share a simulated medium: set packets or samples")
+            raise ValueError(
+                f"robots: time = {self.time!r}; they share a simulated medium: set packets or samples, or run gr-ros2 "
+                "medium and a gr-ros2 link for each robot"
+            )
         if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
             raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
         count = len(self.robots)
@@ -193,11 +221,11 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
         if self.back is None:
             return (self,)
-        there = replace(self, back=None, reports=None, receivers=())
+        forward = replace(self, back=None, reports=None, receivers=())
         back = {item.name: getattr(self.back, item.name) for item in fields(self.back)}
-        return there, replace(there, **back)
+        return forward, replace(forward, **back)
 
-    def report_channels(self) -> list[ChannelConfig]:
+    def report_channels(self) -> list[ScenarioChannel]:
         """The channel on which each receiver reports: that of ``reports``, with a seed of its own; [] without it."""
         if self.reports is None:
             return []
@@ -224,7 +252,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
 
 def dump(scenario: Scenario) -> dict[str, Any]:
     """Every setting as JSON values, from which :func:`scenario_from` makes an equal scenario."""
-    values: dict[str, Any] = TypeAdapter(Scenario).dump_python(scenario, mode="json")
+    values: dict[str, Any] = TypeAdapter(Scenario).dump_python(scenario, mode="json", by_alias=True)
     return values
 
 
@@ -248,6 +276,9 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
         if isinstance(receivers := values.get("receivers"), list | tuple):
             values["receivers"] = [_another(channel, given, 2 + n) for n, given in enumerate(receivers)]
     robots = values.get("robots")
+    count = robots if isinstance(robots, int) else len(robots) if isinstance(robots, list | tuple) else 0
+    if count > BROADCAST:
+        raise ConfigError(f"{prefix}robots = {count}: a robot has an id of 0..254; set up to {BROADCAST} robots")
     if isinstance(robots, int):
         robots = [{}] * robots
     if isinstance(robots, list | tuple):

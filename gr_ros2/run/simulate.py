@@ -21,13 +21,13 @@ from math import inf
 from typing import Any
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
-from gr_ros2.gr.ends import Start, make_endpoint
-from gr_ros2.link import Delivered, ReceiverEvent, SenderEvent, SenderStats, SentPacket
+from gr_ros2.gr.ends import EndpointSetup, make_endpoint
+from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
+from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.v1.endpoint_settings import robot_of
 from gr_ros2.medium import Medium, Reception, make_medium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.middleware.bag_files import read_bag
@@ -35,8 +35,10 @@ from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phys, recorded_names, source_names
-from gr_ros2.run.robots import Halves, halves_of_robots, paths_at, start_of_run
+from gr_ros2.run.recorders import make_recorder
+from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.config import robot_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
@@ -64,7 +66,7 @@ class Offered:
 TimedEvent = tuple[float, "Robot", SenderEvent | ReceiverEvent]
 """Time of the event, s after the start; the robot that sent or received; and the event itself."""
 Airtime = Callable[[int | None, int], float]
-"""s that a packet of this many bytes, sent with this rung, is on the air; None stands for the longest packet."""
+"""s that a packet of this many bytes, sent with this MCS, is on the air; None stands for the longest packet."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,14 @@ class Simulated:
     :param duration_s: s during which messages were offered
     :param airtime_s: of the longest packet, s; 0 for a PHY without airtime
     :param packets: as in ``result.json``
+    :param stats: by source id
     """
 
     duration_s: float
     airtime_s: float
     topics: tuple[TopicResult, ...]
     packets: dict[str, Any]
-    stats: SenderStats
+    stats: Mapping[int, SenderStats]
     recorder: Recorder
 
 
@@ -145,44 +148,65 @@ def _remembered(settings: SimSettings, duration_s: float, topics: frozenset[str]
 def simulate(
     scenario: Scenario,
     *,
+    registry: Registry | None = None,
     phy: Phy | None = None,
-    messages: Iterator[Offered] | None = None,
+    messages: Sequence[Iterator[Offered]] | None = None,
     codec: MessageCodec | None = None,
     on_packet: Callable[[SentPacket], None] | None = None,
     overhead_s: float = 0.0,
 ) -> Simulated:
-    """Forecast the first direction of a scenario. Only those settings of the channel that lose whole packets have an
-    effect.
+    """Forecast a scenario, see :func:`coupled`. Only those settings of the channel that lose whole packets have an
+    effect, and packets that overlap are lost. The messages of a robot count as delivered at the first robot that
+    hears it.
 
+    :param registry: None takes the scenario's
     :param phy: None makes the scenario's
-    :param messages: in time order; None takes the scenario's source
-    :param codec: of both ends; None makes one
+    :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param codec: of all messages; None makes one
     :param on_packet: called with every packet that leaves a robot
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
+    scenario = coupled(scenario)
     ways = scenario.directions()
-    there = replace(ways[0] if len(ways) > 1 else scenario, receivers=())
-    registry = there.load_registry()
-    phys = make_phys([there], registry) if phy is None else [phy]
-    if phys[0].ladder:
+    registry = registry or scenario.load_registry()
+    phys = make_phys(ways, registry) if phy is None else [phy] * len(ways)
+    if phys[0].mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
-    run = Simulation(there, registry, phys, messages=None if messages is None else [messages], codec=codec, ideal=True)
-    src_id = there.ros_source.src_id()
-    topics = {src_id: source_names(there, registry).values()}
-    recorder = Recorder(registry, {src_id: there.ros_source.namespace}, topics)
+    run = Simulation(scenario, registry, phys, messages=messages, codec=codec, ideal=True)
+    ids = [way.ros_source.src_id() for way in ways]
+    listeners = {src_id: next(iter(run.around.reached(number)), number) for number, src_id in enumerate(ids)}
+    recorder = make_recorder(registry, ways)
     for timed_event in run.events():
-        pass_on(recorder, timed_event, overhead_s)
-        if on_packet is not None and isinstance(timed_event[2], SentPacket):
-            on_packet(timed_event[2])
+        _, robot, event = timed_event
+        if not isinstance(event, _OfSender) or listeners.get(_sender(event), robot.number) == robot.number:
+            pass_on(recorder, timed_event, overhead_s)
+        if on_packet is not None and isinstance(event, SentPacket):
+            on_packet(event)
     return Simulated(
         duration_s=run.duration_s,
         airtime_s=phys[0].airtime(),
         topics=recorder.finish(run.duration_s, run.duration_s, run.empty),
         packets=recorder.ledger.packets(),
-        stats=run.robots[0].endpoint.sent,
+        stats={src_id: robot.endpoint.sent for src_id, robot in zip(ids, run.robots, strict=False)},
         recorder=recorder,
     )
+
+
+def coupled(scenario: Scenario) -> Scenario:
+    """What is forecast together: all robots where they share a channel, else the first direction alone."""
+    ways = scenario.directions()
+    if len(ways) > 1:
+        return scenario if scenario.duplex == "half" else ways[0]
+    return replace(scenario, receivers=())
+
+
+_OfSender = Received | Delivered | Lost
+"""Events of a receiver about what one sender has sent."""
+
+
+def _sender(event: Received | Delivered | Lost) -> int:
+    return event.identity.src_id if isinstance(event, Received) else event.src_id
 
 
 def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:
@@ -223,7 +247,13 @@ class Simulation:
         coming = list(messages or offered_by(ways, registry))
         shared = scenario.duplex == "half"
         any_length = all(phy.any_length for phy in phys)
-        start = start_of_run(ways, any_length=any_length, ladder=phys[0].ladder, half_duplex=shared)
+        start = start_of_run(
+            ways,
+            any_length=any_length,
+            mcs_table=phys[0].mcs_table,
+            half_duplex=shared,
+            airtime_s=phys[0].airtime(),
+        )
         self.robots: list[Robot] = []
         starts = random.Random(f"starts {scenario.seed}")
         for number, halves in enumerate(halves_of_robots(ways)):
@@ -239,22 +269,22 @@ class Simulation:
                 airtime=phy.airtime,
                 messages=coming[number] if sends else iter(()),
                 start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
+                busy=ideal,
             )
             self.robots.append(robot)
         all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
-        at = paths_at(scenario, phys[0].sample_rate)
-        self.paths = paths = at(0.0)
+        self.around = around = surroundings(scenario, phys[0].sample_rate)
         if ideal:
-            self.medium: Medium = PacketMedium(at, all_phys, shared=shared, ideal=True)
+            self.medium: Medium = PacketMedium(around, all_phys, shared=shared, ideal=True)
         else:
-            answer = any(self.robots[path.receiver].endpoint.answers for heard in paths for path in heard)
+            heard = {receiver for number in range(len(self.robots)) for receiver in around.reached(number)}
             self.medium = make_medium(
-                at,
+                around,
                 all_phys,
                 samples=scenario.time == "samples",
                 shared=shared,
                 seed=scenario.seed,
-                at_once=answer,
+                at_once=any(self.robots[number].endpoint.answers for number in heard),
             )
 
     def events(self) -> Iterator[TimedEvent]:
@@ -273,7 +303,7 @@ class Simulation:
 
 
 def _endpoint(
-    registry: Registry, halves: Halves, codec: MessageCodec | None, start: Start, seed: int
+    registry: Registry, halves: Halves, codec: MessageCodec | None, start: EndpointSetup, seed: int
 ) -> tuple[Endpoint, list[SenderEvent]]:
     """An endpoint, and the list to which it adds the events of its sending half."""
     events: list[SenderEvent] = []
@@ -290,6 +320,7 @@ class Robot:
     :param airtime: of a packet by its bytes, None = of the longest, s; 0 for a PHY without airtime
     :param messages: in the order of time
     :param start_s: s, when it begins to send
+    :param busy: whether it has had more to send than its airtime allows before the run
     """
 
     def __init__(
@@ -303,6 +334,7 @@ class Robot:
         airtime: Airtime,
         messages: Iterator[Offered],
         start_s: float = 0.0,
+        busy: bool = False,
     ) -> None:
         self._start_s = start_s
         self.number, self.endpoint, self.src_id = number, endpoint, src_id
@@ -317,11 +349,15 @@ class Robot:
         self._coming = next(messages, None)
         self._airtime = airtime
         longest = airtime(None, 0)
-        self._clock: AirtimeClock[None] | None = AirtimeClock(longest) if longest else None
+        limit, rule = None, scenario.airtime.rule
+        if rule is not None:
+            limit = at_full_load(rule, longest) if busy else AirtimeLimit(rule, longest)
+        self._clock: AirtimeClock[None] | None = AirtimeClock(longest, limit=limit) if longest else None
         self._drain = scenario.drain_s
+        self._shares = scenario.medium != "exclusive"
         self._until = scenario.duration_s
         if self._clock is not None:
-            endpoint.use_credit()
+            endpoint.pace.use_credit()
 
     @property
     def empty(self) -> bool:
@@ -332,25 +368,25 @@ class Robot:
         """Take the messages that have come by ``now``, and send what may leave."""
         if self._clock is not None:
             self._clock.due(now)
-            self.endpoint.credit(self._clock.grants(now))
+            self.endpoint.pace.credit(self._clock.grants(now))
         while self._coming is not None and self._coming.t <= now:
-            self.endpoint.submit(self._coming.topic_id, self._coming.payload, now)
+            self.endpoint.messages.submit(self._coming.topic_id, self._coming.payload, now)
             if not self._until:
                 self.duration_s = now
             self._coming = next(self._messages, None)
-        while (data := self.endpoint.next_packet(now)) is not None:
-            rung = self.endpoint.rung
-            airtime = self._airtime(len(data), rung)
+        while (sent := self.endpoint.next_packet(now)) is not None:
+            airtime = self._airtime(len(sent.data), sent.mcs)
             start = now if self._clock is None else self._clock.offer(None, now, airtime)
-            medium.send(self.number, data, start, airtime, rung)
+            assert start is not None, "a packet with a credit was refused"
+            medium.send(self.number, sent.data, start, airtime, sent.mcs)
         yield from ((now, self, event) for event in self._events)
         self._events.clear()
         self.due = self._next(now)
 
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""
-        measured_db = reception.measured_db if self.endpoint.ladder else None
-        for event in self.endpoint.receive(reception.data, reception.at, measured_db):
+        arrival = ReceivedPacket(reception.data, reception.sent.start, reception.measured_db)
+        for event in self.endpoint.receive(arrival, reception.at):
             yield reception.at, self, event
 
     def expire(self, now: float) -> Iterator[TimedEvent]:
@@ -364,7 +400,8 @@ class Robot:
         at = self.endpoint.next_departure() if self.endpoint.answers else None
         if at is not None:
             self.due = min(self.due, max(now, at, self._start_s))
-            self.over = False
+            # Robots with slots of their own send for ever.
+            self.over = self._shares and now > self.duration_s + self._drain
 
     def _next(self, now: float) -> float:
         """Time at which something may happen next; infinite when all is done, or the time to drain is over."""

@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def run_simulated(
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
         run = Simulation(scenario, registry, phys)
-        ears = ears_of(scenario, run.paths)
+        ears = ears_of(scenario, run.around)
         heard = [ways[number] for number in ears[0]]
         recorder = make_recorder(registry, heard, None if bag is None else bag.take)
         called = [robot.ros_source.namespace for robot in scenario.robots] if len(ears) == len(ways) else None
@@ -98,15 +99,16 @@ def run_simulated(
     topics = recorder.finish(played, played, run.empty)
     there, *others = (_counters(run, number, source_names(way, registry)) for number, way in enumerate(ways))
     back = {"back": others[0]} if len(others) == 1 else {"robots": others} if others else {}
+    numbers = partial(phy_numbers, phys[0], 1 if run.medium.shared else len(ways))
     result = Result(
         scenario=scenario.name,
         seed=scenario.seed,
         duration_s=played,
         config=dump(scenario),
         topics=topics,
-        receivers=further.finish(played, played, run.empty),
+        receivers=further.finish(played, played, run.empty, numbers),
         packets=recorder.ledger.packets(),
-        phy=phy_numbers(phys[0], 1 if run.medium.shared else len(ways), recorder),
+        phy=numbers(recorder),
         wall_s=time.monotonic() - began,
         incomplete=tuple(run_observers.incomplete()),
         counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
@@ -131,7 +133,7 @@ def _counters(run: Simulation, number: int, names: Mapping[str, int]) -> dict[st
     :param number: of the robot that sends
     :param names: topic ids by name
     """
-    receiver = run.paths[number][0].receiver if run.paths[number] else number
+    receiver = next(iter(run.around.reached(number)), number)
     sent, got = run.robots[number].endpoint.sent, run.robots[receiver].endpoint.received
     lost = run.medium.lost[number, receiver]
     return {

@@ -33,6 +33,8 @@ from gr_ros2.core.names import (
     checked_namespace_form,
     checked_topic_form,
 )
+from gr_ros2.settings.airtime import Airtime, AirtimeConfig, Windowed
+from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
 from gr_ros2.settings.fields import AUTO, Auto, OnlyIn, settings_of
 from gr_ros2.settings.problems import explain
 from gr_ros2.settings.topic_choice import checked_words, words_of
@@ -41,6 +43,8 @@ from gr_ros2.settings.yaml_text import parse_yaml
 from gr_ros2.state.keys import checked_key_file
 from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
 
+NOBODY = -1
+"""Id of an end that belongs to no robot."""
 MIN_PACKET_LEN = min(version.min_packet_len for version in FORMATS.values())
 MAX_PACKET_LEN = max(version.max_packet_len for version in FORMATS.values())
 
@@ -54,6 +58,7 @@ SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+Decibels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 Text = Annotated[str, Field(min_length=1)]
 Namespace = Annotated[str, AfterValidator(checked_namespace)]
 NamespaceForm = Annotated[str, AfterValidator(checked_namespace_form)]
@@ -61,6 +66,7 @@ TopicForm = Annotated[str, Field(min_length=1), AfterValidator(checked_topic_for
 MergedTopic = Annotated[str, AfterValidator(checked_merged_topic)]
 FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
+Medium = Literal["exclusive", "slots", "aloha"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
 WireVersion = Literal[0, 1]
 Repairs = Literal["idle", "thrifty", "off"]
@@ -138,7 +144,7 @@ class Sampled:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Packets:
+class PacketSettings:
     """What sends packets.
 
     :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
@@ -148,7 +154,7 @@ class Packets:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Agreed(Packets):
+class Agreed(PacketSettings):
     """What all ends of a link have to agree on.
 
     :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
@@ -179,10 +185,20 @@ class Queued:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class TopicOptions(Queued):
+class Recent:
+    """What a message that comes late may be refused by.
+
+    :param max_age_s: s for which a sealed message may have been withheld
+    """
+
+    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TopicOptions(Recent, Queued):
     """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
 
-    :param qos: class of its packets, the two QoS bits of the header
+    :param qos: class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default
     :param reliability: auto adapts the subscription to the publishers found
     :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
     :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``; of a
@@ -192,14 +208,19 @@ class TopicOptions(Queued):
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
-        publishers' lifespan, where ``queue`` is auto too. Of a service: s that a call waits for its reply, auto 30
+        publishers' lifespan where ``queue`` is auto too, otherwise 0.3 for ``commands`` and none for others. Of a
+        service: s that a call waits for its reply, auto 30
     :param weight: what a second of this topic's age counts beside other topics, 0.001..1000
     :param max_rate: messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited
+    :param max_age_s: s for which a sealed message of it may have been withheld (with a key and both ways), or it is not
+        taken; 0 = any time, auto takes the sink's. A number above 0 at the source has every sink take its own bound
+    :param keep_s: s for which its newest message is sent again to robots that lack it, although nothing follows and it
+        is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
 
-    qos: QosClass = "default"
+    qos: QosClass | Auto = AUTO
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     depth: Count | Auto = AUTO
@@ -208,6 +229,7 @@ class TopicOptions(Queued):
     deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
     weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    keep_s: Annotated[Seconds, OnlyIn(1)] = 0.0
     codec: str = AUTO
     quantize: str = ""
 
@@ -228,6 +250,8 @@ class EndConfig(Agreed):
         front end loops back. A sink that has one drops and counts its own packets and those for others
     :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
     :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
+    :param commands: types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before
+        others, unless the topic's options say otherwise; the same at both ends, as far as both know the topics
     :param dictionaries: files of dictionaries of your own, made by `gr-ros2 dict train`; the same at both ends
     :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
     :param debug: readable log of headers, topic ids and entries
@@ -237,6 +261,7 @@ class EndConfig(Agreed):
     robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
     middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
+    commands: Annotated[tuple[str, ...], OnlyIn(1), AfterValidator(checked_commands)] = COMMAND_TYPES
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
@@ -275,6 +300,8 @@ class SourceConfig(Queued, EndConfig):
         joins fragments of different messages)
     :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
         version 1 only while no robot reports, and up to 32 times as long while none is heard that could be
+    :param beacon_s: s without hearing any robot after which nothing is sent but one hello every so many s, until one is
+        heard; 0 = never; needs both directions
     :param compression: code every message, which a receiver sees by itself; auto = with version 1, which the paper's
         version 0 leaves off
     :param repair: what idle air is spent on: idle = all of it on what may have been lost, thrifty = as
@@ -301,6 +328,7 @@ class SourceConfig(Queued, EndConfig):
     queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
     backpressure: bool = False
     entry_ids: Annotated[Literal["sequential", "random"], OnlyIn(0), Field(title="Entry IDs")] = "sequential"
+    beacon_s: Annotated[Seconds, OnlyIn(1), Field(title="Time until only beacons are sent (s)")] = 0.0
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
     compression: bool | Auto = AUTO
     repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
@@ -353,7 +381,7 @@ class SourceConfig(Queued, EndConfig):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class SinkConfig(EndConfig):
+class SinkConfig(Recent, EndConfig):
     """ROS Sink (the paper, section 4.4).
 
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
@@ -376,7 +404,6 @@ class SinkConfig(EndConfig):
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
-    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 72_000_000
     max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
@@ -484,6 +511,88 @@ class ChannelConfig(Seeded):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class OnCarrier:
+    """What is on a carrier.
+
+    :param carrier_hz: carrier frequency, Hz
+    """
+
+    carrier_hz: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Transceiver:
+    """What levels at a receiver follow from.
+
+    :param tx_power_dbm: power that it transmits, dBm; auto = the channel's
+    :param noise_figure_db: of its receiver, dB; auto = the channel's
+    """
+
+    tx_power_dbm: Decibels | Auto = AUTO
+    noise_figure_db: Decibels | Auto = AUTO
+
+
+_ONLY_FOR = {"exponent": "log_distance", "height_m": "two_ray"}
+"""Settings that one model of the path loss has alone."""
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
+class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
+    """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md).
+
+    :param from_: what says the levels: settings = ``snr_db``; positions = where the robots are, in the simulator's
+        world or by a recording's odometry
+    :param model: of the path loss: free_space, two_ray (with the reflection from the ground) or log_distance
+    :param exponent: of log_distance: 2 as in free space, 1.6 to 1.8 in corridors, 2.7 to 4 among obstacles
+    :param height_m: of two_ray: height of all antennas, m
+    :param walls_db: loss in each obstacle of the simulated world on the straight line between two robots, dB
+    :param shadowing_db: standard deviation of the shadowing, dB; 0 = none
+    :param decorrelation_m: way of one robot after which its shadowing has 1/e of the correlation left, m
+    :param tx_power_dbm: power that a robot transmits, dBm
+    :param noise_figure_db: of a receiver, dB
+    :param carrier_hz: carrier frequency, Hz
+    """
+
+    from_: Annotated[Literal["settings", "positions"], Field(alias="from", title="From")] = "settings"
+    model: Literal["log_distance", "two_ray", "free_space"] = "log_distance"
+    exponent: Annotated[float, Field(ge=1, le=8)] = 3.0
+    height_m: Annotated[float, Field(gt=0, le=1000)] = 0.5
+    walls_db: Annotated[float, Field(ge=0, le=100)] = 0.0
+    shadowing_db: Annotated[float, Field(ge=0, le=30)] = 0.0
+    decorrelation_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
+    tx_power_dbm: Decibels = 20.0
+    noise_figure_db: Decibels = 6.0
+    carrier_hz: Annotated[float, Field(ge=1e3, le=1e12)] = 2.4e9
+
+    @property
+    def from_positions(self) -> bool:
+        """Whether the levels follow from where the robots are."""
+        return self.from_ == "positions"
+
+    def levels(self, robot: Transceiver) -> tuple[float, float]:
+        """Transmit power of a robot in dBm, and noise figure of its receiver in dB."""
+        power, figure = robot.tx_power_dbm, robot.noise_figure_db
+        return self.tx_power_dbm if power == AUTO else power, self.noise_figure_db if figure == AUTO else figure
+
+    @model_validator(mode="after")
+    def _one_origin(self) -> ScenarioChannel:
+        default = {name: getattr(ScenarioChannel, name) for name in ScenarioChannel.__annotations__}
+        changed = [name for name, value in default.items() if getattr(self, name) != value]
+        if not self.from_positions:
+            if changed:
+                raise ValueError(f"{changed[0]}: acts only where levels follow from positions; set from: positions")
+            return self
+        if self.snr_db is not None:
+            raise ValueError(f"snr_db = {self.snr_db:g}: follows from positions; leave it out, or set from: settings")
+        for name, model in _ONLY_FOR.items():
+            if name in changed and self.model != model:
+                raise ValueError(f"{name}: only model {model} has it; leave it out, or set model: {model}")
+        if "decorrelation_m" in changed and not self.shadowing_db:
+            raise ValueError("decorrelation_m: nothing is shadowed; set shadowing_db above 0")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class PhyConfig(Sampled, Named):
     """Which physical layer, and how fast.
 
@@ -499,6 +608,11 @@ class PhyConfig(Sampled, Named):
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
     kernels: Kernels = AUTO
     options: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def takes_airtime(self) -> bool:
+        """Whether packets last for some time. Settings load no back-end, so this is known of its name only."""
+        return self.name != "direct"
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -540,14 +654,42 @@ class AnyLink(OneWay, Agreed, Named):
         a built-in one such as `table4`; the same at every robot
     :param phy: which physical layer, and how fast; the same at every robot
     :param localhost_only: DDS stays on the loopback interface; auto takes what the environment of ROS says
+    :param airtime: how much a robot may send, whatever waits: settings, or the name of a band alone
+    :param medium: when a robot sends on a channel that others use too: slots that it derives from the packets heard,
+        aloha (at random, as rarely as the robots heard call for), or exclusive = whenever it has something
     """
 
     phy: PhyConfig = Field(default_factory=PhyConfig)
+    medium: Medium = "exclusive"
+    airtime: Airtime = Field(default_factory=AirtimeConfig)
     localhost_only: bool | Auto = AUTO
 
+    @model_validator(mode="after")
+    def _medium_fits(self) -> AnyLink:
+        if self.medium != "exclusive" and not self.version:
+            raise ValueError(f"medium = {self.medium!r}: version 0 says nothing about slots; set version: 1")
+        if self.medium != "exclusive" and not self.phy.takes_airtime:
+            raise ValueError(f"medium = {self.medium!r}: phy direct takes no airtime; choose another")
+        return self
 
-@dataclass(frozen=True, config=STRICT)
-class DiagnosticsConfig:
+    @model_validator(mode="after")
+    def _airtime_fits(self) -> AnyLink:
+        if self.airtime.rule is not None and self.ros_source.packet_rate == 0:
+            raise ValueError(
+                "ros_source.packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out"
+            )
+        if self.airtime.rule is not None and not self.phy.takes_airtime:
+            raise ValueError("airtime: phy direct takes no airtime, so there is nothing to limit; leave it out")
+        band = self.airtime.of_band
+        if band is not None and band.in_clear and self.key and self.seal == "encrypt":
+            raise ValueError(
+                f"airtime.band = {self.airtime.band!r}: forbids encryption ({band.source}); set seal: authenticate"
+            )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class DiagnosticsConfig(Windowed):
     """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
 
     :param period_s: s between two messages, 0 = none at all
@@ -637,3 +779,13 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}")
     return values
+
+
+def robot_of(source: SourceConfig | None, sink: SinkConfig | None) -> int:
+    """Id of the robot that an end belongs to; ``NOBODY`` for an end that only receives and has none.
+
+    :raises ConfigError: when the source names no robot
+    """
+    if source is not None:
+        return source.src_id()
+    return NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id

@@ -117,7 +117,7 @@ def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> S
     if default is MISSING or type(default).__name__ == "PydanticUndefinedType":
         default = REQUIRED
     return Setting(
-        item.name,
+        item.name.removesuffix("_"),  # of a name that Python keeps for itself
         hint,
         default,
         meaning,

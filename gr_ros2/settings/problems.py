@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
 from gr_ros2.settings.fields import AUTO, members, settings_of
@@ -77,7 +77,7 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
     key, item = ".".join(keys), group[0]
     if not key:
         return str(item["msg"]).removeprefix("Value error, ")
-    known = () if owner is None else tuple(field.name for field in fields(owner))
+    known = () if owner is None else tuple(setting.name for setting in settings_of(owner))
     if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         return f"unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
     setting = next((found for found in settings_of(owner) if found.name == keys[-1]), None) if owner else None

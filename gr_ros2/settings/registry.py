@@ -22,7 +22,7 @@ from gr_ros2.settings.config import SinkConfig, TopicOptions, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
 from gr_ros2.settings.topic_choice import TopicChoice
-from gr_ros2.wire import FORMATS, TableRow
+from gr_ros2.wire import FORMATS, AnnouncedTopic
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
@@ -114,7 +114,7 @@ class Topic:
         return self.type_name != CALLS_TYPE and not self.is_service
 
 
-NewRow = tuple[str, str, TopicOptions]
+NewTopic = tuple[str, str, TopicOptions]
 """Name, type and options of a row that has no number yet."""
 
 
@@ -175,7 +175,7 @@ class Registry(Sequence[Topic]):
             raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
         return cls(list(_topics(rows, path)), path)
 
-    def extended(self, rows: Sequence[NewRow]) -> Registry:
+    def extended(self, rows: Sequence[NewTopic]) -> Registry:
         """These rows too, with the next numbers. A name may come again with another type, which it has from then on.
 
         :raises RegistryError: too many, or a row that is there already
@@ -281,7 +281,7 @@ class Registry(Sequence[Topic]):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def announced(row: TableRow, options: Mapping[str, TopicOptions]) -> Topic:
+def announced(row: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topic:
     """A topic as its sender has announced it.
 
     :param options: configured options by topic name, which replace the announced ones

@@ -11,6 +11,7 @@ import heapq
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -75,6 +76,12 @@ class Fleet:
             "use fewer robots or a larger room"
         )
 
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def of(settings: SimSettings) -> Fleet:
+        """The fleet of these settings, which drives only once for all who ask where it is."""
+        return Fleet(settings)
+
     def topics(self) -> dict[str, str]:
         """Topic name without namespace -> type, in the order of the paper's table 4."""
         return dict(TYPES)
@@ -95,6 +102,12 @@ class Fleet:
         """x and y, m, and heading, rad (not wrapped), in the map frame."""
         state = self.state(robot_id, t)
         return state.x, state.y, state.heading
+
+    def at(self, now: float, robot_ids: Sequence[int]) -> tuple[Floats, Floats]:
+        """Places in m and velocities in m/s of robots at simulated time ``now``, each of shape (robots, 2)."""
+        states = [self.state(robot_id, now) for robot_id in robot_ids]
+        x, y, heading, speed = np.array([state[:4] for state in states]).T
+        return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
     def true_path(self, robot_id: int, times: Sequence[float] | Floats) -> Floats:
         """Rows x, y at those times."""

@@ -135,8 +135,8 @@ class SimPublisher:
                     return
             if self._stop.is_set():
                 return
+            self.published[message.topic] += 1  # before, so that nobody has received more than this says
             publisher.publish(message.payload)
             self.worst_lag_s = max(self.worst_lag_s, -ahead)
-            self.published[message.topic] += 1
             if message.topic in self._transforms:
                 self._transforms[message.topic].follow(message.payload)

@@ -104,8 +104,35 @@ class World:
             hits.append(np.where((depth >= 0) & (near >= 0), near, np.inf))
         return np.asarray(np.concatenate(hits, axis=1).min(axis=1))
 
+    def crossed(self, start: Floats, ends: Floats) -> NDArray[np.int_]:
+        """Number of obstacles that the straight lines from one point to others pass through.
+
+        :param start: x, y
+        :param ends: shape (n, 2)
+        """
+        way = ends - start
+        count = np.zeros(len(ends), int)
+        if len(self.circles):
+            off = self.circles[:, :2] - start
+            along = np.clip((way @ off.T) / np.maximum((way * way).sum(1), 1e-12)[:, None], 0.0, 1.0)
+            gap = along[:, :, None] * way[:, None] - off
+            count += ((gap * gap).sum(-1) < self.circles[:, 2] ** 2).sum(1)
+        if len(self.boxes):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                enter, leave = self._slabs(float(start[0]), float(start[1]), way[:, :1], way[:, 1:])
+            count += ((leave > np.maximum(enter, 0.0)) & (enter < 1.0)).sum(1)
+        return count
+
     def _cast_boxes(self, x: float, y: float, dir_x: Floats, dir_y: Floats) -> Floats:
-        """The slab method in each box's own frame."""
+        enter, leave = self._slabs(x, y, dir_x, dir_y)
+        return np.where((leave >= enter) & (enter >= 0), enter, np.inf)
+
+    def _slabs(self, x: float, y: float, dir_x: Floats, dir_y: Floats) -> tuple[Floats, Floats]:
+        """Where lines enter and leave each box, in lengths of their direction: the slab method in the box's own frame.
+
+        :param dir_x, dir_y: shape (n, 1)
+        :returns: of shape (n, boxes); a line that misses a box leaves it before it enters it
+        """
         off_x, off_y = x - self.boxes[:, 0], y - self.boxes[:, 1]
         enter = np.full((len(dir_x), len(self.boxes)), -np.inf)
         leave = np.full_like(enter, np.inf)
@@ -116,7 +143,7 @@ class World:
             one, two = (-half - offset) / direction, (half - offset) / direction
             enter = np.maximum(enter, np.minimum(one, two))
             leave = np.minimum(leave, np.maximum(one, two))
-        return np.where((leave >= enter) & (enter >= 0), enter, np.inf)
+        return enter, leave
 
     def map_origin_resolution(self, cells: int) -> tuple[float, float]:
         """Map frame coordinate (the same for x and y) of the first cell's corner, and the cell's side, m."""

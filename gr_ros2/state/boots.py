@@ -41,19 +41,19 @@ class _Lock:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.with_name(f".{path.name}.lock").open("a+", encoding="ascii")
+        self._file = path.with_name(f".{path.name}.lock").open("ab+", buffering=0)
         try:
             fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._file.seek(0)
-            holder = self._file.read().strip() or "of another user"
+            holder = self._file.read().decode("ascii", "replace").strip() or "of another user"
             raise ConfigError(
                 f"{path}: process {holder} uses it, so a link of this robot runs already; end that one, or give "
                 "this one another robot_id or state"
             ) from None
         self._file.truncate(0)
-        self._file.write(f"{os.getpid()}\n")
-        self._file.flush()
+        with suppress(OSError):  # a full disk: the lock holds all the same
+            self._file.write(b"%d\n" % os.getpid())
 
     def __del__(self) -> None:
         if hasattr(self, "_file"):

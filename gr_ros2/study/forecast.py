@@ -8,8 +8,11 @@ the forecast it is based on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
+from statistics import fmean
 from typing import Any, get_args
 
 import numpy as np
@@ -17,16 +20,20 @@ import numpy as np
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import message_codec
 from gr_ros2.link import SentPacket
+from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.events import AirKind
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.medium.loss_table import LossCurve
+from gr_ros2.medium.positions import Positions
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
-from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.robots import surroundings
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.run.simulate import Simulated, offered, simulate
-from gr_ros2.settings.config import replaced
+from gr_ros2.run.simulate import Simulated, coupled, offered_by, simulate
+from gr_ros2.settings.config import ChannelConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Topic
+from gr_ros2.settings.registry import Registry, Topic
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -36,6 +43,12 @@ _WALL_S = 1.7e9
 """s since 1970. A fixed time, so that a plan is the same on every day."""
 _PARTS = (1, 2, 3)
 """Numbers of packets per message for which packet lengths are tried."""
+_FULL = 0.9
+"""Part of the airtime that the messages may take. The rest is for repair, reports, and what comes at once."""
+_ROUNDS = 5
+"""Most times that cuts are tried, each with what a message cost after the cuts before."""
+_LEAST_SHARE, _LEAST_HZ = 0.1, 0.5
+"""A topic that would keep less than this part of its messages, or fewer per second, is better left out."""
 _YOUNGER = 0.97
 """A topic counts as younger if the ratio of its new age to its age now is below this, and as older above the
 inverse."""
@@ -52,7 +65,8 @@ class TopicForecast:
     :param offered_hz: messages/s given to the source
     :param message_bytes: mean, serialized
     :param air_bytes: mean per message on the air, coded where the link compresses, without headers
-    :param load: part of the airtime that all its messages would take, at the mean cost of those sent; 1 = all airtime
+    :param load: part of the airtime allowed, to all robots that share it, that all its messages would take, at the mean
+        cost of those sent
     :param share: part of the airtime of the packets that left the source; above 1 is possible where the source is not
         paced
     :param rate_hz: messages/s delivered
@@ -75,6 +89,7 @@ class Forecast:
     :param airtime_s: of one packet
     :param capacity: packets/s the radio carries
     :param used: part of the airtime that is used, 0..1
+    :param allowed: part of the airtime that may be used, 0..1; loads are parts of this
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
     :param pad: part of the packets' bytes that is PAD
     """
@@ -85,13 +100,14 @@ class Forecast:
     used: float
     air_bytes_per_message: float | None
     pad: float
+    allowed: float
     topics: tuple[TopicForecast, ...]
     air: Mapping[str, float] = field(default_factory=dict)
     """Packets per message sent, by their purpose: new messages, repair, reports, hellos."""
 
     @property
     def load(self) -> float:
-        """Part of the airtime that all messages would take; 1 = all airtime, above 1 they do not fit."""
+        """Part of the airtime allowed that all messages would take; above 1 they do not fit."""
         return sum(topic.load for topic in self.topics)
 
 
@@ -172,13 +188,30 @@ class Advice:
         return self.harmless and self.used[1] < _LIGHTER * self.used[0]
 
 
+@dataclass(frozen=True)
+class Cut:
+    """Less traffic on one topic.
+
+    :param topic: its name, or which one it is of every robot
+    :param rate_hz: messages/s of a robot that remain; 0 = the topic is left out
+    :param settings: of this cut and those before it, as on the command line
+    :param load: of all topics after this cut and those before it, see :attr:`Forecast.load`
+    """
+
+    topic: str
+    rate_hz: float
+    settings: tuple[str, ...]
+    load: float
+
+
 class Planner:
     """Forecasts for one scenario and variants of it, with the same messages.
 
+    :param registry: None takes the scenario's
     :raises ConfigError: for version 0, a PHY that takes no airtime, or a scenario that cannot be set up
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, registry: Registry | None = None) -> None:
         if not PHY.load(scenario.phy.name).has_airtime:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
         if not scenario.version:
@@ -186,17 +219,42 @@ class Planner:
         if not scenario.simulated:
             # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
-        self.scenario = scenario
-        self.registry = scenario.load_registry()
-        self.phy = make_phy(scenario, self.registry)
-        self._messages = list(offered(scenario, self.registry))
-        if not self._messages:
+        self._whole = scenario
+        self.scenario = coupled(scenario)
+        self.registry = registry or scenario.load_registry()
+        ways = self.scenario.directions()
+        self.phy = make_phys(ways, self.registry)[0]
+        self._messages = [list(messages) for messages in offered_by(ways, self.registry)]
+        if not any(self._messages):
             raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
+        self._rows = {
+            name: self.registry[topic_id].name
+            for way in ways
+            for name, topic_id in source_names(way, self.registry).items()
+        }
+        self._weights: dict[str, float] = {}
+        for way in ways:
+            options = self.registry.with_options(way.ros_source.topic_options)
+            names = source_names(way, self.registry)
+            self._weights |= {name: options[topic_id].options.weight for name, topic_id in names.items()}
         self._remembering: _Remembering | None = None
 
     def forecast(self) -> Forecast:
         """The scenario as it is."""
         return self._forecast(self.scenario)
+
+    def range_m(self, pdr: float) -> float | None:
+        """Distance up to which a share of the packets arrives, without walls, shadowing and others on the channel.
+
+        None where levels do not follow from positions.
+        """
+        if not self.scenario.channel.from_positions:
+            return None
+        around = surroundings(self._whole, self.phy.sample_rate)
+        assert isinstance(around, Positions)
+        curve = LossCurve(self.phy.on_mcs(0), ChannelConfig())
+        snrs_db = np.arange(curve.low_db, curve.high_db, 0.1)
+        return around.range_m(float(snrs_db[np.argmax(curve.pdr(snrs_db) >= pdr)]))
 
     def advice(self) -> list[Advice]:
         """Single changes that make topics younger or save airtime. Changes that make no topic worse come first; within
@@ -213,14 +271,10 @@ class Planner:
 
     def _compared(self, setting: str, now: Forecast, then: Forecast) -> Advice:
         """The effect of a change on each topic."""
-        registry = self.registry.with_options(self.scenario.ros_source.topic_options)
-        weights = {
-            name: registry[topic_id].options.weight for name, topic_id in source_names(self.scenario, registry).items()
-        }
         effects = tuple(
             Effect(
                 before.topic,
-                weights[before.topic],
+                self._weights[before.topic],
                 (_age(before.result), _age(after.result)),
                 (before.result.pdr or 0.0, after.result.pdr or 0.0),
             )
@@ -230,28 +284,22 @@ class Planner:
         return Advice(setting, then, (now.used, then.used), effects)
 
     def _variants(self, base: Scenario) -> Iterator[tuple[str, Scenario]]:
-        source, sink = base.ros_source, base.ros_sink
+        source = base.ros_source
         if not source.compresses:
-            yield "ros_source.compression=true", replace(base, ros_source=replace(source, compression=True))
+            yield "ros_source.compression=true", _sending(base, lambda own: replace(own, compression=True))
         if source.packet_rate == 0:
-            yield "ros_source.packet_rate=auto", replace(base, ros_source=replace(source, packet_rate=AUTO))
+            yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
         for packet_len in self._packet_lens():
-            yield (
-                f"packet_len={packet_len}",
-                replace(
-                    base,
-                    packet_len=packet_len,
-                    ros_source=replace(source, packet_len=packet_len),
-                    ros_sink=replace(sink, packet_len=packet_len),
-                ),
-            )
+            yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
+        if len(base.directions()) > 1 and base.medium == "exclusive":
+            yield "medium=slots", replace(base, medium="slots")
 
     def _packet_lens(self) -> list[int]:
         """Packet lengths such that the messages of one of the topics fit into one packet, or into a few equal parts."""
         source = self.scenario.ros_source
         wire = source.wire_format
         sizes: dict[int, list[int]] = {}
-        for message in self._messages:
+        for message in chain(*self._messages):
             sizes.setdefault(message.topic_id, []).append(self._size(message.topic_id, message.payload))
         largest = max(max(values) for values in sizes.values())
         lens = set()
@@ -263,6 +311,89 @@ class Planner:
         return sorted(
             packet_len for packet_len in lens if packet_len in usable and largest <= wire.largest_message(packet_len)
         )
+
+    def cuts(self) -> list[Cut]:
+        """What to send less of until the rest fits, the heaviest topic first; [] if it fits.
+
+        The air is shared out by weight (max-min fairness): a topic that needs less than its share keeps all of its
+        messages, every other one is limited to its share.
+        """
+        forecast = self.forecast()
+        cuts: list[Cut] = []
+        offered, loads = self._demand(forecast)
+        cost = {row: loads[row] / hz for row, hz in offered.items()}
+        load = forecast.load
+        for _ in range(_ROUNDS):
+            if load <= 1:
+                break
+            rates = self._fair_rates({name: (cost[name] * hz, hz) for name, hz in offered.items()})
+            applied = list(
+                self._applied({name: rates[name] for name in sorted(rates, key=lambda n: -cost[n] * offered[n])})
+            )
+            if not applied:
+                break
+            # A message costs more where fewer others share its packets.
+            cuts, last = [cut for cut, _ in applied], applied[-1][1]
+            load = last.load
+            kept = {row: own / (rates.get(row) or offered[row]) for row, own in self._demand(last)[1].items()}
+            cost |= {name: max(cost[name], own) for name, own in kept.items()}
+        return cuts
+
+    def _demand(self, forecast: Forecast) -> tuple[dict[str, float], dict[str, float]]:
+        """Messages/s that a robot offers, and the load of all robots, by rows of the registry."""
+        rows: dict[str, list[TopicForecast]] = {}
+        for topic in forecast.topics:
+            if topic.load:
+                rows.setdefault(self._rows[topic.topic], []).append(topic)
+        offered = {row: fmean(topic.offered_hz for topic in topics) for row, topics in rows.items()}
+        return offered, {row: sum(topic.load for topic in topics) for row, topics in rows.items()}
+
+    def _fair_rates(self, topics: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+        """Messages/s of the topics that have to be cut, 0 for those that are left out.
+
+        :param topics: by row of the registry: load of all robots, and messages/s of each
+        """
+        kept = dict(topics)
+        while True:
+            level = _fair_level([(load, self._weight(name)) for name, (load, _) in kept.items()])
+            rates = {
+                name: _round_rate(hz * level * self._weight(name) / load)
+                for name, (load, hz) in kept.items()
+                if load > level * self._weight(name)
+            }
+            tiny = [name for name, hz in rates.items() if hz < max(_LEAST_HZ, _LEAST_SHARE * kept[name][1])]
+            tiny = [name for name in tiny if kept[name][1] > _LEAST_HZ]  # a map is sent, however long it takes
+            if not tiny:
+                return {**dict.fromkeys(topics.keys() - kept.keys(), 0.0), **{n: hz for n, hz in rates.items() if hz}}
+            del kept[max(tiny, key=lambda name: kept[name][0])]
+
+    def _applied(self, rates: Mapping[str, float]) -> Iterator[tuple[Cut, Forecast]]:
+        """Each cut, forecast together with those before it."""
+        scenario = self.scenario
+        without: tuple[str, ...] = ()
+        limited: list[str] = []
+        for row, rate_hz in rates.items():
+            if rate_hz:
+                limited.append(f"ros_source.topic_options.{row}.max_rate={rate_hz:g}")
+                scenario = _sending(scenario, partial(_limited, row=row, rate_hz=rate_hz))
+            else:
+                scenario = _sending(scenario, partial(self._without, row=row))
+                left = [way.ros_source.topics for way in scenario.directions()]
+                if not all(left):
+                    return
+                without = (f"ros_source.topics=[{', '.join(left[0])}]",)
+            forecast = self._forecast(scenario)
+            names = [name for name, other in self._rows.items() if other == row]
+            topic = names[0] if len(names) == 1 else f"{row} of every robot"
+            yield Cut(topic, rate_hz, (*without, *limited), forecast.load), forecast
+
+    def _without(self, source: SourceConfig, *, row: str) -> SourceConfig:
+        left = (topic.name for topic in self.registry.chosen(source.topics))
+        return replace(source, topics=tuple(name for name in left if name != row))
+
+    def _weight(self, row: str) -> float:
+        """Of a topic of all robots together."""
+        return sum(weight for name, weight in self._weights.items() if self._rows[name] == row)
 
     def _codec(self, compression: bool) -> _Remembering | None:
         if not compression:
@@ -277,12 +408,27 @@ class Planner:
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
+        ways = scenario.directions()
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
         codec = self._codec(scenario.ros_source.compresses)
-        duration = scenario.duration_s or self._messages[-1].t
-        messages = [message for message in self._messages if message.t <= duration]
-        shares: Counter[int] = Counter()
+        rule = scenario.airtime.rule
+        allowed = 1.0 if rule is None else min(1.0, len(ways) * sustained(rule))
+        duration = scenario.duration_s or self._messages[0][-1].t
+        topic_ids: dict[tuple[int, str], int] = {}
+        rates_hz: dict[tuple[int, int], float] = {}
+        payloads: dict[tuple[int, int], list[bytes]] = {}
+        messages = []
+        for way, own in zip(ways, self._messages, strict=True):
+            src_id, options = way.ros_source.src_id(), self.registry.with_options(way.ros_source.topic_options)
+            for name, topic_id in source_names(way, self.registry).items():
+                topic_ids[src_id, name] = topic_id
+                rates_hz[src_id, topic_id] = options[topic_id].options.max_rate or np.inf
+                payloads[src_id, topic_id] = []
+            messages.append([m for m in own if m.t <= duration and (src_id, m.topic_id) in payloads])
+            for message in messages[-1]:
+                payloads[src_id, message.topic_id].append(message.payload)
+        shares: Counter[tuple[int, int]] = Counter()
         padded = sent_bytes = 0
         spent = 0.0
 
@@ -298,15 +444,24 @@ class Planner:
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
-                    shares[span.entry.topic_id] += own_airtime * span.size / whole  # type: ignore[assignment]
+                    key = sent.identity.src_id, span.entry.topic_id
+                    shares[key] += own_airtime * span.size / whole  # type: ignore[assignment]
 
-        run = simulate(scenario, phy=phy, messages=iter(messages), codec=codec, on_packet=share, overhead_s=OVERHEAD_S)
-        names = source_names(scenario, self.registry)
+        run = simulate(
+            scenario,
+            registry=self.registry,
+            phy=phy,
+            messages=[iter(own) for own in messages],
+            codec=codec,
+            on_packet=share,
+            overhead_s=OVERHEAD_S,
+        )
         topics = []
         for result in run.topics:
-            topic_id = names[result.topic]
-            mine = [message.payload for message in messages if message.topic_id == topic_id]
-            cost = shares[topic_id] / max(run.stats.sent[topic_id], 1)
+            topic_id = topic_ids[result.src_id, result.topic]
+            key = result.src_id, topic_id
+            mine = payloads[key]
+            cost = shares[key] / max(run.stats[result.src_id].sent[topic_id], 1)
             sizes = [len(payload) if codec is None else len(codec.encode(topic_id, payload)) for payload in mine]
             topics.append(
                 TopicForecast(
@@ -314,8 +469,8 @@ class Planner:
                     offered_hz=len(mine) / duration,
                     message_bytes=float(np.mean([len(payload) for payload in mine])) if mine else 0.0,
                     air_bytes=float(np.mean(sizes)) if mine else 0.0,
-                    load=cost * len(mine) / duration,
-                    share=shares[topic_id] / duration,
+                    load=cost * min(len(mine) / duration, rates_hz[key]) / allowed,
+                    share=shares[key] / duration,
                     rate_hz=result.delivered / duration,
                     result=result,
                 )
@@ -324,10 +479,11 @@ class Planner:
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
-            capacity=1 / airtime,
+            capacity=allowed / airtime,
             used=min(spent / duration, 1.0),
             air_bytes_per_message=sent_bytes / delivered if delivered else None,
             pad=padded / sent_bytes if sent_bytes else 0.0,
+            allowed=allowed,
             topics=tuple(topics),
             air=_air(run),
         )
@@ -369,10 +525,48 @@ class _Remembering:
         return payload
 
 
+def _sending(scenario: Scenario, change: Callable[[SourceConfig], SourceConfig]) -> Scenario:
+    """The scenario with the sending block of every robot changed."""
+    robots = tuple(replace(robot, ros_source=change(robot.ros_source)) for robot in scenario.robots)
+    back = scenario.back and replace(scenario.back, ros_source=change(scenario.back.ros_source))
+    return replace(scenario, ros_source=change(scenario.ros_source), robots=robots, back=back)
+
+
+def _limited(source: SourceConfig, *, row: str, rate_hz: float) -> SourceConfig:
+    options = replaced(source.topic_options.get(row, TopicOptions()), max_rate=rate_hz)
+    return replace(source, topic_options={**source.topic_options, row: options})
+
+
+def _with_packet_len(scenario: Scenario, packet_len: int) -> Scenario:
+    scenario = _sending(scenario, lambda own: replace(own, packet_len=packet_len))
+    sink = replace(scenario.ros_sink, packet_len=packet_len)
+    back = scenario.back and replace(scenario.back, ros_sink=replace(scenario.back.ros_sink, packet_len=packet_len))
+    return replace(scenario, packet_len=packet_len, ros_sink=sink, back=back)
+
+
+def _fair_level(loads: Sequence[tuple[float, float]]) -> float:
+    """Airtime per weight, so that the topics fill ``_FULL`` of the air if none takes more than that.
+
+    :param loads: what each topic would take, and its weight
+    """
+    room, weight = _FULL, sum(weight for _, weight in loads)
+    for load, own in sorted(loads, key=lambda pair: pair[0] / pair[1]):
+        if load > room / weight * own:
+            return room / weight
+        room, weight = room - load, weight - own
+    return np.inf
+
+
+def _round_rate(rate_hz: float) -> float:
+    """The next lower of 1, 2, 5, 10, 20, … messages/s."""
+    decade = 10.0 ** np.floor(np.log10(rate_hz)) if rate_hz > 0 else 0.0
+    return float(max((step * decade for step in (1, 2, 5) if step * decade <= rate_hz), default=0.0))
+
+
 def _air(run: Simulated) -> dict[str, float]:
     """Packets per message sent by their purpose, those of all robots."""
     packets = {kind: run.packets.get(f"air_{kind}", 0) for kind in get_args(AirKind)}
-    messages = max(sum(run.stats.sent.values()), 1)
+    messages = max(sum(stats.sent.total() for stats in run.stats.values()), 1)
     return {kind: count / messages for kind, count in packets.items()} if any(packets.values()) else {}
 
 

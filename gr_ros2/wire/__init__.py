@@ -32,7 +32,7 @@ from gr_ros2.wire.format import (
     Span,
 )
 from gr_ros2.wire.numbers import unwrap
-from gr_ros2.wire.table import Row as TableRow
+from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
 from gr_ros2.wire.v1 import V1
 
@@ -43,6 +43,7 @@ __all__ = [
     "QOS_DEFAULT",
     "QOS_LATENCY",
     "QOS_NAMES",
+    "AnnouncedTopic",
     "CrcError",
     "EncodeError",
     "Entry",
@@ -54,7 +55,6 @@ __all__ = [
     "Packet",
     "PadError",
     "Span",
-    "TableRow",
     "TotalError",
     "VersionError",
     "WireError",

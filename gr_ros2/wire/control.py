@@ -1,4 +1,4 @@
-"""Entries of version 1 that are not messages: hellos, requests and reports.
+"""Entries of version 1 that are not messages: hellos, requests, reports, and what tries out a link.
 
 Invariant: an entry begins with its kind and its length, one byte each, so that a decoder can skip unknown entries.
 """
@@ -11,12 +11,16 @@ from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 
-_HELLO, _ASK, _REPORT, _HEARD = 0xF8, 0xF9, 0xFA, 0xFB
+_HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT = 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD
 
 _heard = Struct(">B4sH")
 _hello = Struct(">QIBI")
 _mark = Struct(">BI")
 _report = Struct(">BHHQB")
+_ping = Struct(">BHBHHQB")
+_about = Struct(">HII")
+_REPLY, _WANTS_ABOUT = 1, 2
+_UNKNOWN_SNR = 255
 _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
 """Range of a reported SNR, dB, and its steps per dB."""
 HELLO_LEN = 2 + _hello.size
@@ -24,6 +28,10 @@ MARK_LEN = _mark.size
 REPORT_LEN = 2 + _report.size
 """Bytes of a report without SNR. With it, a report has one more."""
 HEARD_LEN = 2 + _heard.size
+PING_LEN = 2 + _ping.size
+ABOUT_LEN = 2 + _about.size
+"""Bytes without its text."""
+HELD_STEP_S = 1e-4
 ECHO_LEN = 4
 
 
@@ -129,7 +137,60 @@ class Heard(NamedTuple):
         return f"heard, robot {self.src_id}, its hello that ends in {self.echo.hex()}, after number {self.since}"
 
 
-Control = Hello | Ask | Report | Heard
+class Ping(NamedTuple):
+    """A question to a robot that answers at once, or the answer.
+
+    :param robot: the robot that is asked; in an answer, the robot that asked
+    :param number: of the question, mod 2^16
+    :param reply: whether this is the answer
+    :param wants_about: whether the answer should come with an ``About``
+    :param arrived: in an answer: questions that have come from this robot, mod 2^16
+    :param held: in an answer: time from the question's arrival to the answer's leaving, in ``HELD_STEP_S``, 0..65535
+    :param clock_us: the sender's clock as this leaves, us since 1970; 0 = it has none
+    :param snr_db: in an answer: SNR of the packets of the robot that asked, dB; None where it is not measured
+    """
+
+    robot: int
+    number: int
+    reply: bool = False
+    wants_about: bool = False
+    arrived: int = 0
+    held: int = 0
+    clock_us: int = 0
+    snr_db: float | None = None
+
+    def describe(self) -> str:
+        """The entry in words."""
+        if not self.reply:
+            return f"ping, number {self.number} to robot {self.robot}" + ", asks what it is" * self.wants_about
+        snr = "" if self.snr_db is None else f", SNR {self.snr_db:g} dB"
+        return (
+            f"pong, number {self.number} to robot {self.robot}, {self.arrived} have come, "
+            f"held for {self.held * HELD_STEP_S * 1e3:.1f} ms{snr}"
+        )
+
+
+class About(NamedTuple):
+    """What a robot's end of the link is, so that another end can tell what does not match.
+
+    :param packet_len: its longest packet, bytes
+    :param phy: CRC-32 of the settings of its PHY
+    :param key: first 4 bytes of the SHA-256 of its key, 0 without one
+    :param text: version of the program and whatever else people want to know; UTF-8
+    """
+
+    packet_len: int
+    phy: int
+    key: int
+    text: bytes = b""
+
+    def describe(self) -> str:
+        """The entry in words."""
+        text = self.text.decode("utf-8", "replace")
+        return f"about, packets of {self.packet_len} bytes, phy {self.phy:08x}, key {self.key:08x}, {text!r}"
+
+
+Control = Hello | Ask | Report | Heard | Ping | About
 
 
 def reportable(snr_db: float) -> float:
@@ -149,9 +210,7 @@ def write_control(entry: Control) -> bytes:
                 raise EncodeError(f"loss {loss} of a report is not in 0..127")
             name, data = _REPORT, _report.pack(source, boot, number, arrived, settled << 7 | loss)
             if snr_db is not None:
-                if not _LEAST_SNR_DB <= snr_db <= _MOST_SNR_DB:
-                    raise EncodeError(f"SNR {snr_db} dB of a report is not in {_LEAST_SNR_DB}..{_MOST_SNR_DB}")
-                data += bytes((round((snr_db - _LEAST_SNR_DB) * _SNR_STEPS),))
+                data += bytes((_snr_byte(snr_db),))
         elif isinstance(entry, Hello):
             marks = b"".join(_mark.pack(*mark) for mark in entry.marks)
             name, data = _HELLO, _hello.pack(*entry[:4]) + marks
@@ -159,6 +218,13 @@ def write_control(entry: Control) -> bytes:
             if len(entry.echo) != ECHO_LEN:
                 raise EncodeError(f"{entry}: an echo has {ECHO_LEN} bytes")
             name, data = _HEARD, _heard.pack(*entry)
+        elif isinstance(entry, Ping):
+            robot, number, reply, wants_about, arrived, held, clock_us, snr_db = entry
+            flags = _REPLY * reply | _WANTS_ABOUT * wants_about
+            snr = _UNKNOWN_SNR if snr_db is None else _snr_byte(snr_db)
+            name, data = _PING, _ping.pack(robot, number, flags, arrived, held, clock_us, snr)
+        elif isinstance(entry, About):
+            name, data = _ABOUT, _about.pack(*entry[:3]) + entry.text
         else:
             name, data = _ASK, bytes((entry.src_id,)) + entry.topic_ids
         return bytes((name, len(data))) + data
@@ -166,11 +232,24 @@ def write_control(entry: Control) -> bytes:
         raise EncodeError(f"a field of {entry} is out of range ({error})") from error
 
 
+def _snr_byte(snr_db: float) -> int:
+    if not _LEAST_SNR_DB <= snr_db <= _MOST_SNR_DB:
+        raise EncodeError(f"SNR {snr_db} dB is not in {_LEAST_SNR_DB}..{_MOST_SNR_DB}")
+    return round((snr_db - _LEAST_SNR_DB) * _SNR_STEPS)
+
+
+def _snr_db(byte: int) -> float:
+    snr_db = _LEAST_SNR_DB + byte / _SNR_STEPS
+    if snr_db > _MOST_SNR_DB:
+        raise EntryKindError(f"an SNR of {snr_db:g} dB")
+    return snr_db
+
+
 def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | None]:
     """Where the entry after the one at ``position`` begins, and the entry itself; None for an unknown kind.
 
     :raises EntryBoundsError: it runs past ``end``, or its length is not a multiple of the size of its items
-    :raises EntryKindError: a report of an SNR out of range
+    :raises EntryKindError: an SNR out of range
     """
     name = body[position]
     start = position + 2
@@ -182,9 +261,7 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | N
         if size not in (_report.size, _report.size + 1):
             raise EntryBoundsError(f"a report of {size} bytes")
         source, boot, number, arrived, tail = _report.unpack_from(body, start)
-        snr_db = _LEAST_SNR_DB + body[stop - 1] / _SNR_STEPS if size > _report.size else None
-        if snr_db is not None and snr_db > _MOST_SNR_DB:
-            raise EntryKindError(f"a report of an SNR of {snr_db:g} dB")
+        snr_db = _snr_db(body[stop - 1]) if size > _report.size else None
         return stop, Report(source, boot, number, arrived, tail > 127, tail & 127, snr_db)
     if name == _HELLO:
         if size < _hello.size or (size - _hello.size) % _mark.size:
@@ -200,4 +277,16 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | N
         if size < 2:
             raise EntryBoundsError(f"a request of {size} bytes")
         return stop, Ask(body[start], body[start + 1 : stop])
+    if name == _PING:
+        if size != _ping.size:
+            raise EntryBoundsError(f"a ping of {size} bytes")
+        robot, number, flags, arrived, held, clock_us, snr = _ping.unpack_from(body, start)
+        reply, wants_about = flags & _REPLY != 0, flags & _WANTS_ABOUT != 0
+        snr_db = None if snr == _UNKNOWN_SNR else _snr_db(snr)
+        return stop, Ping(robot, number, reply, wants_about, arrived, held, clock_us, snr_db)
+    if name == _ABOUT:
+        if size < _about.size:
+            raise EntryBoundsError(f"an about of {size} bytes")
+        packet_len, phy, key = _about.unpack_from(body, start)
+        return stop, About(packet_len, phy, key, body[start + _about.size : stop])
     return stop, None

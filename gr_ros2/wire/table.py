@@ -17,7 +17,7 @@ _QOS, _RELIABLE, _LATCHED, _FRESH = 3, 4, 8, 16
 _FIXED = 4
 
 
-class Row(NamedTuple):
+class AnnouncedTopic(NamedTuple):
     """One topic.
 
     :param topic_id: 0..239
@@ -49,7 +49,7 @@ class Row(NamedTuple):
         return ", ".join(words)
 
 
-def write_table(rows: Iterable[Row]) -> bytes:
+def write_table(rows: Iterable[AnnouncedTopic]) -> bytes:
     """The bytes of a table.
 
     :raises EncodeError: a field out of range, or a text of more than 255 bytes
@@ -67,14 +67,14 @@ def write_table(rows: Iterable[Row]) -> bytes:
     return b"".join(parts)
 
 
-def read_table(data: bytes) -> tuple[Row, ...]:
+def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
     """The rows of a table.
 
     :raises WireError: VersionError (an unknown layout), EntryBoundsError (cut off) or EntryKindError
     """
     if data[:1] != bytes((_FORMAT,)):
         raise VersionError(f"a table of topics of layout {data[:1].hex() or 'none'}")
-    rows: list[Row] = []
+    rows: list[AnnouncedTopic] = []
     position = 1
     while position < len(data):
         if position + _FIXED > len(data):
@@ -95,5 +95,9 @@ def read_table(data: bytes) -> tuple[Row, ...]:
             raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in row {len(rows)} of a table")
         name, type_name, codec = texts
         reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
-        rows.append(Row(topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0))
+        rows.append(
+            AnnouncedTopic(
+                topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0
+            )
+        )
     return tuple(rows)

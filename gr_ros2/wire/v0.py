@@ -1,7 +1,7 @@
 """Version 0 of the wire format, byte for byte (the paper, section 5 and table 3): packets, arithmetic, codec.
 
 Invariants: ``decode`` raises nothing but a named WireError, whatever the bytes; ``decode(encode(p, n), n) == p`` for
-every packet that ``encode`` accepts; ``encode`` writes exactly ``packet_len`` bytes; a Packet or Entry is immutable.
+every packet that ``encode`` accepts; ``encode`` writes exactly ``packet_len`` bytes; its values are immutable.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _entry_header = Struct(">BBBH")
 _crc = Struct(">H")
 
 
-class Entry(NamedTuple):
+class EntryV0(NamedTuple):
     """One fragment of one message.
 
     :param topic_id: registry row, 0..15
@@ -73,7 +73,7 @@ class Entry(NamedTuple):
         return f"entry_id {self.entry_id}, index {self.index} of {self.total}"
 
 
-class Packet(NamedTuple):
+class PacketV0(NamedTuple):
     """One packet. Its length is not stored here: it is a property of the link.
 
     :param src_id: 0..254 (a received one may be 255)
@@ -90,7 +90,7 @@ class Packet(NamedTuple):
     dst_id: int
     seq: int
     hop: int
-    entries: tuple[Entry, ...]
+    entries: tuple[EntryV0, ...]
     version: int = _VERSION
     qos: int = 0
     compressed: bool = False
@@ -165,7 +165,7 @@ class FormatV0:
         """Bytes of header, topic ids, entries and CRC. L_pad of section 5.3 is ``packet_len`` minus this number."""
         return overhead(len(payload_lens)) + _ENTRY_HEADER_LEN * len(payload_lens) + sum(payload_lens)
 
-    def layout(self, packet: Packet, packet_len: int, size: int | None = None) -> list[Span]:  # noqa: ARG002
+    def layout(self, packet: PacketV0, packet_len: int, size: int | None = None) -> list[Span]:  # noqa: ARG002
         """The fields of a packet, in the order of its bytes. All packets have ``packet_len`` bytes."""
         entries = packet.entries
         pad = packet_len - self.packed_len([len(entry.payload) for entry in entries])
@@ -177,7 +177,7 @@ class FormatV0:
             Span("crc", _CRC_LEN),
         ]
 
-    def encode(self, packet: Packet, packet_len: int) -> bytes:
+    def encode(self, packet: PacketV0, packet_len: int) -> bytes:
         """The ``packet_len`` bytes of a packet.
 
         :raises EncodeError: a field out of range, no or more than 15 entries, or more bytes than fit
@@ -217,7 +217,7 @@ class FormatV0:
         body = body.ljust(room, b"\0")
         return body + _crc.pack(crc_hqx(body, 0))
 
-    def decode(self, data: bytes, packet_len: int) -> Packet:
+    def decode(self, data: bytes, packet_len: int) -> PacketV0:
         """Read exactly ``packet_len`` bytes.
 
         The spare low nibble of the topic ids is ignored, and QoS 11 reads as default (0).
@@ -253,11 +253,11 @@ class FormatV0:
                 raise IndexRangeError(f"entry {number}: index {index} is not below total {total}")
             ids = data[_HEADER_LEN + (number >> 1)]
             topic_id = ids & 15 if number & 1 else ids >> 4
-            entries.append(Entry(topic_id, entry_id, index, total, data[start:position]))
+            entries.append(EntryV0(topic_id, entry_id, index, total, data[start:position]))
         if data.count(0, position, end) != end - position:
             raise PadError(f"PAD from byte {position} is not all zero")
         qos = flags >> _QOS_SHIFT & _QOS_MASK
-        return Packet(
+        return PacketV0(
             src_id,
             dst_id,
             seq,

@@ -1,8 +1,8 @@
 """Version 1 on the wire, byte for byte; ``docs/reference/wire-format.md`` describes it.
 
-A packet is a header, a body and a trailer. A *source* packet carries entries and has a number of its own. A *standing*
-packet uses the number of a source packet; its row distinguishes it from other packets with this number. There are two
-kinds of standing packets: a *repair* combines the bodies of source packets, and a *control* packet carries hellos,
+A packet is a header, a body and a trailer. A *source* packet carries entries and has a number of its own. A *repair*
+packet uses the number of a source packet; its row distinguishes it from other packets with this number. A
+repair packet combines the bodies of source packets. One that combines none is a *control* packet: it carries hellos,
 reports and requests.
 
 Invariants: every function that reads raises nothing but a named WireError, whatever the bytes; what is written reads
@@ -31,6 +31,7 @@ from gr_ros2.core.errors import (
 )
 from gr_ros2.wire.control import Control, Hello, read_control, write_control
 from gr_ros2.wire.format import Span
+from gr_ros2.wire.mac_block import MOST_LEN, block_len
 
 VERSION = 1
 BROADCAST = 255
@@ -38,15 +39,15 @@ BROADCAST = 255
 HEADER_LEN = 4
 ADDRESS_LEN = 2
 """Bytes that destination and hop count add to the header of an addressed packet."""
-STANDING_LEN = 2
+REPAIR_HEADER_LEN = 2
 """Bytes of window and row. A source packet leaves the same number of bytes free, so that its body fits in a repair."""
 CRC_LEN = 4
 TAG_LEN = 8
 
-QOS_STANDING = 3
+QOS_REPAIR = 3
 """Value of the two QoS bits in packets that are not source packets."""
 ROWS = 128
-"""Most standing packets at one number."""
+"""Most repair packets at one number."""
 MAX_WINDOW = 127
 """Most numbers that a repair spans."""
 
@@ -58,6 +59,7 @@ MAX_MESSAGE = 1 << 24
 MAX_BACK = (1 << 21) - 1
 """Most packets that a message may span."""
 
+_BLOCK = 0x80
 _SEALED, _ADDRESSED = 8, 4
 _MASKED = _CLEAR = _OLDEST = 0x80
 _CODED, _FILL = 0x20, 0x10
@@ -75,9 +77,10 @@ class Header(NamedTuple):
     :param qos: 0 default, 1 latency, 2 bulk; 3 for a packet that is not a source packet
     :param sealed: the trailer is an 8-byte tag, not a CRC-32
     :param src_id: 0..254
-    :param number: number of the source packet, or the number at which a standing packet stands; mod 2^16
+    :param number: number of the source packet, or the number at which a repair packet stands; mod 2^16
     :param dst_id: 0..254 in an addressed packet, otherwise 255
     :param hop: hop count of an addressed packet, 0..255
+    :param block: for medium access, see :mod:`gr_ros2.wire.mac_block`; empty where a channel is not shared
     """
 
     qos: int
@@ -86,11 +89,16 @@ class Header(NamedTuple):
     number: int
     dst_id: int = BROADCAST
     hop: int = 0
+    block: bytes = b""
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
-        return HEADER_LEN if self.dst_id == BROADCAST else HEADER_LEN + ADDRESS_LEN
+        """Bytes on the wire, with the block."""
+        return HEADER_LEN + (self.dst_id != BROADCAST) * ADDRESS_LEN + len(self.block)
+
+    def room(self, packet_len: int) -> int:
+        """Bytes of the longest body behind such a header."""
+        return body_room(packet_len, sealed=self.sealed, addressed=self.dst_id != BROADCAST, block=bool(self.block))
 
 
 class Part(NamedTuple):
@@ -131,10 +139,10 @@ class Part(NamedTuple):
         return f"began {self.back} packets ago, bytes from {self.offset} on{end}"
 
 
-Entry = Part | Control
+EntryV1 = Part | Control
 
 
-class Standing(NamedTuple):
+class RepairHeader(NamedTuple):
     """The fields after the header of a packet that is not a source packet.
 
     :param row: 0..127; number and row together identify the packet
@@ -148,7 +156,7 @@ class Standing(NamedTuple):
     mask: int = 0
     oldest: bool = False
     clear: bool = False
-    size: int = STANDING_LEN
+    size: int = REPAIR_HEADER_LEN
 
 
 def session_crc(boot: int, turns: int) -> int:
@@ -165,25 +173,25 @@ def crc(data: bytes, session: int) -> bytes:
     return crc32(data, session).to_bytes(CRC_LEN, "big")
 
 
-def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False) -> int:
-    """Bytes of the longest body of a source packet."""
-    used = HEADER_LEN + addressed * ADDRESS_LEN + STANDING_LEN + (TAG_LEN if sealed else CRC_LEN)
-    return max(packet_len - used, 0)
+def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False, block: bool = False) -> int:
+    """Bytes of the longest body of a source packet, whatever the length of its block for medium access."""
+    used = HEADER_LEN + addressed * ADDRESS_LEN + REPAIR_HEADER_LEN + (TAG_LEN if sealed else CRC_LEN)
+    return max(packet_len - used - block * MOST_LEN, 0)
 
 
 def write_header(header: Header) -> bytes:
-    """The 4 or 6 bytes of a header.
+    """The 4 or 6 bytes of a header, and the block behind it.
 
     :raises EncodeError: for a field out of range
     """
-    qos, sealed, src_id, number, dst_id, hop = header
+    qos, sealed, src_id, number, dst_id, hop, block = header
     addressed = dst_id != BROADCAST
     try:
-        if not 0 <= qos <= QOS_STANDING or not 0 <= src_id < BROADCAST:
+        if not 0 <= qos <= QOS_REPAIR or not 0 <= src_id < BROADCAST:
             raise EncodeError(f"qos {qos} or src_id {src_id} of {header} is out of range")
-        first = VERSION << 4 | sealed * _SEALED | addressed * _ADDRESSED | qos
+        first = bool(block) * _BLOCK | VERSION << 4 | sealed * _SEALED | addressed * _ADDRESSED | qos
         data = _header.pack(first, src_id, number)
-        return data + bytes((dst_id, hop)) if addressed else data
+        return data + bytes((dst_id, hop)) + block if addressed else data + block
     except (struct_error, ValueError) as error:
         raise EncodeError(f"a field of {header} is out of range ({error})") from error
 
@@ -193,31 +201,34 @@ def read_header(data: bytes, packet_len: int) -> Header:
 
     :raises LengthError: too long, or too short for header and trailer
     :raises VersionError: not version 1
+    :raises EntryBoundsError: its block for medium access runs into the trailer
     """
     size = len(data)
     if size > packet_len or size < HEADER_LEN + CRC_LEN:
         raise LengthError(f"{size} bytes where packet_len is {packet_len}")
     first, src_id, number = _header.unpack_from(data)
-    if first >> 4 != VERSION:
-        raise VersionError(f"version {first >> 4}; this decoder reads version {VERSION}")
-    if first & (_SEALED | _ADDRESSED):
-        least = HEADER_LEN + (TAG_LEN if first & _SEALED else CRC_LEN) + (ADDRESS_LEN if first & _ADDRESSED else 0)
-        if size < least:
-            raise LengthError(f"{size} bytes; a packet of this kind has at least {least}")
-        if first & _ADDRESSED:
-            return Header(first & 3, first & _SEALED != 0, src_id, number, data[4], data[5])
+    if first >> 4 & 7 != VERSION:
+        raise VersionError(f"version {first >> 4 & 7}; this decoder reads version {VERSION}")
+    if first & (_BLOCK | _SEALED | _ADDRESSED):
+        start = HEADER_LEN + ADDRESS_LEN if first & _ADDRESSED else HEADER_LEN
+        end = size - (TAG_LEN if first & _SEALED else CRC_LEN)
+        if start > end:
+            raise LengthError(f"{size} bytes; a packet of this kind has at least {size + start - end}")
+        to = (data[4], data[5]) if first & _ADDRESSED else (BROADCAST, 0)
+        block = data[start : start + block_len(data, start, end)] if first & _BLOCK else b""
+        return Header(first & 3, first & _SEALED != 0, src_id, number, *to, block)
     return Header(first & 3, first & _SEALED != 0, src_id, number)
 
 
-def write_standing(standing: Standing) -> bytes:
+def write_repair_header(repair: RepairHeader) -> bytes:
     """The bytes of window, row and mask. A mask is written if the combination leaves out packets of its window.
 
     :raises EncodeError: for a field out of range
     """
-    row, mask, oldest, clear, _ = standing
+    row, mask, oldest, clear, _ = repair
     window = mask.bit_length()
     if not 0 <= row < ROWS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)):
-        raise EncodeError(f"{standing}: a row is 0..127, a mask has up to 127 bits and the lowest set")
+        raise EncodeError(f"{repair}: a row is 0..127, a mask has up to 127 bits and the lowest set")
     second = row | oldest * _OLDEST
     if not mask:
         return bytes((clear * _CLEAR, second))
@@ -226,27 +237,27 @@ def write_standing(standing: Standing) -> bytes:
     return bytes((window | _MASKED, second)) + mask.to_bytes((window + 7) // 8, "little")
 
 
-def read_standing(data: bytes, start: int, end: int) -> Standing:
+def read_repair_header(data: bytes, start: int, end: int) -> RepairHeader:
     """Window, row and mask from byte ``start`` of a packet whose trailer begins at ``end``.
 
     :raises EntryBoundsError: they run into the trailer
     :raises WindowError: bits that contradict each other
     """
-    if start + STANDING_LEN > end:
+    if start + REPAIR_HEADER_LEN > end:
         raise EntryBoundsError(f"window and row run past byte {end}")
     window, row = data[start] & 127, data[start + 1] & 127
     flag, oldest = data[start] & _MASKED, data[start + 1] & _OLDEST != 0
     if not window:
-        return Standing(row, 0, oldest, flag != 0)
+        return RepairHeader(row, 0, oldest, flag != 0)
     if not flag:
-        return Standing(row, (1 << window) - 1, oldest)
-    size = STANDING_LEN + (window + 7) // 8
+        return RepairHeader(row, (1 << window) - 1, oldest)
+    size = REPAIR_HEADER_LEN + (window + 7) // 8
     if start + size > end:
         raise EntryBoundsError(f"the mask of {window} numbers runs past byte {end}")
-    mask = int.from_bytes(data[start + STANDING_LEN : start + size], "little")
+    mask = int.from_bytes(data[start + REPAIR_HEADER_LEN : start + size], "little")
     if not mask & 1 or mask.bit_length() != window or mask + 1 == 1 << window:
         raise WindowError(f"mask {mask:#x} does not begin and end a window of {window}, or leaves nothing out")
-    return Standing(row, mask, oldest, False, size)
+    return RepairHeader(row, mask, oldest, False, size)
 
 
 def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
@@ -268,7 +279,7 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
     return most, head + most
 
 
-def write_body(entries: Sequence[Entry], room: int) -> bytes:
+def write_body(entries: Sequence[EntryV1], room: int) -> bytes:
     """The bytes of some entries, without padding.
 
     :param room: bytes of the longest body; if the last entry ends there, it leaves out its length where possible
@@ -282,13 +293,13 @@ def write_body(entries: Sequence[Entry], room: int) -> bytes:
     return body
 
 
-def read_body(body: bytes, room: int) -> list[Entry]:
+def read_body(body: bytes, room: int) -> list[EntryV1]:
     """The entries of a body. Zeros may follow them; entries of unknown kinds are left out.
 
     :param room: the longest body on this link
     :raises WireError: EntryBoundsError, EntryKindError, VarintError or PadError
     """
-    entries: list[Entry] = []
+    entries: list[EntryV1] = []
     position, end = 0, min(len(body), room)
     while position < end:
         name = body[position]
@@ -387,18 +398,18 @@ def _read_varint(body: bytes, position: int, end: int) -> tuple[int, int]:
     raise EntryBoundsError(f"a number runs past byte {end}")
 
 
-class Packet(NamedTuple):
+class PacketV1(NamedTuple):
     """A packet as a value.
 
     :param body: entries of a source or control packet, as far as they can be read
-    :param standing: the fields of a repair or control packet
+    :param repair: the fields of a repair or control packet
     :param combined: the combination in a repair, as long as the longest body that it combines
     :param encrypted: whether the body was encrypted
     """
 
     header: Header
-    body: tuple[Entry, ...] = ()
-    standing: Standing | None = None
+    body: tuple[EntryV1, ...] = ()
+    repair: RepairHeader | None = None
     combined: bytes = b""
     encrypted: bool = False
 
@@ -416,18 +427,18 @@ class Packet(NamedTuple):
 
     @property
     def seq(self) -> int:
-        """Number of the source packet, or the number at which a standing packet stands, mod 2^16."""
+        """Number of the source packet, or the number at which a repair packet stands, mod 2^16."""
         return self.header.number
 
     @property
     def numbered(self) -> bool:
         """Whether it is a source packet. A repair or a control packet stands at the newest source packet's number."""
-        return self.standing is None
+        return self.repair is None
 
     @property
     def qos(self) -> int:
         """QoS class of its messages; default if it carries none."""
-        return self.header.qos if self.standing is None else 0
+        return self.header.qos if self.repair is None else 0
 
     @property
     def hop(self) -> int:
@@ -449,21 +460,21 @@ class Packet(NamedTuple):
         return tuple([entry for entry in self.body if not isinstance(entry, Part)])
 
 
-def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed: bool = True) -> bytes:
+def encode(packet: PacketV1, packet_len: int, boot: int, turns: int = 0, *, fixed: bool = True) -> bytes:
     """The bytes of a packet that is not sealed.
 
     :param packet_len: bytes of the longest packet on this link
     :param fixed: whether every packet has ``packet_len`` bytes; otherwise it has only as many as needed
     :raises EncodeError: a field out of range, or more than fits
     """
-    header, entries, standing, combined, _ = packet
-    if header.sealed or (standing is None) == (header.qos == QOS_STANDING):
-        raise EncodeError(f"{header}: a sealed packet, or a standing one without its window and row")
-    room = body_room(packet_len, addressed=header.dst_id != BROADCAST)
+    header, entries, repair, combined, _ = packet
+    if header.sealed or (repair is None) == (header.qos == QOS_REPAIR):
+        raise EncodeError(f"{header}: a sealed packet, or a repair packet without its window and row")
+    room = header.room(packet_len)
     data = write_header(header)
-    if standing is not None:
-        data += write_standing(standing)
-    data += combined if standing is not None and standing.mask else write_body(entries, room)
+    if repair is not None:
+        data += write_repair_header(repair)
+    data += combined if repair is not None and repair.mask else write_body(entries, room)
     full = packet_len - CRC_LEN
     if len(data) > full:
         raise EncodeError(f"{len(data) + CRC_LEN} bytes do not fit packet_len {packet_len}")
@@ -471,7 +482,7 @@ def encode(packet: Packet, packet_len: int, boot: int, turns: int = 0, *, fixed:
     return data + crc(data, session_crc(boot, turns))
 
 
-def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> Packet:
+def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> PacketV1:
     """Read a packet that is not sealed.
 
     :param packet_len: bytes of the longest packet on this link
@@ -482,15 +493,15 @@ def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> Packet:
     header = read_header(data, packet_len)
     if header.sealed or crc(data[:-CRC_LEN], session_crc(boot, turns)) != data[-CRC_LEN:]:
         raise CrcError("CRC-32 does not match, or the packet is sealed")
-    room = body_room(packet_len, addressed=header.dst_id != BROADCAST)
+    room = header.room(packet_len)
     start, end = header.size, len(data) - CRC_LEN
-    if header.qos != QOS_STANDING:
-        return Packet(header, tuple(read_body(data[start:end], room)))
-    standing = read_standing(data, start, end)
-    start += standing.size
-    if standing.mask:
-        return Packet(header, (), standing, data[start:end])
-    return Packet(header, tuple(read_body(data[start:end], room)), standing)
+    if header.qos != QOS_REPAIR:
+        return PacketV1(header, tuple(read_body(data[start:end], room)))
+    repair = read_repair_header(data, start, end)
+    start += repair.size
+    if repair.mask:
+        return PacketV1(header, (), repair, data[start:end])
+    return PacketV1(header, tuple(read_body(data[start:end], room)), repair)
 
 
 class FormatV1:
@@ -529,14 +540,14 @@ class FormatV1:
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
         """Bytes of a packet with entries of these payload lengths, without padding."""
-        return HEADER_LEN + STANDING_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
+        return HEADER_LEN + REPAIR_HEADER_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
 
-    def layout(self, packet: Packet, packet_len: int, size: int | None = None) -> list[Span]:
+    def layout(self, packet: PacketV1, packet_len: int, size: int | None = None) -> list[Span]:
         """See :meth:`gr_ros2.wire.format.Format.layout`."""
-        header, standing = packet.header, packet.standing
+        header, repair = packet.header, packet.repair
         trailer = TAG_LEN if header.sealed else CRC_LEN
-        spans = [Span("head", header.size + (standing.size if standing is not None else 0))]
-        free = body_room(packet_len, sealed=header.sealed, addressed=header.dst_id != BROADCAST)
+        spans = [Span("head", header.size + (repair.size if repair is not None else 0))]
+        free = header.room(packet_len)
         for entry in packet.body:
             written = len(write_body([entry], free))
             spans.append(Span("entry" if isinstance(entry, Part) else "control", written, *_shown(entry)))
@@ -546,14 +557,14 @@ class FormatV1:
         rest = (packet_len if size is None else size) - trailer - sum(span.size for span in spans)
         return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
 
-    def encode(self, packet: Packet, packet_len: int) -> bytes:
+    def encode(self, packet: PacketV1, packet_len: int) -> bytes:
         """A packet's bytes, for the lowest boot number of a sender: see ``encode`` of this module.
 
         :raises EncodeError: a field out of range, or more than fits
         """
         return encode(packet, packet_len, 0)
 
-    def decode(self, data: bytes, packet_len: int) -> Packet:
+    def decode(self, data: bytes, packet_len: int) -> PacketV1:
         """Read a packet as far as this is possible without the hello of its sender.
 
         The trailer is checked only if the packet itself carries that hello. Of a sealed packet, only a hello is read.
@@ -563,26 +574,26 @@ class FormatV1:
         """
         header = read_header(data, packet_len)
         trailer = TAG_LEN if header.sealed else CRC_LEN
-        room = body_room(packet_len, sealed=header.sealed, addressed=header.dst_id != BROADCAST)
+        room = header.room(packet_len)
         start, end = header.size, len(data) - trailer
-        standing = None
-        if header.qos == QOS_STANDING:
-            standing = read_standing(data, start, end)
-            start += standing.size
-        clear = standing is not None and standing.clear
+        repair = None
+        if header.qos == QOS_REPAIR:
+            repair = read_repair_header(data, start, end)
+            start += repair.size
+        clear = repair is not None and repair.clear
         if header.sealed and not clear:
-            return Packet(header, (), standing, b"", encrypted=True)
-        if standing is not None and standing.mask:
-            return Packet(header, (), standing, data[start:end])
+            return PacketV1(header, (), repair, b"", encrypted=True)
+        if repair is not None and repair.mask:
+            return PacketV1(header, (), repair, data[start:end])
         body = tuple(read_body(data[start:end], room))
         if clear and not header.sealed:
             hello = body[0] if body else None
             if not isinstance(hello, Hello) or crc(data[:end], session_crc(hello.boot, hello.turns)) != data[end:]:
                 raise CrcError("CRC-32 does not match that of its hello")
-        return Packet(header, body, standing)
+        return PacketV1(header, body, repair)
 
 
-def _shown(entry: Entry) -> tuple[Part, ...]:
+def _shown(entry: EntryV1) -> tuple[Part, ...]:
     return (entry,) if isinstance(entry, Part) else ()
 
 

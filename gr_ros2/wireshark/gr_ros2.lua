@@ -12,15 +12,15 @@ local xor = (bit or bit32).bxor
 local proto = Proto("gr_ros2", "gr-ros2: ROS 2 topics over any radio")
 
 local QOS = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "default (11)" }
-local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a standing packet" }
+local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a repair packet" }
 local KINDS = { [0] = "source", [1] = "repair", [2] = "control" }
 local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fragment", [3] = "last fragment" }
-local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard" }
-local BROADCAST = 255
+local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about" }
+local BROADCAST, MOST_BLOCK = 255, 12
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
 
 local f = {
-    version = ProtoField.uint8("gr_ros2.version", "Version", base.DEC, nil, 0xF0),
+    version = ProtoField.uint8("gr_ros2.version", "Version", base.DEC, nil, 0x70),
     qos = ProtoField.uint8("gr_ros2.qos", "QoS", base.DEC, QOS, 0x0C),
     compressed = ProtoField.bool("gr_ros2.compressed", "Compressed (C)", 8, nil, 0x02),
     encrypted = ProtoField.bool("gr_ros2.encrypted", "Encrypted (E)", 8, nil, 0x01),
@@ -43,10 +43,19 @@ local f = {
     kind = ProtoField.uint8("gr_ros2.kind", "Kind", base.DEC, KINDS),
     sealed = ProtoField.bool("gr_ros2.sealed", "Sealed (S)", 8, nil, 0x08),
     addressed = ProtoField.bool("gr_ros2.addressed", "Addressed (A)", 8, nil, 0x04),
+    shares = ProtoField.bool("gr_ros2.shares", "A block for medium access follows (M)", 8, nil, 0x80),
     qos_bits = ProtoField.uint8("gr_ros2.qos_bits", "QoS", base.DEC, QOS_V1, 0x03),
     number = ProtoField.uint16("gr_ros2.number", "Number, low 16 bits"),
     packet_number = ProtoField.uint32("gr_ros2.packet_number", "Packet number"),
     hop_count = ProtoField.uint8("gr_ros2.hop_count", "Hop count"),
+    slot = ProtoField.uint8("gr_ros2.slot", "Slot, mod 256"),
+    slot_next = ProtoField.uint16("gr_ros2.slot.next", "Slots to the next send"),
+    slot_after = ProtoField.uint16("gr_ros2.slot.after", "Slots from that to the one after"),
+    slot_heard = ProtoField.uint8("gr_ros2.slot.heard", "Robots heard"),
+    slot_name = ProtoField.uint8("gr_ros2.slot.name", "Hears robot", base.DEC, { [BROADCAST] = "none" }),
+    slot_map = ProtoField.uint32("gr_ros2.slot.map", "Expects to receive, bit i in slot + 1 + i", base.HEX),
+    slot_conflict = ProtoField.uint8("gr_ros2.slot.conflict", "Slots to one that two robots want"),
+    slot_yields = ProtoField.uint8("gr_ros2.slot.yields", "Gives it up", base.DEC, { [BROADCAST] = "none" }),
     window = ProtoField.uint8("gr_ros2.window", "Window", base.DEC, nil, 0x7F),
     masked = ProtoField.bool("gr_ros2.masked", "M: a mask follows, or not encrypted", 8, nil, 0x80),
     row = ProtoField.uint8("gr_ros2.row", "Row", base.DEC, nil, 0x7F),
@@ -83,6 +92,15 @@ local f = {
     heard_src_id = ProtoField.uint8("gr_ros2.heard.src_id", "Has heard robot"),
     heard_echo = ProtoField.uint32("gr_ros2.heard.echo", "End of its newest hello", base.HEX),
     heard_since = ProtoField.uint16("gr_ros2.heard.since", "Heard at own number"),
+    ping_robot = ProtoField.uint8("gr_ros2.ping.robot", "Robot"),
+    ping_number = ProtoField.uint16("gr_ros2.ping.number", "Number of the question"),
+    ping_reply = ProtoField.bool("gr_ros2.ping.reply", "Answer", 8, nil, 0x01),
+    ping_count = ProtoField.uint16("gr_ros2.ping.count", "Questions that have come"),
+    ping_held = ProtoField.uint16("gr_ros2.ping.held", "Held (0.1 ms)"),
+    about_packet_len = ProtoField.uint16("gr_ros2.about.packet_len", "packet_len"),
+    about_phy = ProtoField.uint32("gr_ros2.about.phy", "CRC-32 of the settings of the PHY", base.HEX),
+    about_key = ProtoField.uint32("gr_ros2.about.key", "Fingerprint of the key", base.HEX),
+    about_text = ProtoField.string("gr_ros2.about.text", "Text"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
     table_type = ProtoField.string("gr_ros2.table.type", "Type"),
@@ -296,7 +314,7 @@ end
 -- Version 1 -----------------------------------------------------------------------------------------------------------
 
 local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
-local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN = 17, 5, 14, 7
+local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN = 17, 5, 14, 7, 17, 10
 local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
@@ -382,6 +400,8 @@ local function dissect_control(buffer, tree, at, limit)
         ask = size >= 2,
         report = size == REPORT_LEN or size == REPORT_LEN + 1,
         heard = size == HEARD_LEN,
+        ping = size == PING_LEN,
+        about = size >= ABOUT_LEN,
     }
     if sizes[name] == false then
         item:add_proto_expert_info(refused.overrun)
@@ -411,6 +431,26 @@ local function dissect_control(buffer, tree, at, limit)
         item:add(f.heard_src_id, buffer(start, 1))
         item:add(f.heard_echo, buffer(start + 1, 4))
         item:add(f.heard_since, buffer(start + 5, 2))
+    elseif name == "ping" then
+        local snr = buffer(start + 16, 1):uint()
+        item:add(f.ping_robot, buffer(start, 1))
+        item:add(f.ping_number, buffer(start + 1, 2))
+        item:add(f.ping_reply, buffer(start + 3, 1))
+        item:add(f.ping_count, buffer(start + 4, 2))
+        item:add(f.ping_held, buffer(start + 6, 2))
+        if snr > MAX_SNR and snr < 255 then
+            item:add_proto_expert_info(refused.kind)
+            return nil
+        elseif snr < 255 then
+            item:add(f.report_snr, buffer(start + 16, 1), snr / 2 - 40)
+        end
+    elseif name == "about" then
+        item:add(f.about_packet_len, buffer(start, 2))
+        item:add(f.about_phy, buffer(start + 2, 4))
+        item:add(f.about_key, buffer(start + 6, 4))
+        if size > ABOUT_LEN then
+            item:add(f.about_text, buffer(start + 10, size - ABOUT_LEN))
+        end
     end
     return start + size, name
 end
@@ -579,7 +619,7 @@ local function dissect_body(buffer, tree, packet, at, limit)
 end
 
 -- Window, row and mask; returns the place behind them and the window, or nil.
-local function dissect_standing(buffer, tree, at, limit)
+local function dissect_repair_header(buffer, tree, at, limit)
     if at + 2 > limit then
         tree:add_proto_expert_info(refused.overrun)
         return nil
@@ -644,6 +684,31 @@ local function look_up(buffer, packet, limit)
     end
 end
 
+-- The block for medium access; returns the place behind it, or nil.
+local function dissect_block(buffer, tree, at, limit)
+    local size = at + 6 <= limit and buffer(at + 3, 1):uint() > 127 and MOST_BLOCK or 6
+    if at + size > limit then
+        tree:add_proto_expert_info(refused.overrun)
+        return nil
+    end
+    local function ahead(code)
+        return code < 128 and code or 127 + 4 * (code - 127)
+    end
+    local heard = buffer(at + 3, 1):uint() % 128
+    local block = tree:add(f.slot, buffer(at, 1))
+    block:add(f.slot_next, buffer(at + 1, 1), ahead(buffer(at + 1, 1):uint()))
+    block:add(f.slot_after, buffer(at + 2, 1), ahead(buffer(at + 2, 1):uint()))
+    block:add(f.slot_heard, buffer(at + 3, 1), heard < 64 and heard or 63 + 3 * (heard - 63))
+    block:add(f.slot_name, buffer(at + 4, 1))
+    block:add(f.slot_name, buffer(at + 5, 1))
+    if size == MOST_BLOCK then
+        block:add(f.slot_map, buffer(at + 6, 4))
+        block:add(f.slot_conflict, buffer(at + 10, 1))
+        block:add(f.slot_yields, buffer(at + 11, 1))
+    end
+    return at + size
+end
+
 local function dissect_v1(buffer, pinfo, tree)
     local first = buffer(0, 1):uint()
     local sealed, addressed = math.floor(first / 8) % 2 == 1, math.floor(first / 4) % 2 == 1
@@ -654,6 +719,7 @@ local function dissect_v1(buffer, pinfo, tree)
     end
     local limit = buffer:len() - trailer
     tree:add(f.version, buffer(0, 1))
+    tree:add(f.shares, buffer(0, 1))
     tree:add(f.sealed, buffer(0, 1))
     tree:add(f.addressed, buffer(0, 1))
     tree:add(f.qos_bits, buffer(0, 1))
@@ -671,10 +737,13 @@ local function dissect_v1(buffer, pinfo, tree)
     local packet = {
         src = buffer(1, 1):uint(), low = buffer(2, 2):uint(), sealed = sealed, frame = frame, first_time = first_time,
     }
-    local standing = first % 4 == 3
+    local repair, shares = first % 4 == 3, first > 127
     local at, window, clear = header, nil, false
-    if standing then
-        at, window, clear = dissect_standing(buffer, tree, header, limit)
+    if shares then
+        at = dissect_block(buffer, tree, at, limit)
+    end
+    if repair and at then
+        at, window, clear = dissect_repair_header(buffer, tree, at, limit)
         clear = window == 0 and clear
     end
     if first_time then
@@ -686,7 +755,7 @@ local function dissect_v1(buffer, pinfo, tree)
     end
     packet.number = frame.number or packet.low
     tree:add(f.packet_number, buffer(2, 2), packet.number):set_generated()
-    local kind = not standing and 0 or (window or 0) > 0 and 1 or 2
+    local kind = not repair and 0 or (window or 0) > 0 and 1 or 2
     tree:add(f.kind, buffer(0, 1), kind):set_generated()
     local intact = true
     if sealed then
@@ -714,7 +783,7 @@ local function dissect_v1(buffer, pinfo, tree)
         summary = { string.format("of %d..%d", packet.number - window + 1, packet.number) }
     elseif at < limit then
         local packet_len = math.max(proto.prefs.packet_len, longest)
-        local room = packet_len - header - 2 - trailer
+        local room = packet_len - header - 2 - trailer - (shares and MOST_BLOCK or 0)
         -- Without the preference: where all packets are as long as this one, the longest body ends 2 bytes before the trailer; where a sender
         -- sends only what is needed, it ends with the longest packet's.
         if packet_len > proto.prefs.packet_len and packet_len == buffer:len() and buffer(limit - 2, 2):uint() ~= 0 then
@@ -733,7 +802,7 @@ end
 function proto.dissector(buffer, pinfo, root)
     pinfo.cols.protocol = "gr-ros2"
     local tree = root:add(proto, buffer())
-    if buffer:len() > 0 and buffer(0, 1):bitfield(0, 4) == 1 then
+    if buffer:len() > 0 and buffer(0, 1):bitfield(1, 3) == 1 then
         return dissect_v1(buffer, pinfo, tree)
     end
     return dissect_v0(buffer, pinfo, tree)

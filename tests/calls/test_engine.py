@@ -8,7 +8,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.calls import Answer, Calls, Offer, Outgoing, Request, Service
+from gr_ros2.calls import Answer, Calls, Offer, OutgoingFrame, Request, Service
 from gr_ros2.calls.engine import MAX_CALLS
 
 FAR = Service(2, 20, 5, "/rx_robot_2/add")
@@ -171,7 +171,7 @@ def test_whatever_is_lost_repeated_late_or_restarted_nothing_runs_twice_and_the_
     for step in range(120):
         now = step * 0.5
         what = rng.choice("cccccdddddddrrrb2")
-        sent: Outgoing | None = None
+        sent: OutgoingFrame | None = None
         if what == "c":
             serial += 1
             calls += 1

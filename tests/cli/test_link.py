@@ -47,6 +47,7 @@ def stats(
         "packets": {"out": 90, "in": 64, "refused": 0, "damaged": damaged},
         "phy": {"snr_db": snr_db},
         "front_end": {"name": "uhd", "passed": {"bursts_out": 90}, "lost": {"overflows": 0}},
+        "airtime": {"transmits": True, "sent_s": 0.0, "refused": {}},
     }
 
 

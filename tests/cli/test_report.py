@@ -35,12 +35,7 @@ def test_several_folders_leave_theirs_alone(
     new = {path.relative_to(tmp_path).parts[0] for path in set(tmp_path.rglob("*")) - set(before)}
     assert new == {"results", "c"}
     out = capsys.readouterr().out
-    assert next(line for line in out.splitlines() if "PDR" in line).split() == [
-        "/robot_1/odom",
-        "PDR",
-        "0.625",
-        "0.625",
-    ]
+    assert "Nothing differs" in out
 
 
 def cut(path: Path) -> None:

@@ -17,29 +17,31 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.core.errors import ConfigError, WireError
-from gr_ros2.link.events import Received, SentPacket
+from gr_ros2.link.events import PacketId, Received, SentPacket
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.v0 import V0, Packet
+from gr_ros2.wire.mac_block import read_block
+from gr_ros2.wire.v0 import V0, PacketV0
 from gr_ros2.wire.v1 import Header, crc, session_crc, write_header
 from gr_ros2.wire.v1 import decode as read
 from tests.cli.test_packet import hello
-from tests.link.v1.test_reader import talk
+from tests.link.test_reader import talk
 
 V1 = json.loads((Path(__file__).parent.parent / "vectors" / "v1.json").read_text())
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 FIELDS = ("src_id", "dst_id", "seq", "hop", "qos", "compressed", "encrypted", "entries", "crc")
 
-NOTHING = Packet(1, 255, 0, 1, ())
+NOTHING = PacketV0(1, 255, 0, 1, ())
+NOBODY = PacketId(1, 0, 0, 0)
 """A capture has the bytes as they are."""
 
 
 def capture(path: Path, packets: list[bytes]) -> Path:
     with PacketCapture(path, clock=lambda: 0.0) as writing:
         for number, data in enumerate(packets):
-            writing.sender_event(1, SentPacket(data, NOTHING, (), number * 0.5))
-            writing.receiver_event(Received(data, NOTHING), number * 0.5 + 0.25)
+            writing.sender_event(1, SentPacket(data, NOTHING, NOBODY, (), number * 0.5))
+            writing.receiver_event(Received(data, NOTHING, NOBODY), number * 0.5 + 0.25)
     return path
 
 
@@ -147,7 +149,8 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
     for vector in vectors:
         packets += [bytes.fromhex(hello(vector, bytes.fromhex(vector.get("key", "")))), bytes.fromhex(vector["hex"])]
     path = capture(tmp_path / "v1.pcapng", packets)
-    shown = dissected(path)[2::4]
+    preference = ("-o", "gr_ros2.packet_len:64")
+    shown = dissected(path, *preference)[2::4]
     for vector, layers in zip(vectors, shown, strict=True):
         tree, entries = layers["gr_ros2"], vector["entries"]
         data = bytes.fromhex(vector["hex"])
@@ -159,7 +162,22 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
         assert numbers("version") == [1]
         assert numbers("src_id") == [data[1]]
         assert numbers("packet_number") == [vector["number"]], vector["name"]
-        assert numbers("row") == ([data[5] & 127] if data[0] & 3 == 3 else [])
+        block = data[6 if data[0] & 4 else 4 :][:12] if data[0] & 128 else b""
+        at = 5 + (12 if block and block[3] & 128 else 6) * bool(block)
+        assert numbers("row") == ([data[at] & 127] if data[0] & 3 == 3 else [])
+        assert numbers("shares") == [bool(block)]
+        said = read_block(block)[0] if block else None
+        for field, value in (
+            ("slot", said and [said.slot]),
+            ("slot.next", said and [said.ahead[0]]),
+            ("slot.after", said and [said.ahead[1]]),
+            ("slot.heard", said and [said.heard]),
+            ("slot.name", said and list(said.names)),
+            ("slot.map", said and said.expected is not None and [said.expected]),
+            ("slot.conflict", said and said.expected is not None and [said.conflict[0]]),
+            ("slot.yields", said and said.expected is not None and [said.conflict[1]]),
+        ):
+            assert numbers(field) == (value or []), (vector["name"], field)
         assert numbers("sealed") == [sealed]
         assert values(tree, "gr_ros2.tag") == ([data[-8:].hex(":")] if sealed else [])
         assert numbers("crc32") == ([] if sealed else [int.from_bytes(data[-4:], "big")])
@@ -227,11 +245,13 @@ def test_what_a_receiver_of_version_1_refuses_is_marked_by_the_same_name(tmp_pat
 
     for number, vector in enumerate(V1["refused_bodies"], 1):
         add(write_header(Header(0, False, 1, number)), bytes.fromhex(vector["hex"]), vector["error"])
-    standing = write_header(Header(3, False, 1, 1))
+    for text in ("fa07070203", "fa07078203ff0000000012"):
+        add(b"\x90\x01\x00\x01", bytes.fromhex(text), "entry_bounds")
+    repair = write_header(Header(3, False, 1, 1))
     for text in ("850003", "850012", "85001f"):
-        add(standing, bytes.fromhex(text), "window")
+        add(repair, bytes.fromhex(text), "window")
     for text in ("00", "8900ff"):
-        add(standing, bytes.fromhex(text), "entry_bounds")
+        add(repair, bytes.fromhex(text), "entry_bounds")
     packets.append(packets[0][:-1] + bytes((packets[0][-1] ^ 1,)))
     kinds.append("crc")
     packets.append(b"\x10\x01\x00\x01" + bytes(3))
@@ -255,7 +275,7 @@ def test_a_conversation_is_read_with_the_topics_that_it_announces(mode: SealMode
     path = tmp_path / "talk.pcapng"
     with PacketCapture(path, clock=lambda: 0.0) as writing:
         for number, data in enumerate(packets):
-            writing.receiver_event(Received(data, NOTHING), number / 75)
+            writing.receiver_event(Received(data, NOTHING, NOBODY), number / 75)
     assert not tshark(path, "-Y", "_ws.expert")
     hidden = tshark(path, "-Y", "gr_ros2.ciphertext").count("\n")
     named = tshark(path, "-Y", 'gr_ros2.topic == "scan"').count("\n")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.link import Delivered, Lost, Received, Receiver, ReceiverEvent
+from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, Receiver, ReceiverEvent
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.compression.support import simulated
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
@@ -20,8 +20,8 @@ def received(coded: bytes, *, codec: LinkCodec | None, compressed: bool = True) 
     pieces = [coded[at : at + 100] for at in range(0, len(coded), 100)]
     events: list[ReceiverEvent] = []
     for n, piece in enumerate(pieces):
-        packet = Packet(1, 255, n, 1, (Entry(0, 7, n, len(pieces), piece),), compressed=compressed)
-        events += receiver.receive(V0.encode(packet, PACKET_LEN), 0.0)
+        packet = PacketV0(1, 255, n, 1, (EntryV0(0, 7, n, len(pieces), piece),), compressed=compressed)
+        events += receiver.receive(ReceivedPacket(V0.encode(packet, PACKET_LEN)), 0.0)
     lost = [key for key, count in receiver.stats.lost.items() if count == 1]
     assert lost == [(event.src_id, event.topic_id, event.reason) for event in events if isinstance(event, Lost)]
     return [event for event in events if not isinstance(event, Received)]

@@ -6,11 +6,12 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.link import Receiver, Sender
+from gr_ros2.link import ReceivedPacket, Receiver, Sender
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.record.positions import humble_types
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
+from tests.packets import data_of
 
 REGISTRY = Registry.from_rows({"at": "geometry_msgs/PointStamped", "raw": "my_msgs/Thing"})
 SRC = 4
@@ -56,7 +57,7 @@ class Feed:
     def fly(self, now: float, latency: float = 0.05, most: int = 1_000_000) -> None:
         """At most so many packets cross."""
         for _ in range(most):
-            data = self.sender.next_packet(now)
+            data = data_of(self.sender.next_packet(now))
             if data is None:
                 return
             self.packets += 1
@@ -66,7 +67,7 @@ class Feed:
 
     def hear(self, data: bytes, now: float) -> None:
         """Bytes come to the receiver."""
-        self._tell(self.receiver.receive(data, now), now)
+        self._tell(self.receiver.receive(ReceivedPacket(data), now), now)
 
     def pass_time(self, now: float) -> None:
         """Time passes at the receiver."""

@@ -17,7 +17,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Topic
-from gr_ros2.wire.table import Row
+from gr_ros2.wire.table import AnnouncedTopic
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
 from tests.link.v1.air import Robot, registry
 
@@ -190,7 +190,7 @@ def test_topics_get_the_names_that_their_robot_announces() -> None:
     state = make()
     state.receiver_event(Delivered(9, 3, at(1, 2), 0, "key"), 1.0)
     assert [topic.name for topic in state.tick(1.0).topics if topic.src_id == 9] == ["/source_9/topic_3"]
-    state.receiver_event(Announced(9, (Row(3, "ground_truth", "nav_msgs/msg/Odometry"),)), 2.0)
+    state.receiver_event(Announced(9, (AnnouncedTopic(3, "ground_truth", "nav_msgs/msg/Odometry"),)), 2.0)
     state.receiver_event(Delivered(9, 3, at(2, 3), 0, "later"), 3.0)
     (topic,) = [topic for topic in state.tick(3.0).topics if topic.src_id == 9]
     assert (topic.name, topic.type_name) == ("/source_9/ground_truth", "nav_msgs/msg/Odometry")
@@ -269,7 +269,7 @@ def test_packets_that_stand_at_the_newest_number_are_not_a_turn_ahead() -> None:
     for slot in range(400):
         now = slot / 75
         if slot % 3 == 0:
-            sender.end.submit(0, slot.to_bytes(2, "little") * 10, now)
+            sender.end.messages.submit(0, slot.to_bytes(2, "little") * 10, now)
         for robot, other in ((sender, receiver), (receiver, sender)):
             data = robot.slot(now)
             for event in other.receive(data, now) if data is not None and lost.random() > 0.3 else ():

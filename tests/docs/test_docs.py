@@ -17,6 +17,7 @@ import yaml
 
 from gr_ros2.cli.main import LazyGroup, cli
 from gr_ros2.radio.config import link_from
+from gr_ros2.radio.medium import load_medium
 from gr_ros2.run.scenario import load_scenario, scenario_from
 from gr_ros2.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
@@ -41,32 +42,62 @@ SWEEP: dict[str, Any] = {
     "list": [{"phy.name": "ofdm", "phy.options": {}}, {"phy.name": "gfsk", "phy.options": {}}],
 }
 
-OTHERS = {"rviz2", "direwolf", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
+OTHERS = {"rviz2", "export", "direwolf", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
+    ("docs/how-to/radios.md", "gr-ros2 link robot.yaml --check"): "the same; tests/cli/test_status.py",
+    **{
+        ("docs/how-to/radios.md", f"gr-ros2 {words}"): "needs a running link; tests/cli/test_status.py"
+        for words in ("status", "peers", "ping 2", "ping 2 robot.yaml")
+    },
     **{
         ("docs/how-to/radios.md", f"gr-ros2 link --robot {own} --radio zmq --listen 5551 --peer 10.0.0.{other}:5551"): (
             "opens a port to the network; tests/cli/test_link.py"
         )
         for own, other in ((1, 2), (2, 1))
     },
+    **{
+        (
+            "docs/how-to/two-laptops.md",
+            f"gr-ros2 link --robot {own} --radio zmq --listen 5551 --peer 10.0.0.{other}:5551{more}",
+        ): ("opens a port to the network; tests/e2e/test_link_netns.py")
+        for own, other, more in (
+            (1, 2, ""),
+            (2, 1, ""),
+            (1, 2, " --set ros_source.namespace=/ --topics odom scan /tf /tf_static"),
+        )
+    },
+    (
+        "docs/how-to/two-laptops.md",
+        "gr-ros2 dashboard",
+    ): "needs a link in another terminal; tests/cli/test_dashboard.py",
     ("docs/how-to/dashboard.md", "gr-ros2 dashboard"): "needs a run in another terminal; tests/cli/test_dashboard.py",
     ("docs/how-to/dashboard.md", "gr-ros2 dashboard --wait 60"): "the same",
     ("docs/how-to/dashboard.md", "gr-ros2 run demo --dashboard=0.0.0.0:5006"): "opens a port to the network",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --scheduler tcp://HOST:8786"): "needs a Dask cluster",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep pdr-vs-snr"): "takes minutes; tests/study runs the built-in sweeps' cells",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep rate-vs-snr"): "the same",
+    ("docs/how-to/experiments.md", "gr-ros2 plan my_link.yaml --graph"): "needs a robot; tests/cli/test_plan.py",
     ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
+    **{
+        (
+            "docs/how-to/packet-radios.md",
+            f"gr-ros2 link --robot 1 --radio {radio} --device /dev/ttyUSB0 --transmit --open",
+        ): ("no such device; tests/radio/test_packet_radios.py")
+        for radio in ("sik", "lora-uart", "kiss")
+    },
     ("docs/tutorial.md", "gr-ros2 registry from-graph --namespace /robot_1 --out topics.csv"): "needs a robot",
     ("docs/tutorial.md", "gr-ros2 registry check topics.csv"): "the same",
     (
         "docs/how-to/radios.md",
-        "gr-ros2 link --robot 1 --radio kiss --device tcp://localhost:8001 --set front_end.callsign=N0CALL-1",
+        "gr-ros2 link --robot 1 --radio kiss --device tcp://localhost:8001 --transmit --open "
+        "--set front_end.callsign=N0CALL-1",
     ): "direwolf is not running",
     (
         "docs/how-to/radios.md",
-        "gr-ros2 link --robot 1 --radio serial --device /dev/ttyUSB0 --set phy.options.bit_rate=64000",
+        "gr-ros2 link --robot 1 --radio serial --device /dev/ttyUSB0 --transmit --open "
+        "--set phy.options.bit_rate=64000",
     ): "no such device",
 }
 """Commands that a test cannot run as they stand: why. They are parsed like the others."""
@@ -74,6 +105,7 @@ SHORTER = {
     "run": ("--duration", "1"),
     "demo": ("--duration", "1"),
     "link": ("--duration", "1"),
+    "medium": ("--duration", "1"),
     "plan": ("--duration", "2"),
     "replay": ("--duration", "1"),
     "losses": ("--packets", "20"),
@@ -120,6 +152,8 @@ def test_every_yaml_is_accepted(block: Block, tmp_path: Path) -> None:
         assert link_from({"name": "trial", **values})
     elif "scenario" in values:
         assert load_sweep(path)
+    elif any("bind" in robot for robot in values.get("robots", ()) if isinstance(robot, dict)):
+        assert load_medium(path)
     else:
         assert load_scenario(path)
 
@@ -174,10 +208,12 @@ def fill(folder: Path) -> None:
         shutil.copytree(folder / "clean", folder / name)
     bag = folder / "clean" / "delivered"
     (mcap,) = bag.glob("*.mcap")
-    shutil.copy(mcap, folder / "IN.mcap")
+    for name in ("IN.mcap", "arrived.mcap"):
+        shutil.copy(mcap, folder / name)
     ours(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
     shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
     shutil.copy(ROOT / "gr_ros2/scenarios/demo.yaml", folder / "my_scenario.yaml")
+    shutil.copy(ROOT / "gr_ros2/examples/link-sim.yaml", folder / "my_link.yaml")
     shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
     for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
         shutil.copy(path, folder)
@@ -205,6 +241,8 @@ def test_every_command_runs(block: Block, words: list[str], sample_runs: Path, t
             (folder / name).write_text(once_each)
     if words[-2:-1] == ["--out"] or "--out" in words:
         shutil.rmtree(folder / words[words.index("--out") + 1], ignore_errors=True)
+    if words[1] == "replay":
+        (folder / words[3]).unlink(missing_ok=True)
     shorter = list(SHORTER.get(words[1], ()))  # of several settings of one name the last holds
     if words[1] in ("run", "demo") and not {"--pcap", "--dashboard", "time"} & {
         re.split("=", word)[0] for word in words

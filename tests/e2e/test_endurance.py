@@ -22,6 +22,7 @@ from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Probe
 from tests.middleware.support import STRING
+from tests.packets import data_of
 from tests.waiting import wait_for
 
 GROWTH_BYTES = 3_000_000
@@ -50,9 +51,9 @@ def engine_packets(seed: int) -> list[bytes]:
     packets: list[bytes] = []
     for topic_id, payload, at in submissions(5):
         while (due := sender.next_timeout()) is not None and due <= at:
-            packets.append(sender.next_packet(max(due, 0.0)) or b"")
+            packets.append(data_of(sender.next_packet(max(due, 0.0))) or b"")
         sender.submit(topic_id, payload, at)
-    while (data := sender.next_packet(1e6)) is not None:
+    while (data := data_of(sender.next_packet(1e6))) is not None:
         packets.append(data)
     return packets
 
@@ -102,7 +103,7 @@ def test_engine_and_block_agree_on_the_order_of_packets() -> None:
     for topic_id, payload, _ in submissions(5):
         sender.submit(topic_id, payload, 0.0)
     expected = []
-    while (data := sender.next_packet(0.0)) is not None:
+    while (data := data_of(sender.next_packet(0.0))) is not None:
         expected.append(data)
     assert block_packets(7) == expected
 

@@ -95,7 +95,7 @@ def test_it_ends_after_a_duration(config: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(config: Path, change: str, said: str, status: int) -> None:
-    failed = link(config, *set_options([change]))
+    failed = link(config, "--transmit", "--open", *set_options([change]))
     output, errors = failed.communicate(timeout=PATIENCE_S)
     assert (failed.returncode, output) == (status, "")
     assert errors.startswith("gr-ros2: ") and said in errors

@@ -20,7 +20,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.core.errors import ConfigError, CrcError, RunError
-from gr_ros2.link.events import ReceiverEvent, Rejected, SenderEvent
+from gr_ros2.link.events import PacketId, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result, read_result
@@ -195,10 +195,10 @@ def test_a_recorder_that_fails_ends_the_run_instead_of_making_figures_up(
 ) -> None:
     took = Ledger.packet_received
 
-    def fails_later(ledger: Ledger, data: bytes) -> tuple[int, int] | None:
-        if ledger._packets_handed_up > 50:
+    def fails_later(ledger: Ledger, identity: PacketId) -> int | None:
+        if ledger._received > 50:
             raise MemoryError("ledger")
-        return took(ledger, data)
+        return took(ledger, identity)
 
     monkeypatch.setattr(Ledger, "packet_received", fails_later)
     for passing in ("real", "packets"):

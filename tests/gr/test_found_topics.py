@@ -92,7 +92,8 @@ def test_a_publisher_that_comes_back_with_another_type_is_carried_again(
         assert stats["source"]["topics"]["/count"]["submitted"] == 120
         assert stats["sink"]["topics"]["/rx_robot_1/count"]["delivered"] == 120
         assert len(pair.source.registry) == 2
-        rest = {"packets": {"in": 1, "out": 1, "refused": 0, "damaged": 0}, "uptime_s": 1.0}
+        rest = {"packets": {"in": 1, "out": 1, "refused": 0, "damaged": 0}, "airtime": {"transmits": True}}
+        rest["uptime_s"] = 1.0
         line = status_line({**stats, **rest, "phy": {"snr_db": None}, "front_end": {"lost": {}}})
         assert f"/count is {STRING} now" in line
         published = [info.type_name for info in pair.far.discover() if info.publishers]

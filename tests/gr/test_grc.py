@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -87,7 +88,7 @@ def test_parameters_and_defaults_are_those_of_the_configuration(name: str) -> No
     written = {}
     for parameter in description(name)["parameters"]:
         default = parameter["default"]
-        text = parameter["dtype"] in ("string", "file_open")
+        text = parameter["dtype"] in ("string", "file_open", "file_save")
         written[parameter["id"]] = default if text else ast.literal_eval(default)
     written = {key: tuple(value) if isinstance(value, list) else value for key, value in written.items()}
     plain = {key: getattr(value, "default_factory", lambda value=value: value)() for key, value in wanted.items()}
@@ -398,3 +399,69 @@ def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) ->
         for name in ("ros2_source_0", "ros2_sink_0", "ros2_link_1", "ros2_link_2"):
             if hasattr(top, name):
                 getattr(top, name).close()
+
+
+@pytest.fixture(scope="module")
+def drawings() -> dict[str, list[tuple[str, tuple[float, float, float, float]]]]:
+    """Name and rectangle of every block of every example, px, as GNU Radio Companion draws them."""
+    pytest.importorskip("gi", reason="needs GTK; Debian: apt-get install gir1.2-gtk-3.0")
+    if not shutil.which("xvfb-run"):
+        pytest.skip("needs a screen; Debian: apt-get install xvfb")
+    environ = {**os.environ, "GRC_BLOCKS_PATH": str(grc_path())}
+    done = subprocess.run(
+        ["xvfb-run", "-a", sys.executable, "-c", DRAW, *map(str, EXAMPLES)], env=environ, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    found: dict[str, list[tuple[str, tuple[float, float, float, float]]]] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+DRAW = """
+import json, sys
+import gi
+gi.require_version("Gtk", "3.0"), gi.require_version("PangoCairo", "1.0")
+from gi.repository import Gtk
+from gnuradio import gr
+from gnuradio.grc.gui.Platform import Platform
+from gnuradio.grc.gui.canvas import flowgraph
+flowgraph._ContextMenu = lambda window: None  # a menu needs the main window
+platform = Platform(version=gr.version(), version_parts=(gr.major_version(), gr.api_version(), gr.minor_version()),
+                    prefs=gr.prefs(), install_prefix=gr.prefix())
+platform.build_library()
+window = Gtk.OffscreenWindow()
+area = Gtk.DrawingArea()
+window.add(area)
+window.show_all()
+application = Gtk.Application()
+application.register(None)
+application.get_windows = lambda: []
+Gtk.Application.set_default(application)
+found = {}
+for path in sys.argv[1:]:
+    graph = platform.make_flow_graph(path)
+    graph.drawing_area = area
+    graph.update()
+    graph.update_elements_to_draw()
+    for block in graph.blocks:
+        block.create_labels()
+        block.create_shapes()
+    found[path] = [
+        [block.name, [*block.coordinate, block.coordinate[0] + block.width, block.coordinate[1] + block.height]]
+        for block in graph.blocks
+    ]
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_no_block_of_an_example_is_drawn_over_another(path: Path, drawings: dict[str, Any]) -> None:
+    blocks = drawings[str(path)]
+    assert len(blocks) > 3
+    over = [
+        f"{one} and {other}"
+        for number, (one, a) in enumerate(blocks)
+        for other, b in blocks[:number]
+        if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+    ]
+    assert over == []

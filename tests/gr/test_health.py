@@ -14,13 +14,15 @@ def stats(**changes: Any) -> dict[str, Any]:
     """What a link would say after a quiet start."""
     values: dict[str, Any] = {
         "out": 0, "packets": 0, "missing": 0, "rejected": 0, "delivered": 0, "lost": 0, "latency": None, "age": None,
-        "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, "lost_on_graph": 0, "unpublished": 0, **changes,
+        "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, "lost_on_graph": 0, "unpublished": 0,
+        "state_unsaved": 0, **changes,
     }  # fmt: skip
     latency = None if values["latency"] is None else {"p50": values["latency"], "p95": 2 * values["latency"]}
     return {
         "source": {
             "topics": {
                 "/odom": {
+                    "sent": 7,
                     "queued": values["queued"],
                     "queue": values["queue"],
                     "queue_depth": values["depth"],
@@ -28,6 +30,7 @@ def stats(**changes: Any) -> dict[str, Any]:
                     "lost_on_graph": values["lost_on_graph"],
                 },
                 "/map": {
+                    "sent": 0,
                     "queued": values["queued"],
                     "queue": "fifo",
                     "queue_depth": 1000,
@@ -40,6 +43,8 @@ def stats(**changes: Any) -> dict[str, Any]:
             "packets": values["packets"],
             "packet_loss_est": values["missing"],
             "rejected": {"crc": values["rejected"]},
+            "dropped": {"state_not_written": values["state_unsaved"]},
+            "silence_s": {},
             "held_bytes": 0,
             "publish_failed": values["unpublished"],
             "topics": {
@@ -54,6 +59,7 @@ def stats(**changes: Any) -> dict[str, Any]:
         "packets": {"out": values["out"], "backlog": 0, "damaged": 0, "foreign": 0},
         "phy": {"airtime_s": 0.01, "snr_db": values["snr_db"]},
         "front_end": {"name": "sim", "passed": {}, "lost": {}},
+        "airtime": {"transmits": True, "sent_s": 0.0, "refused": {}, **values.get("airtime", {})},
     }
 
 
@@ -91,6 +97,13 @@ def test_what_is_long_past_does_not_count() -> None:
     for second in range(2, 8):
         receiver, _, _ = parts(health, float(second), packets=10 + 10 * second, missing=90)
     assert (receiver.level, receiver.values["packet loss"]) == (Level.OK, "0")
+
+
+def test_a_state_file_that_cannot_be_written_is_shown() -> None:
+    health = make()
+    parts(health, 0.0)
+    receiver, _, _ = parts(health, 1.0, state_unsaved=2)
+    assert (receiver.level, receiver.message) == (Level.WARN, "2 times that the state file could not be written")
 
 
 def test_silence_counts_from_the_last_packet() -> None:
@@ -184,3 +197,9 @@ def test_what_a_front_end_lost_before_the_first_look_is_told() -> None:
 
 def test_a_front_end_that_counts_nothing_is_no_part() -> None:
     assert len(make().judge(stats(), 0.0)) == 3
+
+
+def test_every_topic_has_its_counters() -> None:
+    _, transmitter, topic = parts(make(), 0.0, delivered=11, lost=2)
+    assert (topic.values["messages delivered"], topic.values["messages lost: expired"]) == ("11", "2")
+    assert transmitter.values["/odom (sent, dropped)"] == "7, 3"

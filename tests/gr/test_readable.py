@@ -10,17 +10,18 @@ import pytest
 
 from gr_ros2.core.errors import LengthError
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.link import Received, Rejected, SentPacket
+from gr_ros2.link import PacketId, Received, Rejected, SentPacket
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.v0 import Entry, Packet
+from gr_ros2.wire.v0 import EntryV0, PacketV0
 
+IDENTITY = PacketId(1, 0, 7, 0)
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
 
 
 def test_header_and_entries() -> None:
-    packet = Packet(1, 255, 7, 1, (Entry(0, 9, 2, 5, b"abc"), Entry(3, 1, 0, 1, b"x")), qos=1)
-    line = describe(Received(b"", packet), REGISTRY)
-    assert line == describe(SentPacket(b"", packet, (), 0.0), REGISTRY)
+    packet = PacketV0(1, 255, 7, 1, (EntryV0(0, 9, 2, 5, b"abc"), EntryV0(3, 1, 0, 1, b"x")), qos=1)
+    line = describe(Received(b"", packet, IDENTITY), REGISTRY)
+    assert line == describe(SentPacket(b"", packet, IDENTITY, (), 0.0), REGISTRY)
     assert line == "v0 qos=latency flags=- src=1 dst=255 seq=7 hop=1 entries=2: 0:odom#9[2/5]=3B 3:?#1[0/1]=1B"
 
 

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from tests.packets import data_of
+
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import pmt
@@ -42,7 +44,7 @@ def packets(*messages: tuple[int, bytes], src_id: int = 1) -> list[bytes]:
     for topic_id, payload in messages:
         sender.submit(topic_id, payload, 0.0)
     made = []
-    while (data := sender.next_packet(0.0)) is not None:
+    while (data := data_of(sender.next_packet(0.0))) is not None:
         made.append(data)
     return made
 

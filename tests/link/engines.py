@@ -5,10 +5,11 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from gr_ros2.link import Delivered, Received, Receiver, ReceiverEvent, Sender
+from gr_ros2.link import Delivered, Received, ReceivedPacket, Receiver, ReceiverEvent, Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.v0 import V0, Packet
+from gr_ros2.wire.v0 import V0, PacketV0
+from tests.packets import data_of
 
 
 def registry(topics: int = 3) -> Registry:
@@ -28,7 +29,7 @@ def receiver(topics: int = 3, **settings: Any) -> Receiver:
 def drain(engine: Sender, now: float = 0.0) -> list[bytes]:
     """All packets that may leave at ``now``."""
     packets = []
-    while (data := engine.next_packet(now)) is not None:
+    while (data := data_of(engine.next_packet(now))) is not None:
         packets.append(data)
     return packets
 
@@ -38,13 +39,13 @@ def trace(packets: list[bytes]) -> list[list[tuple[int, int, int]]]:
     return [[(e.topic_id, e.index, e.total) for e in read(data).entries] for data in packets]
 
 
-def read(data: bytes) -> Packet:
+def read(data: bytes) -> PacketV0:
     return V0.decode(data, len(data))
 
 
 def take(engine: Receiver, data: bytes, now: float) -> list[ReceiverEvent]:
     """What comes of a packet, beside that it came."""
-    return [event for event in engine.receive(data, now) if not isinstance(event, Received)]
+    return [event for event in engine.receive(ReceivedPacket(data), now) if not isinstance(event, Received)]
 
 
 def delivered(events: list[ReceiverEvent]) -> list[bytes]:

@@ -8,9 +8,10 @@ from math import inf
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Delivered, Endpoint, EndpointV0, Lost, SenderEvent, SentPacket
+from gr_ros2.link import Delivered, Endpoint, EndpointV0, Lost, ReceivedPacket, SenderEvent, SentPacket
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.link.engines import registry
+from tests.packets import data_of
 
 
 def end(robot: int, *, sends: bool = True, hears: bool = True, told: list[SenderEvent] | None = None) -> EndpointV0:
@@ -27,8 +28,10 @@ def run(ends: list[Endpoint], until: float) -> list[list[bytes]]:
     while now < until:
         for place, (one, other) in enumerate((ends, ends[::-1])):
             events = one.handle_timeout(now)
-            while (data := one.next_packet(now)) is not None:
-                got[1 - place] += [e.payload for e in other.receive(data, now) if isinstance(e, Delivered)]
+            while (data := data_of(one.next_packet(now))) is not None:
+                got[1 - place] += [
+                    e.payload for e in other.receive(ReceivedPacket(data), now) if isinstance(e, Delivered)
+                ]
             assert not any(isinstance(event, Delivered) for event in events)
         later = [at for e in ends for at in (e.next_timeout(), e.next_departure()) if at is not None]
         assert all(at > now for at in later), "what is due has been done"
@@ -42,7 +45,7 @@ def test_two_ends_send_to_each_other() -> None:
     messages = [[bytes([robot, number]) * 60 for number in range(5)] for robot in (1, 2)]
     for number in range(5):
         for place, one in enumerate(ends):
-            one.submit(number % 3, messages[place][number], 0.0)
+            one.messages.submit(number % 3, messages[place][number], 0.0)
     assert not ends[0].idle
     got = run(ends, 10.0)
     assert [sorted(payloads) for payloads in got] == [sorted(messages[1]), sorted(messages[0])]
@@ -52,27 +55,27 @@ def test_two_ends_send_to_each_other() -> None:
 
 def test_an_end_that_only_sends_and_one_that_only_hears() -> None:
     source, sink = end(1, hears=False), end(2, sends=False)
-    source.submit(0, bytes(100), 0.0)
-    packets = [source.next_packet(number / 100) for number in range(4)]
+    source.messages.submit(0, bytes(100), 0.0)
+    packets = [data_of(source.next_packet(number / 100)) for number in range(4)]
     assert packets[2:] == [None] * 2, "two fragments"
-    assert source.receive(packets[0] or b"", 0.0) == source.handle_timeout(9.0) == []
-    events = [event for data in packets[:2] for event in sink.receive(data or b"", 0.0)]
+    assert source.receive(ReceivedPacket(packets[0] or b""), 0.0) == source.handle_timeout(9.0) == []
+    events = [event for data in packets[:2] for event in sink.receive(ReceivedPacket(data or b""), 0.0)]
     assert [event.payload for event in events if isinstance(event, Delivered)] == [bytes(100)]
     assert sink.next_packet(0.0) is None
     assert sink.idle
-    sink.credit(3)
+    sink.pace.credit(3)
     with pytest.raises(ConfigError, match="an end that sends nothing"):
-        sink.submit(0, b"x", 0.0)
+        sink.messages.submit(0, b"x", 0.0)
 
 
 def test_each_half_says_when_it_has_something_to_do() -> None:
     one, other = end(1), end(2)
-    other.submit(0, bytes(160), 0.0)
-    first, _ = other.next_packet(0.0), other.next_packet(0.0)
+    other.messages.submit(0, bytes(160), 0.0)
+    first, _ = data_of(other.next_packet(0.0)), data_of(other.next_packet(0.0))
     assert other.next_departure() == pytest.approx(0.01), "the next packet"
-    one.receive(first or b"", 0.0)
+    one.receive(ReceivedPacket(first or b""), 0.0)
     assert one.next_timeout() == pytest.approx(0.5), "the incomplete message"
-    one.submit(0, b"x", 0.1)
+    one.messages.submit(0, b"x", 0.1)
     assert one.next_departure() == pytest.approx(-inf)
     assert one.next_packet(0.1) is not None
     assert [type(event) for event in one.handle_timeout(0.5)] == [Lost]
@@ -81,8 +84,8 @@ def test_each_half_says_when_it_has_something_to_do() -> None:
 
 def test_packets_wait_for_credit() -> None:
     one = end(1)
-    one.use_credit()
-    one.submit(0, b"x", 0.0)
+    one.pace.use_credit()
+    one.messages.submit(0, b"x", 0.0)
     assert one.next_packet(0.0) is None
-    one.credit()
+    one.pace.credit()
     assert one.next_packet(0.0) is not None

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from gr_ros2.link import Delivered, Receiver, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Delivered, ReceivedPacket, Receiver, Sender, SenderEvent, SentPacket
 from gr_ros2.link.events import SentEntry
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from tests.link.engines import registry
+from tests.packets import data_of
 
 MESSAGES = 50_000
 """Per case; the four loss rates make 200,000."""
@@ -84,7 +85,7 @@ class Link:
         return self
 
     def transmit(self, now: float) -> bool:
-        data = self.sender.next_packet(now)
+        data = data_of(self.sender.next_packet(now))
         if data is None:
             return False
         self.packets += 1
@@ -106,7 +107,7 @@ class Link:
             self.arrived[payload] = self.arrived.get(payload, 0) + 1
             if self.arrived[payload] == entry.total:
                 self.complete.add(payload)
-        for event in self.receiver.receive(data, now):
+        for event in self.receiver.receive(ReceivedPacket(data), now):
             if isinstance(event, Delivered):
                 whole = event.payload == event.payload[:4] * (len(event.payload) // 4)
                 self.corrupt += not whole or event.payload in self.got
@@ -155,11 +156,11 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
         link.payloads += [b"\xaa\xaa\xaa\xaa" * (size // 4), b"\xbb\xbb\xbb\xbb" * (size // 4)]
         link.sender.submit(0, link.payloads[-2], now)
         packets = []
-        while (data := link.sender.next_packet(now)) is not None:
+        while (data := data_of(link.sender.next_packet(now))) is not None:
             packets.append(data)
         assert len(packets) == fragments
         for data in packets[:lost]:
-            link.receiver.receive(data, now)
+            link.receiver.receive(ReceivedPacket(data), now)
         for _ in range(255):
             link.sender.submit(0, link.payloads[0], now)
         while link.sender.next_packet(now) is not None:
@@ -167,10 +168,10 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
         link.sender.submit(0, link.payloads[-1], now)
         events = []
         for number in range(len(packets)):
-            data = link.sender.next_packet(now + 256 / 35)
+            data = data_of(link.sender.next_packet(now + 256 / 35))
             assert data is not None
             if number >= lost:
-                events += link.receiver.receive(data, now + 256 / 35)
+                events += link.receiver.receive(ReceivedPacket(data), now + 256 / 35)
         assert not any(isinstance(event, Delivered) for event in events)
 
 

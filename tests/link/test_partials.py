@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.link.partials import Partial, Partials
-from gr_ros2.wire.v0 import Entry
+from gr_ros2.wire.v0 import EntryV0
 
 TOTAL = 3
 
@@ -36,7 +36,7 @@ def test_books_agree_whatever_comes_and_goes(steps: list[tuple[int, int, int, in
             if partial is None:
                 partial = Partial(src_id, topic_id, entry_id, entry_id, TOTAL, 0)
             missing = TOTAL - len(partial.fragments | {index: b""})
-            whole = held.add(partial, Entry(topic_id, entry_id, index, TOTAL, bytes([index])), float(now))
+            whole = held.add(partial, EntryV0(topic_id, entry_id, index, TOTAL, bytes([index])), float(now))
             assert whole == (None if missing else b"\0\1\2")
         agree(held)
     for partial in list(held):

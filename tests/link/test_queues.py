@@ -13,7 +13,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.queues import TopicQueue, queue_for
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.settings.config import TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
@@ -38,17 +38,17 @@ def leave(source: Robot, now: float, most: int = 1000) -> list[bytes]:
     return parts
 
 
-def refused(end: Endpoint) -> dict[str, int]:
+def refused(end: EndpointV1) -> dict[str, int]:
     return {reason: count for (_, reason), count in end.sent.refused.items()}
 
 
 def test_latest_sends_the_newest_and_finishes_what_it_began() -> None:
     source = robot(queue="latest")
     leave(source, 0.0)
-    source.end.submit(0, b"a" * 100, 0.1)
+    source.end.messages.submit(0, b"a" * 100, 0.1)
     begun = leave(source, 0.1, 1)
     for letter in (b"b", b"c", b"d"):
-        source.end.submit(0, letter * 20, 0.1)
+        source.end.messages.submit(0, letter * 20, 0.1)
     assert b"".join([*begun, *leave(source, 0.1)]) == b"a" * 100 + b"d" * 20
     assert refused(source.end) == {"superseded": 2}
 
@@ -56,11 +56,11 @@ def test_latest_sends_the_newest_and_finishes_what_it_began() -> None:
 def test_latest_holds_a_recording_back_while_one_waits() -> None:
     source = robot(queue="latest")
     leave(source, 0.0)
-    assert source.end.room(0)
-    source.end.submit(0, b"a" * 100, 0.1)
-    assert not source.end.room(0)
+    assert source.end.messages.room(0)
+    source.end.messages.submit(0, b"a" * 100, 0.1)
+    assert not source.end.messages.room(0)
     leave(source, 0.1, 1)
-    assert source.end.room(0)
+    assert source.end.messages.room(0)
 
 
 def test_a_queue_follows_the_depth_of_its_topic() -> None:
@@ -87,21 +87,23 @@ def test_a_queue_follows_its_publishers_where_it_is_not_configured(
     options: dict[str, Any], depth: int, lifespan_s: float, period_s: float, queue: tuple[str, float]
 ) -> None:
     source = robot(**options).end
-    before = source.queue(0)
-    assert source.follow(0, depth=depth, lifespan_s=lifespan_s, period_s=period_s) == (source.queue(0) != before)
-    assert source.queue(0) == queue
+    before = source.messages.queue(0)
+    assert source.messages.follow(0, depth=depth, lifespan_s=lifespan_s, period_s=period_s) == (
+        source.messages.queue(0) != before
+    )
+    assert source.messages.queue(0) == queue
 
 
 def test_a_lifespan_found_late_holds_for_what_waits() -> None:
     source = robot()
-    source.end.submit(0, b"old", 0.0)
-    source.end.follow(0, lifespan_s=0.1)
-    source.end.submit(0, b"young", 0.09)
+    source.end.messages.submit(0, b"old", 0.0)
+    source.end.messages.follow(0, lifespan_s=0.1)
+    source.end.messages.submit(0, b"young", 0.09)
     assert leave(source, 0.15) == [b"young"]
     assert refused(source.end) == {"stale": 1}
-    source.end.submit(0, b"for ever again", 0.2)
-    source.end.follow(0)
-    assert source.end.queue(0) == ("fifo", 0.0)
+    source.end.messages.submit(0, b"for ever again", 0.2)
+    source.end.messages.follow(0)
+    assert source.end.messages.queue(0) == ("fifo", 0.0)
     assert leave(source, 9.0) == [b"for ever again"]
 
 
@@ -112,8 +114,8 @@ def test_a_deadline_queue_needs_a_deadline() -> None:
 
 def test_what_has_waited_too_long_is_stale() -> None:
     source = robot(queue="deadline", deadline_s=0.1)
-    source.end.submit(0, b"old", 0.0)
-    source.end.submit(0, b"new", 0.06)
+    source.end.messages.submit(0, b"old", 0.0)
+    source.end.messages.submit(0, b"new", 0.06)
     assert leave(source, 0.1) == [b"new"]
     assert refused(source.end) == {"stale": 1}
 
@@ -122,8 +124,8 @@ def test_what_cannot_be_across_in_time_is_not_started() -> None:
     source = robot(packet_rate=10.0, queue="deadline", deadline_s=0.25)
     for step in range(10):  # hello and table
         source.slot(0.1 * step)
-    source.end.submit(0, bytes(150), 1.0)
-    source.end.submit(0, bytes(70), 1.0)
+    source.end.messages.submit(0, bytes(150), 1.0)
+    source.end.messages.submit(0, bytes(70), 1.0)
     left = [part for step in range(10) for part in leave(source, 1.0 + 0.1 * step)]
     assert refused(source.end) == {"cannot_complete": 1}, "more than two packets at ten a second take 300 ms"
     assert sum(map(len, left)) == 70
@@ -132,52 +134,52 @@ def test_what_cannot_be_across_in_time_is_not_started() -> None:
 def test_what_has_become_pointless_is_abandoned_and_the_next_leaves() -> None:
     source = robot(queue="deadline", deadline_s=0.1)
     leave(source, 0.0)
-    source.end.submit(0, b"a" * 100, 0.1)
+    source.end.messages.submit(0, b"a" * 100, 0.1)
     leave(source, 0.1, 1)
-    source.end.submit(0, b"b" * 30, 0.3)
+    source.end.messages.submit(0, b"b" * 30, 0.3)
     assert leave(source, 0.3) == [b"b" * 30]
     assert refused(source.end) == {"abandoned": 1}
 
 
 def test_the_pace_of_credits_is_learnt_while_busy() -> None:
     source = sender(topics=1, packet_len=64, queue_depth=0)
-    source.use_credit()
-    assert source.interval == 0.0
+    source.pace.use_credit()
+    assert source.pace.interval == 0.0
     for number in range(20):
         source.submit(0, bytes(40), number * 0.05)
         source.submit(0, bytes(40), number * 0.05)
-        source.credit()
+        source.pace.credit()
         assert source.next_packet(number * 0.05) is not None
-    assert source.interval == pytest.approx(0.05)
+    assert source.pace.interval == pytest.approx(0.05)
 
 
 def test_idle_time_is_no_pace() -> None:
     source = sender(topics=1, packet_len=64)
-    source.use_credit()
+    source.pace.use_credit()
     for number in range(5):
-        source.credit()
+        source.pace.credit()
         source.submit(0, bytes(40), number * 1.0)
         source.next_packet(number * 1.0)
-    assert source.interval == 0.0
+    assert source.pace.interval == 0.0
 
 
 def test_a_rate_cap_spaces_the_messages_of_a_topic() -> None:
     source = robot(queue="latest", max_rate=10.1)
     sent = []
     for millisecond in range(0, 1000, 20):
-        source.end.submit(0, millisecond.to_bytes(2, "big"), millisecond / 1e3)
+        source.end.messages.submit(0, millisecond.to_bytes(2, "big"), millisecond / 1e3)
         sent += [(millisecond, int.from_bytes(part, "big")) for part in leave(source, millisecond / 1e3)]
     assert sent == [(at, at) for at in range(0, 1000, 100)], "ten a second, always the newest"
 
 
 def test_a_capped_message_says_when_it_may_go() -> None:
     source = robot(queue="fifo", max_rate=10)
-    source.end.submit(0, b"a", 0.0)
-    source.end.submit(0, b"b", 0.0)
+    source.end.messages.submit(0, b"a", 0.0)
+    source.end.messages.submit(0, b"b", 0.0)
     assert leave(source, 0.0) == [b"a"]
-    assert source.end.outbox.next_timeout(0.0) == pytest.approx(0.1)
+    assert source.end.messages.next_timeout(0.0) == pytest.approx(0.1)
     assert leave(source, 0.1) == [b"b"]
-    assert source.end.outbox.next_timeout(0.1) is None
+    assert source.end.messages.next_timeout(0.1) is None
 
 
 @given(
@@ -189,13 +191,13 @@ def test_every_message_ends_once(steps: list[tuple[int, int, float]], policy: st
     source = robot(3, queue=policy, deadline_s=0.06, max_rate=max_rate, queue_depth=3)
     now = 0.0
     for topic, size, pause in steps:
-        source.end.submit(topic, bytes(size), now)
+        source.end.messages.submit(topic, bytes(size), now)
         now += pause
         source.slot(now)
     for step in range(300):
         leave(source, now + 0.02 * step)
     ended = Counter(topic for topic, _ in source.end.sent.refused.elements()) + source.end.sent.sent
-    assert source.end.outbox.idle
+    assert source.end.messages.idle
     assert ended == source.end.sent.submitted
 
 

@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Accepted, Missed, Receiver, Refused, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Accepted, Missed, ReceivedPacket, Receiver, Refused, Sender, SenderEvent, SentPacket
 from gr_ros2.link.schedule import PaperScheduler
 from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.settings.registry import Registry
 from tests.link.engines import delivered, drain, read, registry, sender, trace
+from tests.packets import data_of
 
 
 def test_one_topic_fills_packets_alone() -> None:
@@ -39,7 +40,7 @@ def test_two_topics_share_packets_at_e_2() -> None:
 def test_the_cut_of_a_message_stays_as_its_first_entry_had_it() -> None:
     engine = sender(packet_len=220)
     engine.submit(0, bytes(1000), 0.0)
-    first = engine.next_packet(0.0)
+    first = data_of(engine.next_packet(0.0))
     engine.submit(1, bytes(400), 0.0)
     packets = [first, *drain(engine)] if first else []
     lengths = [(e.topic_id, len(e.payload)) for data in packets for e in read(data).entries]
@@ -120,7 +121,7 @@ def test_a_message_over_255_entries_is_refused_with_the_remedy() -> None:
 def test_a_full_queue_drops_the_oldest_that_has_not_started_and_counts_it() -> None:
     engine = sender(packet_len=64, queue_depth=2)
     engine.submit(0, b"a" * 100, 0.0)
-    first = engine.next_packet(0.0)
+    first = data_of(engine.next_packet(0.0))
     for letter in (b"b", b"c", b"d"):
         engine.submit(0, letter * 20, 0.0)
     payloads = [read(data).entries[0].payload for data in [first or b"", *drain(engine)]]
@@ -173,13 +174,13 @@ def test_packet_rate_spaces_packets_and_makes_up_for_late_wake_ups() -> None:
 
 def test_credit_lets_exactly_so_many_packets_go() -> None:
     engine = sender(packet_len=64)
-    engine.use_credit()
+    engine.pace.use_credit()
     engine.submit(0, bytes(51 * 5), 0.0)
     assert drain(engine) == []
     assert engine.next_timeout() is None
-    engine.credit(2)
+    engine.pace.credit(2)
     assert len(drain(engine)) == 2
-    engine.credit()
+    engine.pace.credit()
     assert len(drain(engine)) == 1
 
 
@@ -334,7 +335,7 @@ def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> No
     assert isinstance(events[0], Accepted)
     assert events[0].payload == message
     sink = Receiver(registry(2), SinkConfig(packet_len=64), codec=Halving())
-    assert delivered(sink.receive(data, 0.0)) == [message]
+    assert delivered(sink.receive(ReceivedPacket(data), 0.0)) == [message]
 
 
 def test_what_the_graph_lost_before_submission_is_observed_once() -> None:
@@ -356,12 +357,12 @@ def test_a_message_that_fits_only_coded_is_sent() -> None:
 def test_nothing_is_composed_before_it_is_asked_for() -> None:
     """What came last before the credit goes, whatever was waiting when the credit before was used."""
     engine = sender(topics=1, packet_len=64, queue_depth=1)
-    engine.use_credit()
+    engine.pace.use_credit()
     engine.submit(0, b"old", 0.0)
     assert engine.next_packet(0.0) is None
     engine.submit(0, b"new", 0.1)
-    engine.credit()
-    data = engine.next_packet(0.1)
+    engine.pace.credit()
+    data = data_of(engine.next_packet(0.1))
     assert data is not None
     assert read(data).entries[0].payload == b"new"
 

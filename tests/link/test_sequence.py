@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.link.sequence import NEAR, Arrival, Pace, SequenceTracker
+from gr_ros2.link.sequence import NEAR, Arrival, CountRate, SequenceTracker
 
 
 def place(tracker: SequenceTracker, seq: int, now: float = 0.0, data: bytes | None = None) -> Arrival:
@@ -107,7 +107,7 @@ def test_a_number_that_a_slow_sender_cannot_have_come_to_tells_nothing() -> None
 
 
 def test_pace_is_believed_only_after_enough() -> None:
-    pace = Pace(window=8, least=4)
+    pace = CountRate(window=8, least=4)
     assert pace.duration(10) == float("inf")
     for step in range(20):
         pace.observe(step * 0.5, 2)

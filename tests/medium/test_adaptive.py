@@ -1,4 +1,4 @@
-"""The adaptive rate in simulated time: the losses of each rung, and scenarios from the settings to the result."""
+"""The adaptive rate in simulated time: the losses of each MCS, and scenarios from the settings to the result."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.medium import FixedPaths, make_medium
 from gr_ros2.medium import Path as Way
-from gr_ros2.medium import make_medium
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.medium.packets import PacketMedium, limits_of
 from gr_ros2.phy import PHY, Phy
@@ -26,10 +26,10 @@ from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.files import find_registry
 
 
-class Rungs:
-    """Counts the packets with messages by their rung."""
+class Rates:
+    """Counts the packets with messages by their MCS."""
 
-    name = "rungs"
+    name = "rates"
     instruments = False
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Rungs:
 
     def sender_event(self, _src_id: int, event: SenderEvent) -> None:
         if isinstance(event, SentPacket) and event.kind == "new":
-            self.sent.append(event.rung)
+            self.sent.append(event.mcs)
 
     def receiver_event(self, _event: ReceiverEvent, _now: float) -> None:
         pass
@@ -68,51 +68,51 @@ def adaptive(snr_db: float, **settings: Any) -> Scenario:
     )
 
 
-def ladder_phy(**options: Any) -> Phy:
+def adaptive_phy(**options: Any) -> Phy:
     phy: Phy = PHY.load("ofdm")(220, 1e6, rate="adaptive", **options)
     return phy
 
 
-def test_each_rung_takes_less_air_and_needs_more_snr() -> None:
-    phy = ladder_phy()
-    airtimes = [phy.airtime(220, rung) for rung in range(len(phy.ladder))]
-    assert airtimes == [rung.airtime_s for rung in phy.ladder] == sorted(airtimes, reverse=True)
-    assert [rung.half_db for rung in phy.ladder] == sorted(rung.half_db for rung in phy.ladder)
+def test_each_rate_takes_less_air_and_needs_more_snr() -> None:
+    phy = adaptive_phy()
+    airtimes = [phy.airtime(220, mcs) for mcs in range(len(phy.mcs_table))]
+    assert airtimes == [mcs.airtime_s for mcs in phy.mcs_table] == sorted(airtimes, reverse=True)
+    assert [mcs.half_db for mcs in phy.mcs_table] == sorted(mcs.half_db for mcs in phy.mcs_table)
     assert phy.airtime() == airtimes[0]
     assert phy.airtime(24, 6) < phy.airtime(24, 0)
 
 
-def arrived(phy: Phy, snr_db: float, rung: int, packets: int) -> int:
+def arrived(phy: Phy, snr_db: float, mcs: int, packets: int) -> int:
     """How many of some packets arrive."""
     paths = [[Way(1, ChannelConfig(snr_db=snr_db))], []]
-    medium = PacketMedium(lambda _: paths, [phy, phy])
+    medium = PacketMedium(FixedPaths(paths), [phy, phy])
     for number in range(packets):
-        medium.send(0, b"x", number, 0.5, rung)
+        medium.send(0, b"x", number, 0.5, mcs)
     count = len(list(medium.receptions(packets)))
     assert medium.lost[0, 1]["phy"] == packets - count
     return count
 
 
-@pytest.mark.parametrize(("rung", "name"), list(enumerate(rung.name for rung in ladder_phy().ladder)))
-def test_half_of_the_packets_of_a_rung_arrive_where_its_model_says(rung: int, name: str) -> None:
-    phy = ladder_phy()
-    model = phy.ladder[rung]
+@pytest.mark.parametrize(("mcs", "name"), list(enumerate(mcs.name for mcs in adaptive_phy().mcs_table)))
+def test_half_of_the_packets_of_a_rate_arrive_where_its_model_says(mcs: int, name: str) -> None:
+    phy = adaptive_phy()
+    model = phy.mcs_table[mcs]
     for snr_db in (model.half_db - 1.5, model.half_db - 0.5, model.half_db + 0.5, model.half_db + 2.5):
-        pdr = arrived(phy, snr_db, rung, 2000) / 2000
+        pdr = arrived(phy, snr_db, mcs, 2000) / 2000
         assert pdr == pytest.approx(model.pdr(snr_db), abs=0.15), name
     low, high = limits_of(model)
-    assert not arrived(phy, low - 0.1, rung, 1)
-    assert arrived(phy, high + 30, rung, 1)
+    assert not arrived(phy, low - 0.1, mcs, 1)
+    assert arrived(phy, high + 30, mcs, 1)
 
 
-def test_packets_may_pass_through_the_modem_of_their_rung() -> None:
-    phy = ladder_phy()
+def test_packets_may_pass_through_the_modem_of_their_rate() -> None:
+    phy = adaptive_phy()
     paths = [[Way(1, ChannelConfig(snr_db=9.0))], []]
-    medium = make_medium(lambda _: paths, [phy, phy], samples=True)
-    for number, rung in enumerate((0, 2, 5)):
-        medium.send(0, bytes(220), number, phy.airtime(220, rung), rung)
+    medium = make_medium(FixedPaths(paths), [phy, phy], samples=True)
+    for number, mcs in enumerate((0, 2, 5)):
+        medium.send(0, bytes(220), number, phy.airtime(220, mcs), mcs)
     received = list(medium.receptions(3.0))
-    assert [reception.sent.rung for reception in received] == [0, 2]
+    assert [reception.sent.mcs for reception in received] == [0, 2]
     assert [reception.measured_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
 
 
@@ -128,32 +128,32 @@ def test_fading_is_that_of_rayleigh_and_a_function_of_time() -> None:
     assert abs(one.gain_db(1.0) - one.gain_db(1.001)) < 1
 
 
-@pytest.mark.parametrize(("snr_db", "rung"), [(0.0, 0), (4.0, 1), (14.0, 4), (28.0, 6)])
-def test_a_scenario_is_sent_at_the_rate_that_its_channel_allows(snr_db: float, rung: int) -> None:
-    rungs = Rungs()
-    observers = RunObservers([rungs], threaded=False)
+@pytest.mark.parametrize(("snr_db", "mcs"), [(0.0, 0), (4.0, 1), (14.0, 4), (28.0, 6)])
+def test_a_scenario_is_sent_at_the_rate_that_its_channel_allows(snr_db: float, mcs: int) -> None:
+    rates = Rates()
+    observers = RunObservers([rates], threaded=False)
     result = run_simulated(adaptive(snr_db), run_observers=observers).result
     assert result.topics[0].pdr == 1.0
-    late = rungs.sent[len(rungs.sent) // 2 :]
-    assert max(set(late), key=late.count) == rung
-    phy = ladder_phy()
+    late = rates.sent[len(rates.sent) // 2 :]
+    assert max(set(late), key=late.count) == mcs
+    phy = adaptive_phy()
     assert result.phy["airtime_s"] == phy.airtime()
     assert result.phy["airtime_mean_s"] < phy.airtime()
 
 
-def test_without_reports_everything_is_sent_at_the_most_robust_rung() -> None:
-    rungs = Rungs()
-    observers = RunObservers([rungs], threaded=False)
+def test_without_reports_everything_is_sent_at_the_most_robust_rate() -> None:
+    rates = Rates()
+    observers = RunObservers([rates], threaded=False)
     scenario = adaptive(28.0, reports=None)
     result = run_simulated(scenario, run_observers=observers).result
-    assert set(rungs.sent) == {0}
+    assert set(rates.sent) == {0}
     assert result.topics[0].pdr == 1.0
 
 
 def test_what_an_adaptive_rate_cannot_have_is_said_in_a_line() -> None:
     for options in ({"payload_modulation": "qpsk"}, {"fec": "cc"}, {"detection_threshold": "stock"}):
         with pytest.raises(ConfigError, match="rate: adaptive"):
-            ladder_phy(**options)
+            adaptive_phy(**options)
     with pytest.raises(ConfigError, match="has one tap"):
         run_simulated(adaptive(9.0, channel={"snr_db": 9.0, "doppler_hz": 2.0, "taps": (1.0, 0.5)}))
     scenario = adaptive(9.0)

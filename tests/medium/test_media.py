@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.medium import Medium, Path, Reception, make_medium
+from gr_ros2.medium import FixedPaths, Medium, Path, Reception, make_medium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
@@ -37,7 +37,7 @@ def between(robots: int, snr_db: float | None, heard: int | None = None) -> list
 def media(paths: list[list[Path]], of: Phy, *, shared: bool, seed: int = 0) -> dict[str, Medium]:
     phys = [of] * len(paths)
     return {
-        time: make_medium(lambda _: paths, phys, samples=time == "samples", shared=shared, seed=seed)
+        time: make_medium(FixedPaths(paths), phys, samples=time == "samples", shared=shared, seed=seed)
         for time in ("packets", "samples")
     }
 
@@ -106,7 +106,7 @@ def test_the_stronger_of_two_bursts_may_survive(time: str) -> None:
 def test_a_path_with_a_delay_receives_later() -> None:
     of = phy()
     paths = [[Path(1, ChannelConfig(), delay_s=0.25)], []]
-    medium = PacketMedium(lambda _: paths, [of] * 2)
+    medium = PacketMedium(FixedPaths(paths), [of] * 2)
     medium.send(0, bytes(PACKET_LEN), 0.0, 0.1)
     assert not list(medium.receptions(0.34))
     assert [reception.at for reception in medium.receptions(0.36)] == [pytest.approx(0.35)]
@@ -119,7 +119,7 @@ def test_the_work_for_a_packet_does_not_depend_on_robots_out_of_hearing() -> Non
     def work(robots: int) -> Counter[str]:
         draw = random.Random(1)
         paths = between(robots, 11.0, heard=4)
-        medium = PacketMedium(lambda _: paths, [of] * robots, shared=True)
+        medium = PacketMedium(FixedPaths(paths), [of] * robots, shared=True)
         packets = 20 * robots
         schedule = sorted((draw.uniform(0, 200), number % robots) for number in range(packets))
         by_sender = dict.fromkeys(range(robots), 0.0)

@@ -3,7 +3,8 @@
 // rate whatever is asked for, with `dies=S` it falls silent after S seconds, with `refuses=N` it takes no samples after N
 // bursts. With `tells=N` it reports each burst sent, and of each Nth an underflow, a late one and a damaged one. With
 // `loses=N` it reports N times that samples received were lost. With `tuned=HZ` it is tuned there whatever is asked for,
-// its gain stays below `most=DB`, and what `breaks=` names fails: `rate` or `start`, of the transmitter.
+// its gain stays below `most=DB`, and what `breaks=` names fails: `rate` or `start`, of the transmitter. With `clock=S` it
+// has a clock, which says S seconds when the device is opened: it tags what it gives, and sends at a time.
 #include <SoapySDR/Device.hpp>
 #include <SoapySDR/Errors.hpp>
 #include <SoapySDR/Formats.hpp>
@@ -46,10 +47,15 @@ public:
             tuned_ = std::atof(args.at("tuned").c_str());
         if (args.count("most"))
             most_ = std::atof(args.at("most").c_str());
+        if (args.count("clock"))
+            clock_ = std::atof(args.at("clock").c_str());
         if (args.count("breaks"))
             breaks_ = args.at("breaks");
     }
     ~Loopback() override { say(SOAPY_SDR_TX, "closed"); }
+
+    bool hasHardwareTime(const std::string&) const override { return clock_ >= 0; }
+    long long getHardwareTime(const std::string&) const override { return at(Clock::now()); }
 
     std::string getDriverKey() const override { return "loopback"; }
     size_t getNumChannels(const int) const override { return 1; }
@@ -134,7 +140,7 @@ public:
     }
     int deactivateStream(SoapySDR::Stream*, const int, const long long) override { return 0; }
 
-    int writeStream(SoapySDR::Stream*, const void* const* buffers, const size_t count, int& flags, const long long,
+    int writeStream(SoapySDR::Stream*, const void* const* buffers, const size_t count, int& flags, const long long when,
                     const long timeout) override
     {
         if (written_ == takes_) {
@@ -148,6 +154,15 @@ public:
             peak = std::max(peak, std::abs(samples[i]));
         {
             std::lock_guard<std::mutex> hold(lock_);
+            if (clock_ >= 0 && (flags & SOAPY_SDR_HAS_TIME)) {
+                // Zeros up to the sample that is on the air then.
+                const auto first = static_cast<long long>((when - at(began_)) * 1e-9 * rate_ + 0.5);
+                const auto coming = given_ + static_cast<long long>(air_.size());
+                if (first < coming)
+                    events_.push_back(SOAPY_SDR_TIME_ERROR);
+                else
+                    air_.insert(air_.end(), first - coming, Sample());
+            }
             air_.insert(air_.end(), samples, samples + count);
             if (tells_ > 0) {
                 if (written_ % tells_ == 0)
@@ -173,7 +188,8 @@ public:
         return event;
     }
 
-    int readStream(SoapySDR::Stream*, void* const* buffers, const size_t most, int&, long long&, const long) override
+    int readStream(SoapySDR::Stream*, void* const* buffers, const size_t most, int& flags, long long& when,
+                   const long) override
     {
         const double elapsed = std::chrono::duration<double>(Clock::now() - began_).count();
         if (elapsed > dies_) {
@@ -191,6 +207,10 @@ public:
             return SOAPY_SDR_OVERFLOW;
         }
         losing_ = false;
+        if (clock_ >= 0) {
+            flags |= SOAPY_SDR_HAS_TIME;
+            when = at(began_) + static_cast<long long>(given_ / rate_ * 1e9 + 0.5);
+        }
         const size_t count = std::min<size_t>(most, due);
         auto* samples = static_cast<Sample*>(buffers[0]);
         std::lock_guard<std::mutex> hold(lock_);
@@ -206,6 +226,12 @@ public:
     }
 
 private:
+    // The device's clock, ns.
+    long long at(const Clock::time_point when) const
+    {
+        return static_cast<long long>((clock_ + std::chrono::duration<double>(when - opened_).count()) * 1e9);
+    }
+
     void say(const int direction, const std::string& what)
     {
         if (log_.is_open()) {
@@ -226,6 +252,8 @@ private:
     long long given_ = 0;
     long written_ = 0, takes_ = -1, tells_ = 0, loses_ = 0, lost_ = 0;
     bool losing_ = false;
+    double clock_ = -1;
+    const Clock::time_point opened_ = Clock::now();
     Clock::time_point began_ = Clock::now();
     int sending_ = 0, receiving_ = 0;
 };

@@ -13,7 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import numpy as np
 
 from gr_ros2.phy import PHY
-from gr_ros2.phy.burst import BurstReceiver, Frames, Heard, Samples, whitening
+from gr_ros2.phy.burst import BurstReceiver, DemodulatedPacket, Frames, Samples, whitening
 from gr_ros2.phy.burst_blocks import BurstPhy
 from gr_ros2.phy.lora import code_words
 
@@ -39,7 +39,7 @@ def bursts(phy: Any, count: int, seed: int = 0) -> tuple[list[bytes], np.ndarray
     return packets, np.concatenate([*parts, np.zeros(400)])
 
 
-def data_of(heard: list[Heard]) -> list[bytes]:
+def data_of(heard: list[DemodulatedPacket]) -> list[bytes]:
     return [packet.data for packet in heard]
 
 

@@ -14,7 +14,7 @@ from gnuradio import gr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.phy.pdus import PduPort, packets_of, pdu_of, u8vector
+from gr_ros2.phy.pdus import AirPacket, PduPort, _bundled, packets_of, pdu_heard, pdu_of, pdu_to_send, u8vector
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -46,7 +46,7 @@ def _received(*readers: Probe) -> list[list[Any]]:
         top.msg_connect((sender, "pdus"), (reader, "pdus"))
     top.start()
     try:
-        sender.port.send(PACKETS)
+        sender.port.send([AirPacket(packet) for packet in PACKETS])
         wait_for(lambda: all(_packets(reader.messages) == PACKETS for reader in readers), "all packets")
     finally:
         top.stop()
@@ -55,7 +55,7 @@ def _received(*readers: Probe) -> list[list[Any]]:
 
 
 def _packets(messages: list[Any]) -> list[bytes]:
-    return [packet for message in messages for packet in packets_of(message)[0]]
+    return [packet.data for message in messages for packet in packets_of(message)[0]]
 
 
 def test_a_block_that_understands_bundles_gets_all_packets_in_one_message() -> None:
@@ -81,14 +81,34 @@ def test_a_port_without_a_reader_is_known() -> None:
 
 @given(st.binary(max_size=4095))
 def test_a_pdu_is_one_packet(data: bytes) -> None:
-    assert packets_of(pdu_of(data)) == ([data], "")
+    assert packets_of(pdu_of(data)) == ([AirPacket(data)], "")
+
+
+_TIMES = st.none() | st.floats(0, 1e9)
+
+
+@given(st.lists(st.builds(AirPacket, st.binary(max_size=40), st.none() | st.integers(0, 7), st.none(), _TIMES, _TIMES)))
+def test_a_bundle_carries_what_a_pdu_says(packets: list[AirPacket]) -> None:
+    assert packets_of(pmt.cons(pmt.intern("bundle"), u8vector(b"".join(map(_bundled, packets))))) == (packets, "")
+    for packet in packets:
+        to_send, heard = packet._replace(at=None), packet._replace(leave_at=None)
+        assert packets_of(pdu_to_send(to_send)) == ([to_send], "")
+        assert packets_of(pdu_heard(heard)) == ([heard], "")
+
+
+@pytest.mark.parametrize("value", [pmt.intern("x"), pmt.from_double(float("nan")), pmt.from_complex(1j), pmt.PMT_NIL])
+def test_metadata_of_others_says_nothing(value: Any) -> None:
+    metadata = pmt.make_dict()
+    for key in ("mcs", "snr_db", "received_at", "begins_at", "leave_at"):
+        metadata = pmt.dict_add(metadata, pmt.intern(key), value)
+    assert packets_of(pdu_of(b"x", metadata)) == ([AirPacket(b"x")], "")
 
 
 @given(st.binary(max_size=300))
 def test_a_bundle_of_any_bytes_is_read(data: bytes) -> None:
     packets, problem = packets_of(pmt.cons(pmt.intern("bundle"), u8vector(data)))
     assert not problem
-    assert sum(map(len, packets)) <= len(data)
+    assert sum(len(packet.data) for packet in packets) <= len(data)
 
 
 @pytest.mark.parametrize(
@@ -109,4 +129,4 @@ def test_garbage_is_named(garbage: Any, reason: str) -> None:
 
 
 def test_an_empty_packet_is_a_packet() -> None:
-    assert packets_of(pmt.cons(pmt.make_dict(), pmt.init_u8vector(0, []))) == ([b""], "")
+    assert packets_of(pmt.cons(pmt.make_dict(), pmt.init_u8vector(0, []))) == ([AirPacket(b"")], "")

@@ -9,6 +9,9 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.link import ReceivedPacket
+from tests.packets import data_of
+
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
@@ -329,12 +332,12 @@ def test_messages_of_odometry_arrive_at_20_db() -> None:
     packets = []
     for number, message in enumerate(messages):
         sender.submit(0, message, number * 0.01)
-        while (packet := sender.next_packet(number * 0.01)) is not None:
+        while (packet := data_of(sender.next_packet(number * 0.01))) is not None:
             packets.append(packet)
     assert len(packets) == len(messages) == 200
     phy = make(760)
     arrived = deliver(phy, modulated(phy, packets), ChannelConfig(snr_db=20, seed=1))
     receiver = Receiver(registry, SinkConfig(packet_len=760))
-    events = [event for packet in arrived for event in receiver.receive(packet, 0.0)]
+    events = [event for packet in arrived for event in receiver.receive(ReceivedPacket(packet), 0.0)]
     delivered = [event.payload for event in events if isinstance(event, Delivered)]
     assert delivered == messages

@@ -38,7 +38,7 @@ def cell(contender: str, **changes: object) -> RaceCell:
         "age_mean": 0.03,
         "airtime_per_message": 0.004,
         "air_bytes_per_message": 70.0,
-        "air_bytes_back": 0.0,
+        "air_bytes_reverse": 0.0,
         "discovery_bytes": 0.0,
         "first_message": 0.5,
         "drops": {},

@@ -53,13 +53,13 @@ def test_datagrams_cross_both_ways_and_every_byte_is_counted(
     far.sendto(b"back", (ADDRESSES[0], PORT))
     assert near.recv(MTU) == b"back"
     report = air.report()
-    assert list(report.there.size) == [29, 728, MTU]
-    assert list(report.there.airtime) == [RADIO.airtime_s(size) for size in (29, 728, MTU)]
-    over = [began, *report.there.t]  # the air is free for the next frame then, although a thread may deliver it later
-    gaps = zip(over[:-1], over[1:], report.there.airtime, strict=True)
+    assert list(report.forward.size) == [29, 728, MTU]
+    assert list(report.forward.airtime) == [RADIO.airtime_s(size) for size in (29, 728, MTU)]
+    over = [began, *report.forward.t]  # the air is free for the next frame then, although a thread may deliver it later
+    gaps = zip(over[:-1], over[1:], report.forward.airtime, strict=True)
     assert all(after - before >= air * 0.999 for before, after, air in gaps)
     assert all(at >= end for at, end in zip(arrived, over[1:], strict=True))
-    assert list(report.back.size) == [32]
+    assert list(report.reverse.size) == [32]
     assert report.drops == {"queue_full": 0, "on_air": 0, "not_taken": 0}
 
 
@@ -70,13 +70,13 @@ def test_what_the_air_cannot_take_waits_in_a_bounded_queue_and_is_counted_beyond
     size, sent = 700, 40
     for number in range(sent):
         near.sendto(number.to_bytes(size, "big"), (ADDRESSES[1], PORT))
-    wait_for(lambda: len(air.report().there.t) + air.report().drops["queue_full"] == sent, "not all is accounted for")
+    wait_for(lambda: len(air.report().forward.t) + air.report().drops["queue_full"] == sent, "not all is accounted for")
     report = air.report()
-    arrived = [int.from_bytes(far.recv(MTU), "big") for _ in report.there.t]
+    arrived = [int.from_bytes(far.recv(MTU), "big") for _ in report.forward.t]
     assert arrived == sorted(arrived)
     assert arrived[0] == 0
     assert QUEUE_BYTES // (size + HEADERS) <= len(arrived) < sent / 2
-    gaps = [after - before for before, after in zip(report.there.t, list(report.there.t)[1:], strict=False)]
+    gaps = [after - before for before, after in zip(report.forward.t, list(report.forward.t)[1:], strict=False)]
     assert min(gaps) >= RADIO.airtime_s(size + HEADERS) * 0.999
 
 

@@ -57,7 +57,7 @@ def test_every_number_of_a_cell() -> None:
         "age_mean": pytest.approx((2.5 * (0.25 + 2.75) / 2 + 0.25 * (0.75 + 1.0) / 2) / 2.75),
         "airtime_per_message": pytest.approx(0.105 / 2),
         "air_bytes_per_message": pytest.approx(1050 / 2),
-        "air_bytes_back": pytest.approx(50 / 1050),
+        "air_bytes_reverse": pytest.approx(50 / 1050),
         "discovery_bytes": 140,
         "first_message": pytest.approx(1.25),
         "drops": {"on_air": 2},

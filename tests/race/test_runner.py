@@ -55,7 +55,7 @@ def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
         assert cell["air_bytes_per_message"] >= 50, name
         version_0 = CONTENDERS[name].settings.get("version") == 0
         assert (cell["discovery_bytes"] == 0) == version_0, name
-        assert (cell["air_bytes_back"] == 0) == version_0, name
+        assert (cell["air_bytes_reverse"] == 0) == version_0, name
         assert name in done.stdout
     assert "load 50%, loss 0%: ahead of gr-ros2: " in done.stdout
     assert "discovery bytes (gr-ros2-v0" in done.stdout

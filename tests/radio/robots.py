@@ -32,6 +32,8 @@ def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
         "version": 0,
         "phy": {"name": "psk", "sample_rate": RATE},
         "front_end": front_end,
+        "transmit": values.pop("transmit", True),
+        "open": "key" not in values,
         "ros_source": {
             "namespace": f"/robot_{number}",
             "queue_depth": 0,
@@ -115,6 +117,8 @@ def link_command(
         ros_sink: {{middleware: memory}}
         phy: {{name: psk, sample_rate: {sample_rate}}}
         front_end: {json.dumps(front_end)}
+        transmit: true
+        open: true
         """
     )
     command = [sys.executable, "-m", "gr_ros2.cli", "link", str(path), *options]

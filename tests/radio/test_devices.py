@@ -129,6 +129,43 @@ def test_what_a_device_tells_is_counted_by_name(driver: Path) -> None:
     assert result.get("overflows") == (3 if marks_gaps else None)
 
 
+TIMED = """
+import json, sys, time
+from gr_ros2.phy import PHY
+from gr_ros2.phy.flowgraph import Flowgraph
+from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
+from gr_ros2.radio.radio import make_radio
+from tests.gr.probe import Probe
+from tests.waiting import wait_for
+radio, probe, top = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6), Probe(), Flowgraph("t", "t")
+top.msg_connect(probe, "pdus", radio, "pdus")
+top.msg_connect(radio, "pdus", probe, "pdus")
+got = lambda: [packet for message in probe.messages for packet in packets_of(message)[0]]
+with top:
+    first = time.monotonic() + 0.5
+    asked = [first + 0.1 * number for number in range(5)]
+    for number, at in enumerate(asked):
+        probe.post_message(pdu_to_send(AirPacket(bytes([number]) * 64, leave_at=at)))
+    wait_for(lambda: len(got()) == len(asked), "every packet")
+print(json.dumps([radio.front_end.timing_error_s, [packet.at - at for packet, at in zip(got(), asked)]]))
+radio.close()
+"""
+
+
+@pytest.mark.parametrize("args", ["driver=loopback,clock=1000000", "driver=loopback"])
+def test_a_device_with_a_clock_sends_at_the_time_asked_for_and_tells_when_it_received(driver: Path, args: str) -> None:
+    run = [sys.executable, "-c", TIMED, args]
+    done = subprocess.run(run, env=with_driver(driver), capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    stated_s, errors_s = json.loads(done.stdout.splitlines()[-1])
+    clocked = "clock" in args
+    assert stated_s == (0.001 if clocked else 0.01)
+    if clocked:
+        assert max(map(abs, errors_s)) < stated_s
+    else:  # a busy machine may be late by more than a device without a clock states, but nothing is early
+        assert min(errors_s) > -stated_s
+
+
 def test_what_a_device_does_not_take_is_dropped_and_counted(driver: Path) -> None:
     phy = PskPhy(64, SLOW)
     front_end = {"name": "soapy", "args": "driver=loopback,refuses=3", "frequency": 433e6}
@@ -200,10 +237,34 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
 
 
 @pytest.mark.slow
+def test_a_device_that_falls_silent_is_waited_for_and_opened_again(driver: Path, tmp_path: Path) -> None:
+    """Each time it is opened, it dies after 0.2 s. In between, the robot hears its own packets."""
+    code = (
+        "import json\n"
+        "from tests.radio.robots import *\n"
+        "front_end = {'name': 'soapy', 'args': 'driver=loopback,dies=0.2', 'frequency': 1e8}\n"
+        f"link = RobotLink(config(1, front_end, version=1, state={str(tmp_path / 'state')!r}))\n"
+        "link.start()\n"
+        "def again():\n"
+        "    link.check()\n"
+        "    return link.stats()['front_end']['lost'].get('interruptions', 0) == 2\n"
+        "wait_for(again, 'the second time that it vanishes')\n"
+        "print(json.dumps(link.stats()))\n"
+        "link.stop()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert done.stderr.count("no samples for 3 s") == 2
+    assert "front end soapy is back" in done.stderr
+    assert told["sink"]["dropped"]["own"] > 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        ("driver=loopback,dies=0.2", "no samples for 3 s"),
         ("driver=loopback,breaks=start", "the device does not begin to send (STREAM_ERROR)"),
     ],
 )

@@ -99,12 +99,49 @@ def test_no_period_no_diagnostics(tmp_path: Path) -> None:
         assert {info.topic for info in listener.discover()} == {"/point"}
 
 
+def test_a_second_link_of_the_same_robot_on_one_graph_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    arrays: list[Any] = []
+    number, store = domain(1), typestore()
+    with (
+        MemoryMiddleware(domain_id=number) as one,
+        MemoryMiddleware(domain_id=number) as two,
+        MemoryMiddleware(domain_id=number) as listener,
+    ):
+        listener.subscribe(
+            "/diagnostics", DIAGNOSTICS_TYPE, Qos(), lambda p: arrays.append(store.deserialize_cdr(p, DIAGNOSTICS_TYPE))
+        )
+
+        def told() -> bool:
+            return any(status.name == "link_1: robot id" for status in arrays[-1].status)
+
+        first = Diagnostics(QUICK, one, "link_1", lambda: STATS)
+        first.start()
+        wait_for(lambda: arrays, "diagnostics")
+        assert not told()
+        second = Diagnostics(QUICK, two, "link_1", lambda: STATS)
+        wait_for(told, "a warning of the second link")
+        assert "a second link_1 is on this ROS graph" in caplog.text
+        second.stop()
+        wait_for(lambda: not told(), "the end of the warning")
+        first.stop()
+
+
 STATS = {
     "source": {"topics": {}},
-    "sink": {"packets": 0, "packet_loss_est": 0, "rejected": {}, "held_bytes": 0, "publish_failed": 0, "topics": {}},
+    "sink": {
+        "packets": 0,
+        "packet_loss_est": 0,
+        "rejected": {},
+        "dropped": {},
+        "silence_s": {},
+        "held_bytes": 0,
+        "publish_failed": 0,
+        "topics": {},
+    },
     "packets": {"out": 0, "backlog": 0, "damaged": 0, "foreign": 0},
     "phy": {"airtime_s": 0.0},
     "front_end": {"name": "sim", "passed": {}, "lost": {}},
+    "airtime": {"transmits": True, "sent_s": 0.0, "refused": {}},
 }
 QUICK = DiagnosticsConfig(period_s=0.01)
 

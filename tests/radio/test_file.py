@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gnuradio import blocks, gr
+
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.radio.bursts import BurstCutter
@@ -127,8 +129,9 @@ def test_a_recording_that_is_repeated_comes_again(tmp_path: Path) -> None:
 
 def test_a_recording_cut_off_by_a_kill_is_still_one(tmp_path: Path) -> None:
     recorder = SigmfRecorder(tmp_path / "cut", SigmfRecording(RATE, 433e6), BurstCutter(4, tagged=False))
-    recorder.work([np.arange(8, dtype=np.complex64)], [])
-    recorder.stop()
+    graph = gr.top_block()
+    graph.connect(blocks.vector_source_c(list(range(8))), recorder)
+    graph.run()
     with Path(tmp_path / "cut.sigmf-data").open("ab") as data:
         data.write(b"torn")
     about, samples = read_recording(tmp_path / "cut")

@@ -11,7 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.config import link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
 from gr_ros2.settings.fields import AUTO
@@ -45,6 +45,14 @@ def test_the_yaml_it_prints_says_the_same(radio: str, tmp_path: Path) -> None:
     path = tmp_path / "saved.yaml"
     path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
     assert load_link(path) == settings
+
+
+@pytest.mark.parametrize("radio", list(PRESETS))
+def test_a_preset_prints_what_it_stands_for(radio: str) -> None:
+    row = PRESETS[radio]
+    settings = link_from(settled(one_line(7, radio, None, {"device": "/dev/ttyUSB0"}), Path(), []))
+    assert (settings.packet_len, settings.phy.options) == (row.packet_len, row.phy_options)
+    assert settings.front_end == {"name": row.front_end, **row.settings, "device": "/dev/ttyUSB0"}
 
 
 def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,15 +21,15 @@ from tests.waiting import wait_for
 ADAPTIVE = {"version": 1, "phy": {"name": "ofdm", "sample_rate": RATE, "options": {"rate": "adaptive"}}}
 
 
-class Rungs:
-    """The rungs of the packets that carried messages."""
+class Rates:
+    """The rates of the packets that carried messages."""
 
     def __init__(self) -> None:
         self.sent: list[int] = []
 
     def sender_event(self, _src_id: int, event: SenderEvent) -> None:
         if isinstance(event, SentPacket) and event.kind == "new":
-            self.sent.append(event.rung)
+            self.sent.append(event.mcs)
 
     def receiver_event(self, _event: ReceiverEvent, _now: float) -> None:
         pass
@@ -47,16 +47,16 @@ def ends(tmp_path: Path) -> list[dict[str, Any]]:
 def test_the_rate_is_what_the_noise_of_the_samples_allows(
     ends: list[dict[str, Any]], snr_db: float, least: int, most: int
 ) -> None:
-    rungs = Rungs()
+    rates = Rates()
     channel = {"snr_db": snr_db}
     with (
-        Robot(1, ends[0], observer=rungs, **ADAPTIVE) as one,
+        Robot(1, ends[0], observer=rates, **ADAPTIVE) as one,
         Robot(2, ends[1], hears=(1,), channel=channel, **ADAPTIVE) as two,
     ):
 
         def risen() -> bool:
-            one.say(len(rungs.sent))
-            return max(rungs.sent, default=0) >= least
+            one.say(len(rates.sent))
+            return max(rates.sent, default=0) >= least
 
         wait_for(risen, "the rate to rise")
         heard = len(two.heard)
@@ -66,28 +66,28 @@ def test_the_rate_is_what_the_noise_of_the_samples_allows(
             return len(two.heard) > heard + 20
 
         wait_for(delivered, "messages at that rate")
-        assert one.link.stats()["phy"]["rung"] in [rung.name for rung in one.link.phy.ladder]
-    assert max(rungs.sent) <= most
-    assert rungs.sent[0] == 0
+        assert one.link.stats()["phy"]["mcs"] in [mcs.name for mcs in one.link.phy.mcs_table]
+    assert max(rates.sent) <= most
+    assert rates.sent[0] == 0
 
 
 @pytest.mark.slow
 def test_the_rate_rises_when_a_robot_in_another_process_reports(ends: list[dict[str, Any]]) -> None:
-    rungs = Rungs()
-    with Robot(1, ends[0], hears=(2,), observer=rungs, **ADAPTIVE) as one:
+    rates = Rates()
+    with Robot(1, ends[0], hears=(2,), observer=rates, **ADAPTIVE) as one:
         one.say(1)
         other = RobotProcess(2, ends[1], first=1, **ADAPTIVE)
         try:
 
             def risen() -> bool:
                 one.say(2)
-                return max(rungs.sent, default=0) == len(one.link.phy.ladder) - 1
+                return max(rates.sent, default=0) == len(one.link.phy.mcs_table) - 1
 
             wait_for(risen, "the rate to rise")
             wait_for(lambda: bool(one.heard), "the other robot's messages")
         finally:
             other.kill()
-    assert rungs.sent[0] == 0
+    assert rates.sent[0] == 0
 
 
 def test_version_0_has_no_reports_and_is_refused(ends: list[dict[str, Any]]) -> None:
@@ -95,9 +95,9 @@ def test_version_0_has_no_reports_and_is_refused(ends: list[dict[str, Any]]) -> 
         RobotLink(config(1, ends[0], **{**ADAPTIVE, "version": 0}))
 
 
-def test_a_robot_that_hears_itself_alone_is_served_at_the_most_robust_rung() -> None:
-    rungs = Rungs()
-    with Robot(1, {"name": "sim"}, hears=(1,), observer=rungs, **ADAPTIVE) as robot:
+def test_a_robot_that_hears_itself_alone_is_served_at_the_most_robust_rate() -> None:
+    rates = Rates()
+    with Robot(1, {"name": "sim"}, hears=(1,), observer=rates, **ADAPTIVE) as robot:
         said = robot.say(*range(5))
         wait_for(lambda: robot.heard == said, "every message")
-    assert set(rungs.sent) == {0}
+    assert set(rates.sent) == {0}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli.link import status_line
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RegistryError
 from gr_ros2.link import Delivered
 from gr_ros2.link.events import Accepted, Received, ReceiverEvent, SenderEvent, SentPacket
@@ -67,6 +70,39 @@ def test_a_link_that_was_stopped_keeps_no_other_process_from_its_state(name: str
         refused = subprocess.run(command, capture_output=True, check=False)
         assert b"a link of this robot runs already" in refused.stderr
     subprocess.run(command, check=True)
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on a disk of its own on which not a byte is free."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "gr_ros2_test", str(folder)]
+    try:
+        made = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        pytest.skip(f"needs mount: {error}")
+    if made.returncode:
+        pytest.skip(f"needs the right to mount a disk: {made.stderr.strip()}")
+    try:
+        with suppress(OSError), (folder / "rest").open("wb", buffering=0) as rest:
+            while True:
+                rest.write(bytes(4096))
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_link_starts_on_a_full_disk_and_says_so(full_disk: Path, caplog: pytest.LogCaptureFixture) -> None:
+    state = full_disk / "state"
+    with Robot(1, SIM, hears=(1,), version=1, state=str(state)) as robot:
+        said = robot.say(*range(5))
+        wait_for(lambda: robot.heard == said, "every message")
+        assert any(f"{state}: cannot be written (No space left on device)" in text for text in caplog.messages)
+        assert not state.exists()
+        (full_disk / "rest").unlink()
+    with Robot(1, SIM, version=1, state=str(state)):
+        assert state.exists()
 
 
 def test_packets_leave_at_the_pace_of_the_air() -> None:
@@ -159,3 +195,62 @@ def test_it_stops_at_any_moment_and_leaves_no_thread() -> None:
             robot.say(*range(20))
         robot.link.stop()
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("gr-ros2")]
+
+
+def test_a_limit_of_airtime_holds_and_is_told_and_a_restart_knows_it(tmp_path: Path) -> None:
+    slow = {"name": "sim", "guard_s": 0.02}
+    limited: dict[str, Any] = {
+        "airtime": {"duty_cycle": 0.01, "window_s": 100},
+        "state": str(tmp_path / "robot.json"),
+        "version": 1,
+    }
+    with Robot(1, slow, **limited) as robot:
+        robot.say(*range(5))
+        wait_for(lambda: robot.link.stats()["airtime"]["waits_s"] > 0, "the burst to be spent")
+        first = robot.link.stats()
+    account = first["airtime"]
+    assert account["allowed_s"] == pytest.approx(1.0)
+    assert 0 < account["spent_s"] < 1.0
+    assert account["spent_s"] == pytest.approx(account["sent_s"])
+    assert account["refused"] == {}
+    assert "of 1 s allowed in 100 s" in status_line(first)
+    with Robot(1, slow, **limited) as robot:
+        again = robot.link.stats()["airtime"]
+    assert again["spent_s"] >= account["spent_s"] * 0.99, "what was sent before counts"
+
+
+def test_sending_is_switched_off_at_once_and_on_again() -> None:
+    with Robot(1, SIM, hears=(1,)) as robot:
+        said = robot.say(*range(3))
+        wait_for(lambda: len(robot.heard) == len(said), "every message")
+        robot.link.transmit(on=False)
+        before = robot.link.stats()
+        assert "sending is off" in status_line(before)
+        robot.say(*range(3, 6))
+        wait_for(lambda: robot.link.stats()["source"]["topics"], "the messages to be taken")
+        assert robot.link.stats()["packets"]["out"] == before["packets"]["out"]
+        robot.link.transmit(on=True)
+        wait_for(lambda: len(robot.heard) > len(said), "messages after it is on again")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"airtime": "eu86"}, "airtime: band = 'eu86': no such band; known are eu433, eu863"),
+        ({"airtime": {"duty_cycle": 0}}, "airtime.duty_cycle = 0"),
+        ({"airtime": {"band": "eu868", "duty_cycle": 0.1}}, "band eu868 allows 0.01 of 3600 s; leave it out"),
+        ({"airtime": {"band": "us915", "max_burst_s": 0}}, "band us915 allows 0.4 s"),
+        ({"airtime": "amateur"}, "a station says its callsign in clear"),
+        ({"airtime": {"window_s": 60}}, "window_s = 60: has no effect without a share; set duty_cycle"),
+        ({"airtime": {"duty_cycle": 0.1}, "ros_source": {"packet_rate": 0}}, "sends whatever airtime allows; set auto"),
+        (
+            {"airtime": "eu868", "front_end": {"name": "uhd", "frequency": 433.2e6}},
+            r"not within the 868 to 868.6 MHz of airtime.band = 'eu868'; set another frequency or band",
+        ),
+    ],
+)
+def test_a_limit_that_cannot_be_is_refused_in_one_line_with_the_remedy(settings: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        config(1, **{"front_end": SIM, **settings})
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)

@@ -16,7 +16,7 @@ import pmt
 from gnuradio import gr, uhd
 
 from gr_ros2.core.errors import RadioError
-from gr_ros2.radio.bursts import LENGTH_TAG
+from gr_ros2.phy.base import LENGTH_TAG
 from gr_ros2.radio.robot_link import RobotLink
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
@@ -27,6 +27,8 @@ HIGHEST, MOST = 6e9, 76.0
 """Hz and dB the stand-ins can do."""
 STEP = 2000
 """Samples a call."""
+AHEAD_S = 100.0
+"""s by which the clock of the stand-ins is ahead."""
 
 
 class _Usrp:
@@ -34,6 +36,9 @@ class _Usrp:
 
     def get_samp_rate(self) -> float:
         return RATE
+
+    def get_time_now(self) -> Any:
+        return uhd.time_spec_t(time.monotonic() + AHEAD_S)
 
     def get_antennas(self, channel: int) -> tuple[str, ...]:
         assert channel == 0
@@ -158,7 +163,7 @@ def test_whatever_a_usrp_tells_is_counted_by_name() -> None:
         (sink,), (source,) = Sink.made, Source.made
         wait_for(lambda: "overflows" in robot.counters(), "the first sample")
         assert robot.counters() == {
-            **{"clipped": 0, "overflows": 0},
+            **{"clipped": 0, "energy": 0, "overflows": 0},
             **{"bursts_out": 0, "underflows": 0, "sequence_errors": 0, "late": 0},
         }
         robot.say(*range(3))
@@ -166,6 +171,7 @@ def test_whatever_a_usrp_tells_is_counted_by_name() -> None:
         packets = robot.link.stats()["packets"]["out"]
         wait_for(lambda: robot.counters()["bursts_out"] == packets, "every acknowledgement")
         front_end: Any = robot.link.front_end
+        assert front_end.clock_offset() == pytest.approx(-AHEAD_S, abs=AHEAD_S / 10)
         assert sink.lengths == [front_end.layout.total] * packets
 
         for event in TROUBLES:

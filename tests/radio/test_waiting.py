@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.middleware import Qos, TopicInfo
-from gr_ros2.radio.waiting import waiting_line
+from gr_ros2.radio.waiting import shortcut, waiting_line
 
 QOS = Qos("reliable", "volatile", 10)
 ODOM, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
@@ -60,3 +60,22 @@ def test_a_line_is_told_when_it_changes() -> None:
             assert source.stats()["unmatched"] == []
         finally:
             source.close()
+
+
+@pytest.mark.parametrize(
+    ("topics", "heard", "said"),
+    [
+        (["/gr_ros2_link_1/statistics", "/odom"], [2], None),
+        (
+            ["/gr_ros2_link_2/statistics"],
+            [2],
+            "gr_ros2_link_2 is on this robot's ROS graph, which is heard by radio too",
+        ),
+        (["/gr_ros2_link_2/statistics", "/gr_ros2_link_10/statistics"], [], "gr_ros2_link_2, gr_ros2_link_10 is on"),
+        (["/my/gr_ros2_link_2/statistics", "/gr_ros2_link_x/statistics"], [], None),
+    ],
+)
+def test_another_robots_link_on_this_graph_is_named(topics: list[str], heard: list[int], said: str | None) -> None:
+    infos = [TopicInfo(topic, "std_msgs/msg/String", (Qos(),)) for topic in topics]
+    line = shortcut(infos, 1, heard)
+    assert (line is None) if said is None else (line is not None and line.startswith(said))

@@ -6,6 +6,7 @@ import gc
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def test_messages_that_are_none_of_ours_are_counted_and_dropped(
     ends: list[dict[str, Any]], stranger: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     def header(number: int, rate: float = RATE, magic: bytes = MAGIC) -> bytes:
-        return HEADER.pack(magic, 77, number, rate)
+        return HEADER.pack(magic, 77, number, rate, nan)
 
     with Robot(1, ends[0]) as robot:
 
@@ -131,22 +132,22 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
                     nonlocal sent
                     for _ in range(50):
                         samples = np.full(1000, sent, "<c8").tobytes()
-                        publisher.send(HEADER.pack(MAGIC, sender, sent, RATE) + samples)
+                        publisher.send(HEADER.pack(MAGIC, sender, sent, RATE, nan) + samples)
                         sent += 1
                     lost = front_end.counters().lost
                     return lost["restarts"] == sender and lost["overflows"] > 1000 * (sender + 1)
 
                 wait_for(dropped, "bursts that are dropped")
         assert front_end.counters().passed["bursts_in"] == most
-        numbers = [int(burst[0].real) for burst in (arrivals.take(10.0) for _ in range(most)) if burst is not None]
+        numbers = [int(burst[1][0].real) for burst in (arrivals.take(10.0) for _ in range(most)) if burst is not None]
         assert len(numbers) == most
         assert numbers == sorted(set(numbers))
         with strange_robot(address) as publisher:
 
             def heard_again() -> bool:
-                publisher.send(HEADER.pack(MAGIC, 77, 0, RATE) + bytes(8))
+                publisher.send(HEADER.pack(MAGIC, 77, 0, RATE, nan) + bytes(8))
                 burst = arrivals.take(0.01)
-                return burst is not None and not burst.any()
+                return burst is not None and not burst[1].any()
 
             wait_for(heard_again, "a new burst, now that there is room")
     finally:
@@ -160,7 +161,7 @@ def test_the_sender_forgotten_is_the_one_heard_longest_ago(ends: list[dict[str, 
 
         def bursts(*numbers: tuple[int, int]) -> int:
             for sender, number in numbers:
-                arrivals.arrived(HEADER.pack(MAGIC, sender, number, RATE))
+                arrivals.arrived(HEADER.pack(MAGIC, sender, number, RATE, nan))
             return robot.counters()["missed"]
 
         bursts(*((sender, 0) for sender in range(MAX_SENDERS)))

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gr_ros2.link.events import Accepted, Delivered, Missed, Received, Refused, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Missed, PacketId, Received, Refused, SentEntry, SentPacket
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.report.page import Run
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.v0 import V0, Entry, Packet
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu"})
 T0 = 100.0
@@ -64,17 +64,18 @@ def recorded() -> Recorder:
             if imu >= 0 and index == 0:
                 record.append(SentEntry(imu, 1, step, 0, 1))
             entries = tuple(
-                Entry(e.topic_id, step, e.index, e.total, bytes([step, e.topic_id, e.index])) for e in record
+                EntryV0(e.topic_id, step, e.index, e.total, bytes([step, e.topic_id, e.index])) for e in record
             )
-            packet = Packet(1, 255, number & 255, 1, entries)
+            packet = PacketV0(1, 255, number & 255, 1, entries)
             data = V0.encode(packet, 64)
             number += 1
             left = now + (index + 1) * 0.02 - 0.02
-            recorder.sender_event(1, SentPacket(data, packet, tuple(record), left))
+            identity = PacketId(1, 0, number, 0)
+            recorder.sender_event(1, SentPacket(data, packet, identity, tuple(record), left))
             lost = step % 4 == 3 and index == 1 and step < 4 * LOST + 2
             if lost or step >= ODOM - UNSENT - IN_FLIGHT:
                 continue
-            recorder.receiver_event(Received(data, packet), left + 0.05)
+            recorder.receiver_event(Received(data, packet, identity), left + 0.05)
             if imu >= 0 and index == 0:
                 recorder.receiver_event(Delivered(1, 1, b"imu %d" % step, 0, step), left + 0.05)
             if index == 1:

@@ -13,23 +13,40 @@ from hypothesis import strategies as st
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import CrcError, PadError, RunError
-from gr_ros2.link import Receiver, Sender
-from gr_ros2.link.events import Accepted, Delivered, Lost, Missed, Refused, Rejected, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link import ReceivedPacket, Receiver, Sender
+from gr_ros2.link.events import (
+    Accepted,
+    Delivered,
+    Lost,
+    Missed,
+    PacketId,
+    Received,
+    Refused,
+    Rejected,
+    SenderEvent,
+    SentEntry,
+    SentPacket,
+)
 from gr_ros2.record.ledger import REORDER_WINDOW, Ledger, TopicLedger
 from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.wire.v0 import Packet
+from gr_ros2.wire.v0 import PacketV0
 from tests.compression.support import Writer
+from tests.packets import data_of
 
 SRC = 1
 
 
 def packet(number: int, *entries: SentEntry) -> SentPacket:
-    return sent(b"packet %d" % number, entries, float(number))
+    return sent(number, entries, float(number))
 
 
-def sent(data: bytes, entries: tuple[SentEntry, ...], now: float) -> SentPacket:
-    return SentPacket(data, Packet(SRC, 255, 0, 1, ()), entries, now)
+def sent(number: int, entries: tuple[SentEntry, ...], now: float) -> SentPacket:
+    return SentPacket(b"", PacketV0(SRC, 255, 0, 1, ()), named(number), entries, now)
+
+
+def named(number: int) -> PacketId:
+    return PacketId(SRC, 0, number, 0)
 
 
 def entry(serial: int, key: int, index: int = 0, total: int = 1, topic_id: int = 0) -> SentEntry:
@@ -58,7 +75,7 @@ def accepted(serial: int, payload: bytes | None = None, topic_id: int = 0) -> Ac
 
 def test_a_delivered_message_keeps_its_times_and_size() -> None:
     ledger = feed(accepted(0, b"hello"), packet(0, entry(0, 7)))
-    ledger.packet_received(b"packet 0")
+    ledger.packet_received(named(0))
     ledger.receiver_event(Delivered(SRC, 0, b"hello", 0, 7), 2.5)
     book = only(ledger.finish())
     assert book.rows == {"delivered": 1}
@@ -88,7 +105,7 @@ def test_what_lies_behind_the_last_packet_received_is_in_flight() -> None:
         packet(1, entry(1, 1)),
         packet(2, entry(2, 2, 0, 2)),
     )
-    ledger.packet_received(b"packet 1")
+    ledger.packet_received(named(1))
     ledger.receiver_event(Delivered(SRC, 0, b"message 1", 0, 1), 9.0)
     # 0 was overtaken; 2 is half sent; 3 still waits
     assert only(ledger.finish()).rows == {"delivered": 1, "lost_fragments": 1, "in_flight": 2}
@@ -101,13 +118,13 @@ def test_an_empty_phy_turns_in_flight_into_lost() -> None:
 
 def test_everything_arrived_and_nothing_came_out() -> None:
     ledger = feed(accepted(0), packet(0, entry(0, 0)))
-    ledger.packet_received(b"packet 0")
+    ledger.packet_received(named(0))
     assert only(ledger.finish()).rows == {"not_taken": 1}
 
 
 def test_the_receivers_reason_stands() -> None:
     ledger = feed(accepted(0), packet(0, entry(0, 9, 0, 2)), packet(1, entry(0, 9, 1, 2)))
-    ledger.packet_received(b"packet 0")
+    ledger.packet_received(named(0))
     ledger.receiver_event(Lost(SRC, 0, "expired", 9), 5.0)
     assert ledger.unresolved() == 0
     assert only(ledger.finish()).rows == {"expired": 1}
@@ -192,11 +209,11 @@ def test_a_delivery_told_before_its_packet_is_matched_in_the_end() -> None:
 
 def test_packets_are_counted_by_fate() -> None:
     ledger = feed(packet(0), packet(1))
-    for data in (b"packet 0", b"noise", b"more noise"):
-        ledger.packet_received(data)
+    assert ledger.packet_received(named(0)) == 0
+    assert ledger.packet_received(named(2)) is None, "of another run"
     ledger.receiver_event(Rejected(b"noise", CrcError("no")), 0.0)
     ledger.receiver_event(Rejected(b"noise", PadError("no")), 0.0)
-    counts = {"sent": 2, "received": 1, "crc_failed": 1, "malformed": 1, "rejected_crc": 1, "rejected_pad": 1}
+    counts = {"sent": 2, "received": 2, "crc_failed": 1, "malformed": 1, "rejected_crc": 1, "rejected_pad": 1}
     assert ledger.packets() == counts
 
 
@@ -207,15 +224,14 @@ def test_contradictory_events_are_a_run_error() -> None:
         feed(accepted(0), Refused(0, 0, "queue_bound"), Refused(0, 0, "queue_bound")).finish()
 
 
-def test_equal_packets_are_counted_one_by_one() -> None:
-    """One topic whose message never changes: packets n and n + 256 have the same bytes."""
-    same = b"the same bytes"
+def test_packets_of_one_number_are_counted_one_by_one() -> None:
+    """A packet that is sent again; and with version 0 packets n and n + 256."""
     ledger = Ledger()
     for serial in range(3):
         ledger.sender_event(SRC, accepted(serial, b"x"))
-        ledger.sender_event(SRC, sent(same, (entry(serial, 0),), 0.0))
-    ledger.packet_received(same)
-    ledger.packet_received(same)
+        ledger.sender_event(SRC, sent(7, (entry(serial, 0),), 0.0))
+    ledger.packet_received(named(7))
+    ledger.packet_received(named(7))
     assert only(ledger.finish()).rows == {"not_taken": 2, "in_flight": 1}
 
 
@@ -230,7 +246,7 @@ def test_memory_of_open_messages_is_bounded(total: int) -> None:
             number = serial * total + index
             ledger.sender_event(SRC, packet(number, entry(serial, serial % 256, index, total)))
             if serial % 11 == 0:
-                ledger.packet_received(b"packet %d" % number)
+                ledger.packet_received(named(number))
         if serial % 11 == 0:
             ledger.receiver_event(Delivered(SRC, 0, b"message %d" % serial, 0, serial % 256), float(serial))
     assert ledger.unresolved() <= REORDER_WINDOW + 2 * 256
@@ -261,7 +277,7 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
     topics: list[int] = []  # by serial
     gone: set[int] = set()  # serials that were refused or have started, and so cannot be dropped
     refused: set[int] = set()
-    packets: list[bytes] = []
+    packets: list[int] = []
     missed: Counter[int] = Counter()
     for now, (kind, first, second, many) in enumerate(events):
         if kind == "accept":
@@ -283,12 +299,12 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
             serials = [serial for serial in many if serial < len(topics) and serial not in refused]
             gone.update(serials)
             entries = tuple(SentEntry(s, topics[s], second, 0, 2, repeat=kind == "repeat") for s in serials)
-            packets.append(b"packet %d" % (len(packets) % 5))
+            packets.append(len(packets) % 5)
             ledger.sender_event(SRC, sent(packets[-1], entries, now))
         elif kind == "arrive" and packets:
-            ledger.packet_received(packets[first % len(packets)])
+            ledger.packet_received(named(packets[first % len(packets)]))
         elif kind == "noise":
-            ledger.packet_received(b"noise")
+            ledger.packet_received(named(5))
         elif kind == "deliver":
             ledger.receiver_event(Delivered(SRC, first, b"payload %d" % second, 0, second), now)
         elif kind == "lose":
@@ -326,9 +342,10 @@ def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decode
     written = [Writer(random.Random(seed)).message("nav_msgs/msg/Odometry")[0] for seed in range(60)]
     for now, payload in enumerate(written):
         sender.submit(0, payload, now)
-        while (data := sender.next_packet(now)) is not None:
-            ledger.packet_received(data)
-            for event in receiver.receive(data, now):
+        while (data := data_of(sender.next_packet(now))) is not None:
+            for event in receiver.receive(ReceivedPacket(data), now):
+                if isinstance(event, Received):
+                    assert ledger.packet_received(event.identity) is not None
                 ledger.receiver_event(event, now)
                 if isinstance(event, Delivered):
                     delivered.append(event.payload)
@@ -366,16 +383,17 @@ def test_the_engines_over_a_bad_link(
             submitted[topic_id] += 1
             sender.submit(topic_id, rng.randbytes(rng.randint(*sizes)), now)
         for _ in range(rng.randrange(6)):
-            data = sender.next_packet(now)
+            data = data_of(sender.next_packet(now))
             if data is not None and rng.random() >= loss:
                 spoilt = rng.random() < damage
                 air.append(bytes([data[0] ^ 1]) + data[1:] if spoilt else data)
         events = receiver.handle_timeout(now)
         while len(air) > delay:
             data = air.pop(0)
-            ledger.packet_received(data)
-            events += receiver.receive(data, now)
+            events += receiver.receive(ReceivedPacket(data), now)
         for event in events:
+            if isinstance(event, Received):
+                assert ledger.packet_received(event.identity) is not None
             ledger.receiver_event(event, now)
             if isinstance(event, Delivered):
                 outcome[event.topic_id] += 1

@@ -6,11 +6,12 @@ import random
 
 import pytest
 
-from gr_ros2.link import Receiver, Sender
+from gr_ros2.link import ReceivedPacket, Receiver, Sender
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
+from tests.packets import data_of
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "fix": "sensor_msgs/NavSatFix", "raw": "my_msgs/Thing"})
 
@@ -35,10 +36,10 @@ def test_a_run_over_the_engines() -> None:
     for step in range(100):
         now = 100 + step / 10
         sender.submit(0, _point_stamped(step, 2 * step), now)
-        while (data := sender.next_packet(now)) is not None:
+        while (data := data_of(sender.next_packet(now))) is not None:
             if 20 <= step < 30:  # an outage
                 continue
-            for event in receiver.receive(data, now + 0.05):
+            for event in receiver.receive(ReceivedPacket(data), now + 0.05):
                 recorder.receiver_event(event, now + 0.05)
     assert recorder.progress() == (100, 90)
     at, imu = recorder.finish(duration_s=10, t_end=110)
@@ -67,9 +68,13 @@ def test_a_run_over_the_engines() -> None:
         "airtime_mean_s": 0.5,
         "airtime_per_message_s": pytest.approx(0.5 * packets / 90),
         "airtime_per_byte_s": pytest.approx(0.5 * packets / 90 / len(_point_stamped(0, 0))),
+        "airtime_of_senders_s": {"4": {"new": pytest.approx(0.5 * packets)}},
+        "air_span_s": pytest.approx(9.9 + 0.5, abs=0.1),
         "bytes_per_message": pytest.approx(64 * packets / 90),
     }
     without = recorder.airtime(None)
+    assert without.pop("airtime_of_senders_s") == {}
+    assert without.pop("air_span_s") == pytest.approx(9.9, abs=0.1)
     assert without.pop("bytes_per_message") == pytest.approx(64 * packets / 90)
     assert set(without.values()) == {None}
 

@@ -14,10 +14,10 @@ import pyarrow.parquet as pa_parquet
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Accepted, Delivered, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, PacketId, SentEntry, SentPacket
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.trace import PacketLog, Track, make_trace, read_trace, write_trace
-from gr_ros2.wire.v0 import Entry, Packet
+from gr_ros2.wire.v0 import EntryV0, PacketV0
 from tests.record.runs import DURATION_S, IMU, IN_FLIGHT, LOST, ODOM, TOO_LARGE, UNSENT, empty_trace, make_run
 
 NAMES = ["messages", "packets", "paths"]
@@ -153,12 +153,12 @@ def test_a_packet_costs_numbers_and_no_objects() -> None:
     def send(numbers: range) -> None:
         for number in numbers:
             ledger.sender_event(1, Accepted(number, 0, b"x%d" % number, float(number)))
-            packet = Packet(1, 255, number & 255, 1, (Entry(0, number & 255, 0, 1, b""),))
+            packet = PacketV0(1, 255, number & 255, 1, (EntryV0(0, number & 255, 0, 1, b""),))
             entry = SentEntry(number, 0, number & 255, 0, 1)
-            event = SentPacket(number.to_bytes(8, "big"), packet, (entry,), float(number))
+            event = SentPacket(b"", packet, PacketId(1, 0, number, 0), (entry,), float(number))
             log.sent(event)
             ledger.sender_event(1, event)
-            assert ledger.packet_received(event.data) == (1, number)
+            assert ledger.packet_received(event.identity) == number
             log.received(number, float(number))
             ledger.receiver_event(Delivered(1, 0, b"x%d" % number, 0, number & 255), float(number))
 
@@ -190,9 +190,9 @@ def test_reading_what_grows_disturbs_nobody() -> None:
         try:
             for number in range(30_000):
                 track.add(float(number), 1.0, 2.0)
-                packet = Packet(1, 255, number & 255, 1, (Entry(0, number & 255, 0, 1, b""),) * 2)
+                packet = PacketV0(1, 255, number & 255, 1, (EntryV0(0, number & 255, 0, 1, b""),) * 2)
                 entries = (SentEntry(number, 0, number & 255, 0, 1),) * 2
-                log.sent(SentPacket(number.to_bytes(8, "big"), packet, entries, float(number)))
+                log.sent(SentPacket(b"", packet, PacketId(1, 0, number, 0), entries, float(number)))
         finally:
             done.set()
 

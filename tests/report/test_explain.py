@@ -20,19 +20,22 @@ from tests.record.runs import empty_trace, make_run
 
 def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    outcome, capacity, packets, fragments, in_flight, trend = explanation(run.result, run.trace)
+    outcome, air, packets, fragments, in_flight = explanation(run.result, run.trace)
     assert outcome == (
         "Of 49 messages sent: 33 (67%) delivered, 8 (16%) lost because a fragment did not arrive, "
         "2 (4%) too large for the packet length, 6 (12%) still in flight at the end."
     )
-    assert "10.0 ms of air, so the link carries at most 100.0 packets/s" in capacity
-    # 38 messages of two fragments and 9 of one share packets as those did that left: 83 entries in 74 packets
-    assert f"come to {(38 * 2 + 9) * 74 / 83 / 4:.1f} packets/s: 19% of what the link has" in capacity
-    assert packets.startswith("Of 74 packets that left the source, 58 (78%) reached the sink intact, 8 were lost")
-    assert "8 had not come out of the PHY by the end; those that arrived took 14% of the air" in packets
+    # 74 packets of 10 ms; the last of them left 3.62 s after the first
+    assert air == f"The air was busy {0.74 / 3.63:.0%} of the time, with new messages."
+    assert packets == (
+        "Of 74 packets with messages, 58 (78%) arrived, 8 were lost on the way, "
+        "8 had not come out of the PHY by the end."
+    )
     assert "of 41 messages that left whole 33 (80%) arrived complete" in fragments
-    assert "5 had left the source whole and waited in the PHY or on the air, 0 had left in part, and 1 had" in in_flight
-    assert trend.endswith("it stayed the same.")
+    assert in_flight == (
+        "Of the messages in flight at the end, 5 had left the source whole and waited in the PHY or on the air, "
+        "1 had not left the source's queue."
+    )
 
 
 def test_what_the_sources_graph_lost_is_told(tmp_path: Path) -> None:
@@ -46,7 +49,11 @@ def test_what_the_sources_graph_lost_is_told(tmp_path: Path) -> None:
 def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     slow = replace(run.result, phy={**run.result.phy, "airtime_s": 0.5, "airtime_mean_s": 0.5})
-    assert f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times what the link has" in explanation(slow, run.trace)[1]
+    # 38 messages of two fragments and 9 of one share packets as those did that left: 83 entries in 74 packets
+    assert explanation(slow, run.trace)[2] == (
+        "The messages do not fit: all of them would have needed "
+        f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times the air that there is."
+    )
 
 
 @pytest.mark.parametrize("airtime", [None, 0.0])
@@ -65,16 +72,17 @@ def test_as_fast_as_the_flowgraph_runs_the_clock_says_nothing_of_the_air(tmp_pat
 LATE = LatenessResult({"threads": 0.24, "gate": 0.06, "modem": 0.012}, 3, 0.045, 16, 5, 200, 20)
 
 
-def test_a_computer_that_was_late_is_named(tmp_path: Path) -> None:
+def test_a_computer_that_was_late_is_named_first(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     late = replace(run.result, lateness=LATE)
-    assert explanation(late, run.trace)[-1] == (
-        "The computer was up to 240 ms late (threads; gate 60.0 ms, modem 12.0 ms), 3 times by 50.0 ms or more, 4% of "
-        "the run; 31% of the losses follow such moments, as do 10% of all messages."
+    assert explanation(late, run.trace)[0] == (
+        "The computer did not keep up with the clock: it was up to 240 ms late (threads; gate 60.0 ms, modem 12.0 ms), "
+        "3 times by 50.0 ms or more, 4% of the run; 31% of the losses follow such moments, as do 10% of all messages."
     )
-    without = replace(late, lateness=replace(LATE, lost=0, lost_after=0, worst_s={"threads": 0.24}))
-    assert explanation(without, run.trace)[-1] == (
-        "The computer was up to 240 ms late (threads), 3 times by 50.0 ms or more, 4% of the run."
+    without = replace(late, lateness=replace(LATE, lost=0, lost_after=0, moments=1, worst_s={"threads": 0.24}))
+    assert explanation(without, run.trace)[0] == (
+        "The computer did not keep up with the clock: it was up to 240 ms late (threads), once by 50.0 ms or more, "
+        "4% of the run."
     )
 
 
@@ -101,18 +109,22 @@ def test_what_repair_did_is_told_and_tabulated(tmp_path: Path) -> None:
     outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=4.0), out)
     result = outcome.result
     (odom,), packets = result.topics, result.packets
-    repair, air = explanation(result, outcome.trace)[-2:]
-    assert repair.startswith(f"Repair recovered {odom.ledger['repaired']:,} messages (")
-    assert repair.endswith(f"{odom.ledger.get('given_up', 0):,} were given up.")
-    assert f" {packets['air_new']:,} for new messages (" in air
-    assert f" {packets['air_repair']:,} for repair (" in air
-    assert f"{packets['sent'] / odom.delivered:.2f} packets for each message delivered" in air
+    messages, air, *_ = explanation(result, outcome.trace)
+    assert f" {odom.ledger['delivered']:,} (" in messages
+    assert "delivered at the first try, " in messages
+    assert f" {odom.ledger['repaired']:,} (" in messages
+    spent, span = result.phy["airtime_of_senders_s"], result.phy["air_span_s"]
+    there, back = (spent[src_id] for src_id in sorted(spent, key=lambda src_id: src_id != "1"))
+    assert f"the channel of robot 1 {sum(there.values()) / span:.0%} of the time (new messages" in air
+    assert f"repair {there['repair'] / span:.0%}" in air
+    assert f"the channel back {sum(back.values()) / span:.0%} of the time (reports" in air
+    assert sum(packets[f"air_{kind}"] for kind in ("new", "repair", "report", "hello")) == packets["sent"]
     uses = {use.kind: use for use in air_uses(result)}
     assert sum(use.share for use in uses.values()) == pytest.approx(1)
     grid = air_grid(result)
     assert grid is not None
     assert [line[0] for line in grid.sections[0]] == ["new", "repair", "report", "hello"]
-    page = write_report(read_runs([out]), out)[0].read_text()
+    page = write_report(read_runs([out]), out, pictures=True)[0].read_text()
     assert "What the air was used for" in page
     assert (out / "air.png").is_file()
 
@@ -122,3 +134,18 @@ def test_version_0_has_nothing_to_tell_of_repair(tmp_path: Path) -> None:
     assert air_uses(run.result) == []
     assert air_grid(run.result) is None
     assert "epair" not in " ".join(explanation(run.result, run.trace))
+
+
+def test_a_link_that_falls_behind_is_told_and_one_whose_queues_fluctuate_is_not(tmp_path: Path) -> None:
+    settings = ["time=packets", "phy.name=ofdm"]
+    behind = run_scenario(load_scenario("paper-ofdm", settings, duration_s=4.0), tmp_path / "behind")
+    assert "The link fell behind: the median latency was " in " ".join(explanation(behind.result, behind.trace))
+    steady = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=4.0), tmp_path / "steady")
+    assert "fell behind" not in " ".join(explanation(steady.result, steady.trace))
+
+
+def test_the_announcement_of_topics_has_a_name(tmp_path: Path) -> None:
+    outcome = run_scenario(load_scenario("demo", ["time=packets"], duration_s=1.0), tmp_path / "run")
+    topics = set(outcome.trace.packets().topic)
+    assert "the topics that /robot_1 announces" in topics
+    assert not any("topic_2" in topic for topic in topics)

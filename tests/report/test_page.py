@@ -39,7 +39,10 @@ class _Page(HTMLParser):
 
 def test_a_report_stands_alone(tmp_path: Path) -> None:
     make_run(tmp_path)
-    page, *others = write_report(read_runs([tmp_path]), tmp_path)
+    before = set(tmp_path.iterdir())
+    assert write_report(read_runs([tmp_path]), tmp_path) == [tmp_path / "report.html"]
+    assert set(tmp_path.iterdir()) - before == {tmp_path / "report.html"}
+    page, *others = write_report(read_runs([tmp_path]), tmp_path, pictures=True)
     assert page == tmp_path / "report.html"
     text = page.read_text()
     html = _Page(text)
@@ -68,6 +71,11 @@ def test_the_papers_numbers_stand_above_the_runs(tmp_path: Path) -> None:
     assert "8 (16%) lost because a fragment did not arrive" in text
 
 
+def test_other_scenarios_have_nothing_of_the_paper(tmp_path: Path) -> None:
+    make_run(tmp_path, "demo")
+    assert "of the paper" not in write_report(read_runs([tmp_path]), tmp_path)[0].read_text()
+
+
 def _goodput(directory: Path) -> str:
     return f"{read_runs([directory])[0].result.topics[0].goodput_Bps:.1f}"
 
@@ -75,8 +83,8 @@ def _goodput(directory: Path) -> str:
 @pytest.mark.slow
 def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
-    before = write_report([run], tmp_path / "a")
-    after = write_report(read_runs([tmp_path / "run"]), tmp_path / "b")
+    before = write_report([run], tmp_path / "a", pictures=True)
+    after = write_report(read_runs([tmp_path / "run"]), tmp_path / "b", pictures=True)
     compared = set()
     for one, other in zip(before, after, strict=True):
         if one.suffix in (".png", ".csv", ".parquet"):
@@ -89,7 +97,7 @@ def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
 def test_several_runs_share_a_report(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "paper-ofdm")
     make_run(tmp_path / "b", "paper-direct", paced=False)
-    page, *others = write_report(read_runs([tmp_path / "a", tmp_path / "b"]), tmp_path / "out")
+    page, *others = write_report(read_runs([tmp_path / "a", tmp_path / "b"]), tmp_path / "out", pictures=True)
     names = {path.name for path in others}
     assert {"latency.svg", "paper-ofdm_latency.png", "paper-direct_ledger.svg"} <= names
     assert "paper-direct_airtime.png" not in names  # the clock says nothing of the air
@@ -109,7 +117,7 @@ def test_runs_of_one_scenario_are_called_after_their_folders(tmp_path: Path) -> 
     assert [run.label for run in read_runs(paths[:2])] == ["one", "two"]
     assert [run.label for run in read_runs(paths[1:])] == ["two", "one"]
     assert [run.label for run in read_runs(paths)] == [str(path) for path in paths]
-    assert len(write_report(read_runs(paths), tmp_path / "out")) > 3 * 2 * len(FIGURES)
+    assert len(write_report(read_runs(paths), tmp_path / "out", pictures=True)) > 3 * 2 * len(FIGURES)
 
 
 def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
@@ -132,7 +140,7 @@ def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
 
 def test_what_the_sources_graph_lost_is_in_every_part(tmp_path: Path) -> None:
     make_run(tmp_path, missed=51)
-    page, *_ = write_report(read_runs([tmp_path]), tmp_path)
+    page, *_ = write_report(read_runs([tmp_path]), tmp_path, pictures=True)
     assert "lost by the ROS graph of the source" in page.read_text()
     summary = pa_csv.read_csv(tmp_path / "summary.csv").to_pylist()[0]
     assert (summary["sent"], summary["ledger_lost_on_graph"]) == (ODOM + 51, 51)

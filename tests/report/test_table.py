@@ -48,7 +48,7 @@ def test_the_ledger_shows_every_row_that_occurred(result: Result) -> None:
 
 def test_notes_say_what_must_not_be_missed(result: Result) -> None:
     assert len(notes(result)) == 1
-    assert "path error 0.010 m" in notes(result)[0]
+    assert "runs 0.010 m beside the sent path" in notes(result)[0]
     bad = replace(result, topics=(replace(result.topics[0], corrupt=2),), interrupted=True)
     assert "2 messages arrived altered" in notes(bad)[0]
     assert "stopped after 15.0 s" in notes(bad)[-1]

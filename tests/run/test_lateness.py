@@ -79,7 +79,7 @@ def test_a_process_that_was_stopped_is_named_with_how_long(tmp_path: Path) -> No
     assert late.moments >= 1
     assert 0 < late.share <= 1
     assert late.lost_after <= late.lost <= late.sent >= late.sent_after
-    assert explanation(result, read_trace(out))[-1].startswith("The computer was up to ")
+    assert explanation(result, read_trace(out))[0].startswith("The computer did not keep up with the clock: ")
 
 
 def test_a_pulse_measures_from_its_start_to_its_end() -> None:

@@ -10,9 +10,10 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.medium import Surroundings
 from gr_ros2.record.result import Result, read_result, write_result
 from gr_ros2.report.table import summary_grid
-from gr_ros2.run.robots import ears_of, paths_at
+from gr_ros2.run.robots import ears_of, surroundings
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import dump, load_scenario, scenario_from
 from tests.e2e.support import check_books
@@ -38,10 +39,15 @@ def test_two_robots_on_one_channel_disturb_each_other_and_repair_it(time: str) -
 
 
 def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
-    result = run("twenty-robots", duration_s=1.0)
+    result = run("twenty-robots", "medium=exclusive", duration_s=1.0)
     assert len(result.topics) == 19
     assert [receiver.name for receiver in result.receivers] == [f"/robot_{number}" for number in range(2, 21)]
     assert {len(receiver.topics) for receiver in result.receivers} == {19}
+    for receiver in result.receivers:
+        assert 0 < receiver.packets["received"] < receiver.packets["sent"]
+        assert receiver.phy["channels"] == 1
+        assert receiver.phy["bytes_per_message"] > 0
+    assert len({receiver.packets["received"] for receiver in result.receivers}) > 1
     assert result.counters["channel"]["collision"] > 0
     assert sum(topic.delivered for topic in result.topics) > 0
     again = read_result(write_result(result, tmp_path / "result.json"))
@@ -49,25 +55,31 @@ def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
     assert "/robot_3/odom at /robot_2" in [line[1] for line in summary_grid([again]).sections[0]]
 
 
+def levels(around: Surroundings) -> list[list[tuple[int, float]]]:
+    """The hearers of every robot, and their SNRs."""
+    heard = [around.hearers(number, 0.0) for number in range(around.robots)]
+    return [list(zip(one.ids.tolist(), one.snr_db.tolist(), strict=True)) for one in heard]
+
+
 def test_levels_follow_from_power_gain_and_noise() -> None:
     rows = "[[null, -100, null], [-110, null, -90], [null, -200, null]]"
     louder = "robots=[{}, {tx_power_dbm: 30}, {noise_figure_db: 3}]"
     scenario = load_scenario("two-robots-half-duplex", [louder, f"gains_db={rows}"])
-    paths = paths_at(scenario, 1e6)(0.0)
+    around = surroundings(scenario, 1e6)
     noise_dbm = -174 + 60 + 6
-    assert [[(path.receiver, path.channel.snr_db) for path in heard] for heard in paths] == [
+    assert levels(around) == [
         [(1, 20 - 100 - noise_dbm)],
         [(0, 30 - 110 - noise_dbm), (2, 30 - 90 - noise_dbm + 3)],
         [],  # 20 - 200 dBm is below what anybody hears
     ]
-    assert ears_of(scenario, paths) == [[1], [0], [1]]
-    assert len({path.channel.seed for heard in paths for path in heard}) == 3
+    assert ears_of(scenario, around) == [[1], [0], [1]]
+    assert len({around.path(*pair).channel.seed for pair in ((0, 1), (1, 0), (1, 2))}) == 3
     assert scenario_from(dump(scenario)) == scenario
 
 
 def test_without_gains_the_snr_is_that_of_the_channel() -> None:
     scenario = load_scenario("two-robots-half-duplex", ["gains_db=null", "channel.snr_db=7"])
-    assert [path.channel.snr_db for heard in paths_at(scenario, 1e6)(0.0) for path in heard] == [7, 7]
+    assert levels(surroundings(scenario, 1e6)) == [[(1, 7)], [(0, 7)]]
 
 
 @pytest.mark.parametrize(

@@ -37,12 +37,8 @@ def test_each_is_ready_to_run(name: str) -> None:
     assert scenario.directions()[0].ros_source.src_id() == 1
     assert scenario.ros_source.packet_len == scenario.ros_sink.packet_len == scenario.packet_len
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
-    domains = {scenario.ros_source.domain_id, scenario.ros_sink.domain_id}
-    if name == "one-graph" or scenario.robots:
-        assert domains == {"auto"}, "that of the shell, or none at all"
-    else:
-        assert len(domains) == 2
-        assert min(domains) > 0
+    assert {scenario.ros_source.domain_id, scenario.ros_sink.domain_id} == {"auto"}, "free ones, or that of the shell"
+    assert scenario.own_domains == (name != "one-graph")
     assert "odom" in [topic.name for topic in scenario.load_registry()]
 
 

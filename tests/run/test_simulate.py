@@ -11,8 +11,9 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.gr.ends import message_codec
-from gr_ros2.link import Delivered, EndpointV0, ReceiverEvent, SenderEvent
+from gr_ros2.link import Delivered, EndpointV0, ReceivedPacket, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.medium import FixedPaths
 from gr_ros2.medium import Path as Way
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy.direct import DirectPhy
@@ -191,11 +192,11 @@ class Answering(EndpointV0):
 
     answers = True
 
-    def receive(self, data: bytes, now: float, snr_db: float | None = None) -> list[ReceiverEvent]:
-        events = super().receive(data, now, snr_db)
+    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+        events = super().receive(arrival, now)
         for event in events:
             if isinstance(event, Delivered):
-                self.submit(event.topic_id, len(event.payload).to_bytes(4, "big"), now)
+                self.messages.submit(event.topic_id, len(event.payload).to_bytes(4, "big"), now)
         return events
 
 
@@ -213,7 +214,7 @@ def test_a_robot_may_answer_what_it_hears() -> None:
         common: dict[str, Any] = {"src_id": source.src_id(), "airtime": lambda *_: 0.01}
         robots.append(Robot(there, number, endpoint, events=told, messages=messages, **common))
     paths = [[Way(1, ChannelConfig())], [Way(0, ChannelConfig())]]
-    medium = PacketMedium(lambda _: paths, [DirectPhy(220)] * 2)
+    medium = PacketMedium(FixedPaths(paths), [DirectPhy(220)] * 2)
     heard = [(now, event) for now, _, event in EventLoop(robots, medium).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]
     assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]
@@ -238,6 +239,6 @@ def test_a_simulation_that_stands_still_says_which_end_and_which_timer() -> None
     endpoint = Stuck(registry, settings.ros_source, None)
     messages = iter([Offered(0.5, 0, bytes(51))])
     stuck = Robot(settings, 0, endpoint, src_id=1, airtime=lambda *_: 0.0, events=[], messages=messages)
-    medium = PacketMedium(lambda _: [[]], [DirectPhy(220)])
+    medium = PacketMedium(FixedPaths([[]]), [DirectPhy(220)])
     with pytest.raises(RunError, match=r"stands still at 0.0.* s: departure of robot 1 is due at 0\.0"):
         list(EventLoop([stuck], medium).run())

@@ -31,6 +31,29 @@ def test_the_shares_of_the_topics_are_the_airtime_used(name: str) -> None:
     assert 0 <= forecast.pad < (0.13 if name == "six-topics-paced" else 1), "packets are filled"
 
 
+def test_commands_come_in_time_on_a_link_that_is_full() -> None:
+    settings = ["phy={name: modem, options: {bit_rate: 9600}}", "ros_source.topic_options={}"]
+    full = planner("six-topics-paced", *settings, duration=20.0).forecast()
+    late = planner("six-topics-paced", *settings, "ros_source.commands=[]", duration=20.0).forecast()
+    now, before = ({topic.topic: topic.result for topic in plan.topics}["/robot_1/cmd_vel"] for plan in (full, late))
+    assert full.load > 10
+    assert now.latency_s.p99 is not None
+    assert before.latency_s.p99 is not None
+    assert now.latency_s.p99 < 0.31
+    assert before.latency_s.p99 > 1.5
+    assert {"stale", "cannot_complete"} & now.ledger.keys(), "what is dropped is counted"
+
+
+@pytest.mark.parametrize(("limit", "share"), [("eu869.4", 0.09), ("{duty_cycle: 0.01, window_s: 600}", 0.009)])
+def test_a_plan_keeps_the_limit_of_airtime(limit: str, share: float) -> None:
+    free = planner("six-topics-paced", duration=20.0).forecast()
+    kept = planner("six-topics-paced", f"airtime={limit}", duration=20.0).forecast()
+    assert kept.allowed == pytest.approx(share)
+    assert kept.used < 1.2 * share
+    assert kept.capacity == pytest.approx(share * free.capacity)
+    assert kept.load > 5 * free.load
+
+
 def test_what_fits_is_said_to_fit() -> None:
     fits = planner("paper-ofdm-paced", "ros_source.repair='off'").forecast()
     assert fits.load == pytest.approx(fits.used, rel=0.08)
@@ -177,3 +200,42 @@ def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> No
 def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         planner("paper-ofdm-paced", *overrides)
+
+
+@pytest.mark.parametrize(
+    ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 2.0, 19)]
+)
+def test_robots_on_one_channel_are_forecast_together(name: str, duration: float, rows: int) -> None:
+    """Robot 1 of a run counts what it hears; a forecast counts what the first robot hears that hears a sender. Without
+    repair, which where packets overlap makes a small difference large."""
+    scenario = load_scenario(name, ["ros_source.repair='off'"], duration_s=duration)
+    forecast = Planner(scenario).forecast()
+    real = run_scenario(scenario).result
+    there = {topic.topic: topic for topic in real.topics}
+    assert len(there) == rows
+    topics = {topic.topic: topic for topic in forecast.topics}
+    assert list(topics) == [f"/robot_{number}/odom" for number in range(1, len(scenario.robots) + 1)]
+    for topic, result in there.items():
+        assert topics[topic].result.delivered == pytest.approx(result.delivered, rel=0.1, abs=1), topic
+    messages = sum(topic.sent for topic in there.values())
+    assert sum(forecast.air.values()) == pytest.approx(real.packets["sent"] / messages, rel=0.1)
+
+
+def test_slots_are_proposed_where_packets_overlap() -> None:
+    plan = planner("two-robots-half-duplex", duration=10.0)
+    (slots,) = (advice for advice in plan.advice() if advice.setting == "medium=slots")
+    assert slots.harmless
+    followed = planner("two-robots-half-duplex", slots.setting, duration=10.0).forecast()
+    assert followed.used == pytest.approx(slots.forecast.used)
+    assert (
+        min(topic.result.pdr or 0 for topic in followed.topics) > 0.9 > min(effect.pdr[0] for effect in slots.effects)
+    )
+
+
+def test_cuts_are_the_same_for_every_robot() -> None:
+    load = ["sim.odom_rate=50", "phy.sample_rate=100000"]
+    cuts = planner("team", *load).cuts()
+    assert [cut.topic for cut in cuts] == ["odom of every robot"]
+    followed = planner("team", *load, *cuts[-1].settings).forecast()
+    assert followed.load == pytest.approx(cuts[-1].load)
+    assert followed.load <= 1 < planner("team", *load).forecast().load

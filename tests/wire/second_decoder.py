@@ -193,7 +193,44 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
         if len(content) != 7:
             raise Refused("entry_bounds")
         return {"heard": content[0], "echo": number(1, 5), "since": number(5, 7)}
+    if kind == 0xFC:
+        if len(content) != 17:
+            raise Refused("entry_bounds")
+        if 200 < content[16] < 255:
+            raise Refused("entry_kind")
+        return {
+            "ping": content[0],
+            "number": number(1, 3),
+            "reply": content[3] % 2 == 1,
+            "wants_about": content[3] // 2 % 2 == 1,
+            "arrived": number(4, 6),
+            "held": number(6, 8),
+            "clock_us": number(8, 16),
+            "snr_db": None if content[16] == 255 else content[16] / 2 - 40,
+        }
+    if kind == 0xFD:
+        if len(content) < 10:
+            raise Refused("entry_bounds")
+        return {"about": number(0, 2), "phy": number(2, 6), "key": number(6, 10), "text": content[10:].hex()}
     return None
+
+
+def read_medium_access(data: bytes) -> dict[str, object]:
+    """The block at the begin of these bytes."""
+    if len(data) < 6 or (data[3] & 128 and len(data) < 12):
+        raise Refused("entry_bounds")
+    ahead = [code if code < 128 else 127 + 4 * (code - 127) for code in data[1:3]]
+    heard = data[3] & 127
+    heard = heard if heard <= 63 else 63 + 3 * (heard - 63)
+    expected, conflict = (int.from_bytes(data[6:10], "big"), list(data[10:12])) if data[3] & 128 else (None, [0, 255])
+    return {
+        "slot": data[0],
+        "ahead": ahead,
+        "heard": heard,
+        "names": list(data[4:6]),
+        "expected": expected,
+        "conflict": conflict,
+    }
 
 
 def read_packet(
@@ -205,7 +242,7 @@ def read_packet(
     """
     if not 8 <= len(data) <= packet_len:
         raise Refused("length")
-    if data[0] >> 4 != 1:
+    if data[0] >> 4 & 7 != 1:
         raise Refused("version")
     sealed, addressed, qos = bool(data[0] & 8), bool(data[0] & 4), data[0] & 3
     trailer, start = (8 if sealed else 4), (6 if addressed else 4)
@@ -217,6 +254,11 @@ def read_packet(
     if addressed:
         packet["dst_id"], packet["hop"] = data[4], data[5]
     end = len(data) - trailer
+    room = packet_len - start - 2 - trailer
+    if data[0] & 128:
+        packet["block"] = read_medium_access(data[start:end])
+        start += 12 if data[start + 3] & 128 else 6
+        room -= 12
     row, window, hello = 255, 0, False
     if qos == 3:
         if start + 2 > end:
@@ -255,7 +297,6 @@ def read_packet(
         session = boot.to_bytes(8, "big") + turns.to_bytes(4, "big")
         if crc32(session + data[:end]) != int.from_bytes(data[end:], "big"):
             raise Refused("crc")
-    room = packet_len - (6 if addressed else 4) - 2 - trailer
     if qos == 3 and window:
         packet["body"] = body
     else:

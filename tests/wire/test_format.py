@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import CrcError, EncodeError, LengthError, VersionError
 from gr_ros2.wire import FORMATS, Format, decode, format_of
-from gr_ros2.wire.v0 import V0, Entry, Packet, with_crc, without_crc
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0, with_crc, without_crc
 
 VERSIONS = pytest.mark.parametrize("wire", FORMATS.values(), ids=lambda wire: f"v{wire.version}")
-PACKET = V0.encode(Packet(1, 255, 7, 1, (Entry(0, 9, 0, 1, b"payload"),)), 64)
+PACKET = V0.encode(PacketV0(1, 255, 7, 1, (EntryV0(0, 9, 0, 1, b"payload"),)), 64)
 
 
 @VERSIONS
@@ -46,7 +46,7 @@ def test_the_smallest_packet_that_carries_a_message(wire: Format, size: int) -> 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=15), st.integers(0, 40))
 def test_a_layout_is_the_whole_packet(lens: list[int], more: int) -> None:
-    packet = Packet(1, 255, 0, 1, tuple(Entry(0, 0, 0, 1, bytes(n)) for n in lens))
+    packet = PacketV0(1, 255, 0, 1, tuple(EntryV0(0, 0, 0, 1, bytes(n)) for n in lens))
     packet_len = V0.packed_len(lens) + more
     spans = V0.layout(packet, packet_len)
     assert sum(span.size for span in spans) == packet_len
@@ -58,9 +58,9 @@ def test_a_layout_is_the_whole_packet(lens: list[int], more: int) -> None:
 def test_what_has_no_room_is_refused_by_the_encoder(lens: list[int]) -> None:
     packet_len = V0.packed_len(lens)
     assert V0.room(packet_len, len(lens), sum(lens)) < 0
-    entries = tuple(Entry(0, 0, 0, 1, bytes(n)) for n in (*lens, 0))
+    entries = tuple(EntryV0(0, 0, 0, 1, bytes(n)) for n in (*lens, 0))
     with pytest.raises(EncodeError):
-        V0.encode(Packet(1, 255, 0, 1, entries), packet_len)
+        V0.encode(PacketV0(1, 255, 0, 1, entries), packet_len)
 
 
 def test_packets_are_read_by_their_version() -> None:

@@ -19,7 +19,8 @@ from gr_ros2.link.v1.gf256 import coefficient
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
 from gr_ros2.wire import v1
-from gr_ros2.wire.table import Row, read_table
+from gr_ros2.wire.mac_block import read_block
+from gr_ros2.wire.table import AnnouncedTopic, read_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
 
@@ -34,12 +35,17 @@ def named(kind: str) -> Any:
 def test_packets(case: dict[str, Any]) -> None:
     data = bytes.fromhex(case["hex"])
     packet = v1.decode(data, case["packet_len"], case["boot"], case["number"] >> 16)
-    assert packet.header._asdict() == case["header"]
+    header = packet.header._asdict()
+    block = header.pop("block")
+    assert header == case["header"]
     assert v1.encode(packet, case["packet_len"], case["boot"], case["number"] >> 16, fixed=len(data) == 64) == data
     read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
     assert read["entries"] == case["entries"]
     assert read["number"] == case["number"]
     assert read.get("row") == case.get("row")
+    assert read.get("block") == case.get("block")
+    said = json.loads(json.dumps(read_block(block)[0]._asdict())) if block else None
+    assert said == case.get("block")
 
 
 @named("bodies")
@@ -72,7 +78,7 @@ def test_kept_messages() -> None:
         1,
         40,
         Settings(2, packet_len=64),
-        rows=(Row(0, "map", "std_msgs/msg/String", latched=True),),
+        topics=(AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),),
         decoder_for=None,
         marks={},
         stats=ReceiverStats(),
@@ -122,15 +128,15 @@ def test_repairs(case: dict[str, Any]) -> None:
     for text in case["repairs"]:
         data = bytes.fromhex(text)
         packet = v1.decode(data, case["packet_len"], case["boot"], case["newest"] >> 16)
-        assert packet.standing is not None
-        standing = packet.standing
-        found.update(decoder.repair(case["newest"], standing.mask, standing.row, packet.combined))
+        assert packet.repair is not None
+        repair = packet.repair
+        found.update(decoder.repair(case["newest"], repair.mask, repair.row, packet.combined))
         read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
         assert read["members"] == case["members"]
         members, body = read["members"], read["body"]
         assert isinstance(members, list)
         assert isinstance(body, bytes)
-        equations.append((standing.row, members, body))
+        equations.append((repair.row, members, body))
     assert found == missing
     if len(missing) < 20:  # the second decoder takes its time
         assert second.solve(here, equations, room) == missing
@@ -150,9 +156,9 @@ def test_sealed_packets(case: dict[str, Any]) -> None:
     mode: SealMode = "encrypt" if case["encrypts"] else "authenticate"
     header = v1.read_header(data, 64)
     start, row, plain = header.size, SOURCE_ROW, False
-    if header.qos == v1.QOS_STANDING:
-        standing = v1.read_standing(data, start, len(data) - 8)
-        start, row, plain = start + standing.size, standing.row, standing.clear
+    if header.qos == v1.QOS_REPAIR:
+        repair = v1.read_repair_header(data, start, len(data) - 8)
+        start, row, plain = start + repair.size, repair.row, repair.clear
     trailer = Keys((key,), mode).own(1, case["boot"])
     body = trailer.open(data[:start], data[start:], case["number"], row, plain=plain)
     assert trailer.close(data[:start], body, case["number"], row, plain=plain) == data
@@ -170,7 +176,7 @@ def test_the_vectors_are_what_their_tool_writes() -> None:
 
 def test_tables() -> None:
     for case in VECTORS["tables"]:
-        assert read_table(bytes.fromhex(case["hex"])) == tuple(Row(**row) for row in case["rows"])
+        assert read_table(bytes.fromhex(case["hex"])) == tuple(AnnouncedTopic(**row) for row in case["rows"])
 
 
 @pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
@@ -185,7 +191,7 @@ def test_the_second_decoder_understands_a_whole_link(mode: SealMode) -> None:
     for index in range(160):
         now += 1 / 75
         if index % 8 == 0 and index < 120:
-            one.end.submit(index % 3, rng.randbytes(rng.choice((20, 130))), now)
+            one.end.messages.submit(index % 3, rng.randbytes(rng.choice((20, 130))), now)
         data = one.slot(now)
         if data is None or (rng.random() < 0.4 and index > 20):
             continue

@@ -24,7 +24,7 @@ from gr_ros2.wire import (
     VersionError,
     WireError,
 )
-from gr_ros2.wire.v0 import V0, Entry, Packet, crc16, overhead, with_crc
+from gr_ros2.wire.v0 import V0, EntryV0, PacketV0, crc16, overhead, with_crc
 
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "v0.json").read_text())
 ERRORS = {
@@ -39,21 +39,21 @@ ERRORS = {
 }
 
 
-def packet_of(values: dict[str, Any]) -> Packet:
-    entries = tuple(Entry(**{**entry, "payload": bytes.fromhex(entry["payload"])}) for entry in values["entries"])
-    return Packet(**{**values, "entries": entries})
+def packet_of(values: dict[str, Any]) -> PacketV0:
+    entries = tuple(EntryV0(**{**entry, "payload": bytes.fromhex(entry["payload"])}) for entry in values["entries"])
+    return PacketV0(**{**values, "entries": entries})
 
 
 @st.composite
-def packets(draw: st.DrawFn) -> tuple[Packet, int]:
+def packets(draw: st.DrawFn) -> tuple[PacketV0, int]:
     """A packet and a packet_len that holds it."""
     byte = st.integers(0, 255)
     entries = []
     for _ in range(draw(st.integers(1, 15))):
         total = draw(st.integers(1, 255))
         index = draw(st.integers(0, total - 1))
-        entries.append(Entry(draw(st.integers(0, 15)), draw(byte), index, total, draw(st.binary(max_size=60))))
-    packet = Packet(
+        entries.append(EntryV0(draw(st.integers(0, 15)), draw(byte), index, total, draw(st.binary(max_size=60))))
+    packet = PacketV0(
         draw(st.integers(0, 254)),
         draw(byte),
         draw(byte),
@@ -88,7 +88,7 @@ def test_vectors_are_those_shared_with_other_implementations() -> None:
 
 
 @given(packets())
-def test_round_trip(case: tuple[Packet, int]) -> None:
+def test_round_trip(case: tuple[PacketV0, int]) -> None:
     packet, packet_len = case
     data = V0.encode(packet, packet_len)
     assert len(data) == packet_len
@@ -144,7 +144,7 @@ def test_arbitrary_bodies_with_a_right_crc_decode_or_are_refused_by_name(body: b
 
 
 def test_reserved_qos_reads_as_default_and_spare_nibble_is_ignored() -> None:
-    data = bytearray(V0.encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),), qos=2), 20)[:-2])
+    data = bytearray(V0.encode(PacketV0(1, 255, 0, 1, (EntryV0(3, 0, 0, 1, b"x"),), qos=2), 20)[:-2])
     data[0] |= 3 << 2
     data[5] |= 0xF
     packet = V0.decode(with_crc(bytes(data)), 20)
@@ -153,7 +153,7 @@ def test_reserved_qos_reads_as_default_and_spare_nibble_is_ignored() -> None:
 
 
 def test_source_255_is_read_but_not_written() -> None:
-    data = bytearray(V0.encode(Packet(1, 255, 0, 1, (Entry(3, 0, 0, 1, b"x"),)), 20)[:-2])
+    data = bytearray(V0.encode(PacketV0(1, 255, 0, 1, (EntryV0(3, 0, 0, 1, b"x"),)), 20)[:-2])
     data[1] = 255
     packet = V0.decode(with_crc(bytes(data)), 20)
     assert packet.src_id == 255
@@ -165,13 +165,13 @@ def test_source_255_is_read_but_not_written() -> None:
     ("changes", "packet_len"),
     [
         ({"entries": ()}, 64),
-        ({"entries": (Entry(0, 0, 0, 1, b""),) * 16}, 200),
-        ({"entries": (Entry(0, 0, 0, 1, bytes(52)),)}, 64),
-        ({"entries": (Entry(16, 0, 0, 1, b""),)}, 64),
-        ({"entries": (Entry(0, 256, 0, 1, b""),)}, 64),
-        ({"entries": (Entry(0, 0, 1, 1, b""),)}, 64),
-        ({"entries": (Entry(0, 0, 0, 256, b""),)}, 64),
-        ({"entries": (Entry(0, 0, 0, 0, b""),)}, 64),
+        ({"entries": (EntryV0(0, 0, 0, 1, b""),) * 16}, 200),
+        ({"entries": (EntryV0(0, 0, 0, 1, bytes(52)),)}, 64),
+        ({"entries": (EntryV0(16, 0, 0, 1, b""),)}, 64),
+        ({"entries": (EntryV0(0, 256, 0, 1, b""),)}, 64),
+        ({"entries": (EntryV0(0, 0, 1, 1, b""),)}, 64),
+        ({"entries": (EntryV0(0, 0, 0, 256, b""),)}, 64),
+        ({"entries": (EntryV0(0, 0, 0, 0, b""),)}, 64),
         ({"version": 1}, 64),
         ({"qos": 4}, 64),
         ({"hop": 16}, 64),
@@ -186,11 +186,11 @@ def test_what_the_wire_cannot_say_is_refused(changes: dict[str, Any], packet_len
         "dst_id": 255,
         "seq": 0,
         "hop": 1,
-        "entries": (Entry(0, 0, 0, 1, b""),),
+        "entries": (EntryV0(0, 0, 0, 1, b""),),
         **changes,
     }
     with pytest.raises(EncodeError):
-        V0.encode(Packet(**values), packet_len)
+        V0.encode(PacketV0(**values), packet_len)
 
 
 def test_sizes_are_those_of_the_paper() -> None:

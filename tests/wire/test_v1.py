@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import Ask, Heard, Hello, Report
-from gr_ros2.wire.table import Row, read_table, write_table
-from gr_ros2.wire.v1 import Header, Packet, Part, Standing, decode, encode
+from gr_ros2.wire.control import About, Ask, Heard, Hello, Ping, Report
+from gr_ros2.wire.mac_block import MOST_LEN
+from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
+from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader, decode, encode
 
 U8, U16, U32, U64 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32, 64))
 BOOT = 0x01020304
@@ -19,7 +20,9 @@ BOOT = 0x01020304
 def headers(qos: st.SearchStrategy[int], sealed: st.SearchStrategy[bool]) -> st.SearchStrategy[Header]:
     source = st.integers(0, 254)
     address = st.just((v1.BROADCAST, 0)) | st.tuples(st.integers(0, 254), U8)
-    return st.tuples(qos, sealed, source, U16, address).map(lambda values: Header(*values[:4], *values[4]))
+    block = st.sampled_from((b"", bytes(6), bytes.fromhex("0507078203048000000112fe")))
+    made = st.tuples(qos, sealed, source, U16, address, block)
+    return made.map(lambda values: Header(*values[:4], *values[4], values[5]))
 
 
 @st.composite
@@ -37,49 +40,53 @@ controls = (
     st.builds(Hello, U32, U32, U8, U32, marks)
     | st.builds(Ask, U8, st.binary(min_size=1, max_size=9))
     | st.builds(Heard, U8, st.binary(min_size=4, max_size=4), st.integers(0, 0xFFFF))
+    | st.builds(Ping, U8, U16, st.booleans(), st.booleans(), U16, U16, U64, SNRS)
+    | st.builds(About, U16, U32, U32, st.binary(max_size=20))
     | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127), SNRS)
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)
 
 
 @st.composite
-def standings(draw: st.DrawFn, control: bool) -> Standing:
+def repair_headers(draw: st.DrawFn, control: bool) -> RepairHeader:
     row = draw(st.integers(0, 127))
     if control:
-        return Standing(row, clear=draw(st.booleans()))
+        return RepairHeader(row, clear=draw(st.booleans()))
     mask = draw(st.integers(0, (1 << 127) - 1)) | 1
-    size = len(v1.write_standing(Standing(row, mask)))
-    return Standing(row, mask, draw(st.booleans()), size=size)
+    size = len(v1.write_repair_header(RepairHeader(row, mask)))
+    return RepairHeader(row, mask, draw(st.booleans()), size=size)
 
 
 @st.composite
-def packets(draw: st.DrawFn) -> tuple[Packet, int, bool]:
+def packets(draw: st.DrawFn) -> tuple[PacketV1, int, bool]:
     kind = draw(st.sampled_from(("source", "control", "repair")))
-    qos = st.integers(0, 2) if kind == "source" else st.just(v1.QOS_STANDING)
+    qos = st.integers(0, 2) if kind == "source" else st.just(v1.QOS_REPAIR)
     header = draw(headers(qos, st.just(False)))
     fixed = draw(st.booleans())
     if kind == "repair":
-        standing = draw(standings(control=False))
+        repair = draw(repair_headers(control=False))
         combined = draw(st.binary(max_size=60))
-        least = header.size + standing.size + len(combined) + v1.CRC_LEN
+        least = header.size + repair.size + len(combined) + v1.CRC_LEN
         packet_len = least + draw(st.integers(0, 20))
         combined = combined.ljust(packet_len - least + len(combined), b"\0") if fixed else combined
-        return Packet(header, (), standing, combined), packet_len, fixed
-    standing = draw(standings(control=True)) if kind == "control" else None
+        return PacketV1(header, (), repair, combined), packet_len, fixed
+    repair = draw(repair_headers(control=True)) if kind == "control" else None
     inside = draw(entries)
     used = len(v1.write_body(inside, 1 << 20))
     # Without the length byte of its last entry, it just fits.
     room = used - draw(st.integers(0, 1)) if _last_says_its_length(inside) else used
-    packet_len = max(room + draw(st.just(0) | st.integers(0, 20)), 2) + header.size + v1.STANDING_LEN + v1.CRC_LEN
-    return Packet(header, inside, standing), packet_len, fixed
+    room = max(room + draw(st.just(0) | st.integers(0, 20)), 2)
+    packet_len = room + header.size + v1.REPAIR_HEADER_LEN + v1.CRC_LEN
+    packet_len += MOST_LEN - len(header.block) if header.block else 0
+    return PacketV1(header, inside, repair), packet_len, fixed
 
 
-def _last_says_its_length(inside: tuple[v1.Entry, ...]) -> bool:
+def _last_says_its_length(inside: tuple[v1.EntryV1, ...]) -> bool:
     return bool(inside) and isinstance(inside[-1], Part) and not 0 < len(inside[-1].payload) <= 15
 
 
 @given(packets(), U32, U32)
-def test_what_is_written_reads_back(case: tuple[Packet, int, bool], boot: int, turns: int) -> None:
+def test_what_is_written_reads_back(case: tuple[PacketV1, int, bool], boot: int, turns: int) -> None:
     packet, packet_len, fixed = case
     data = encode(packet, packet_len, boot, turns, fixed=fixed)
     assert len(data) <= packet_len
@@ -89,7 +96,7 @@ def test_what_is_written_reads_back(case: tuple[Packet, int, bool], boot: int, t
 
 @given(packets(), st.data())
 def test_another_start_of_the_sender_and_every_flipped_bit_are_refused(
-    case: tuple[Packet, int, bool], draw: st.DataObject
+    case: tuple[PacketV1, int, bool], draw: st.DataObject
 ) -> None:
     packet, packet_len, fixed = case
     data = encode(packet, packet_len, BOOT, 7, fixed=fixed)
@@ -120,13 +127,13 @@ def test_headers_read_back(header: Header, trailer: bytes) -> None:
 @given(st.binary(max_size=24), st.integers(0, 24))
 def test_any_window_and_row_read_or_are_refused_by_name(data: bytes, start: int) -> None:
     try:
-        standing = v1.read_standing(data, start, len(data))
+        repair = v1.read_repair_header(data, start, len(data))
     except WireError as error:
         assert error.kind in {"entry_bounds", "window"}
         return
-    again = v1.write_standing(standing)
-    assert v1.read_standing(again, 0, len(again))[:4] == standing[:4]
-    assert standing.size <= len(data) - start
+    again = v1.write_repair_header(repair)
+    assert v1.read_repair_header(again, 0, len(again))[:4] == repair[:4]
+    assert repair.size <= len(data) - start
 
 
 @given(
@@ -161,7 +168,7 @@ def test_the_overhead_of_a_whole_message_is_that_of_version_0(sealed: bool, over
 
 @pytest.mark.parametrize(("size", "packet_len"), [(0, 11), (1, 11), (13, 23), (15, 25), (16, 27)])
 def test_short_messages_have_no_length_byte(size: int, packet_len: int) -> None:
-    packet = Packet(Header(0, False, 1, 1), (Part(0, bytes(size)),))
+    packet = PacketV1(Header(0, False, 1, 1), (Part(0, bytes(size)),))
     data = encode(packet, 64, BOOT, fixed=False)
     assert len(data) == packet_len
     assert decode(data, 64, BOOT) == packet
@@ -216,14 +223,14 @@ def test_bodies_are_refused_by_name(body: str, kind: str) -> None:
 
 def test_an_addressed_packet_is_two_bytes_longer() -> None:
     message = bytes(49)
-    packet = Packet(Header(0, False, 1, 5, dst_id=7, hop=2), (Part(0, message),))
+    packet = PacketV1(Header(0, False, 1, 5, dst_id=7, hop=2), (Part(0, message),))
     assert decode(encode(packet, 64, BOOT), 64, BOOT) == packet
     with pytest.raises(WireError):
         encode(packet._replace(body=(Part(0, bytes(51)),)), 64, BOOT)
 
 
 rows = st.builds(
-    Row,
+    AnnouncedTopic,
     st.integers(0, 239),
     st.text(max_size=30),
     st.text(max_size=30),
@@ -236,7 +243,7 @@ rows = st.builds(
 
 
 @given(st.lists(rows, max_size=20, unique_by=lambda row: row.topic_id))
-def test_a_table_reads_back(table: list[Row]) -> None:
+def test_a_table_reads_back(table: list[AnnouncedTopic]) -> None:
     assert read_table(write_table(table)) == tuple(table)
 
 

@@ -59,6 +59,10 @@ class RepairDecoder:
         """Whether a source packet is known."""
         return number in self._bodies
 
+    def body(self, number: int) -> bytes:
+        """The body of a source packet that is known."""
+        return self._bodies[number]
+
     @property
     def equations(self) -> int:
         """Number of equations held that do not determine a packet yet."""
@@ -142,7 +146,7 @@ class RepairDecoder:
         factor = TIMES[INVERSE[left & 255]]
         body = right.to_bytes(room, "little").translate(factor)
         if left < 256:
-            return self._believe(pivot, body)
+            return self._accept(pivot, body)
         if len(rows) >= self._most:
             self.counts["too_many"] += 1
             return []
@@ -173,7 +177,7 @@ class RepairDecoder:
                     rows[pivot] = (rest.to_bytes(size, "little"), side.to_bytes(room, "little"))
                 else:
                     del rows[pivot]
-                    more += self._believe(pivot, side.to_bytes(room, "little"))
+                    more += self._accept(pivot, side.to_bytes(room, "little"))
                     if not rows:
                         break
             own = rows.pop(number, None)  # last, so that no equation that still names the packet goes into it
@@ -196,7 +200,7 @@ class RepairDecoder:
             pivots = [pivot for pivot in range(number - MAX_WINDOW + 1, number) if pivot in rows]
         return [pivot for pivot in pivots if number - pivot < len(rows[pivot][0]) and rows[pivot][0][number - pivot]]
 
-    def _believe(self, number: int, body: bytes) -> Found:
+    def _accept(self, number: int, body: bytes) -> Found:
         """Return a body that follows from equations, if it is plausible."""
         if not self._plausible(body):
             return self._disbelieve()

@@ -5,16 +5,17 @@ Invariant: this module holds values only; every default suits a radio of some kB
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.v1.repair import RepairMode
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.commands import COMMAND_TYPES
+from gr_ros2.settings.config import NOBODY, SinkConfig, SourceConfig, robot_of
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, STANDING_LEN, TAG_LEN
+from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, REPAIR_HEADER_LEN, TAG_LEN
 
-NOBODY = -1
-MIN_PACKET_LEN = HEADER_LEN + STANDING_LEN + TAG_LEN + 26
+MIN_PACKET_LEN = HEADER_LEN + REPAIR_HEADER_LEN + TAG_LEN + 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +33,17 @@ class Settings:
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
         topics with a deadline or lifespan, no bound for others; 0 = no bound
+    :param max_ages: the same by topic, without leading slash
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
     :param packet_rate: packets/s at most; auto = as many as credits allow, where credits are given; 0 = no limit
     :param queue_depth: messages that may wait per topic; 0 = no limit
+    :param commands: types and names of topics whose messages come in time or not at all
+    :param deadlines: s by topic, without leading slash, after which a received command is not delivered any more
+    :param airtime_share: part of the time that this robot may send, above 0..1; what it says about itself comes more
+        rarely by this factor, and so may what it hears
+    :param beacon_s: s without hearing any robot after which one hello leaves every so many s, and nothing else; 0 = off
     """
 
     src_id: int
@@ -49,36 +56,43 @@ class Settings:
     half_duplex: bool = False
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO
+    max_ages: Mapping[str, float] = field(default_factory=dict)
     repeat_s: float = 10.0
     max_source_bytes: int = 72_000_000
     max_sources: int = 16
     packet_rate: float | Auto = AUTO
     queue_depth: int = 100
+    commands: tuple[str, ...] = COMMAND_TYPES
+    deadlines: Mapping[str, float] = field(default_factory=dict)
+    airtime_share: float = 1.0
+    beacon_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:
             raise ConfigError(f"packet_len = {self.packet_len}: version 1 needs {MIN_PACKET_LEN}..4095")
         if not 0 <= self.src_id < BROADCAST and (self.hears or self.src_id != NOBODY):
             raise ConfigError(f"robot_id = {self.src_id}: must be 0..254")
-
-
-def robot_of(source: SourceConfig | None, sink: SinkConfig | None) -> int:
-    """Id of the robot that an end belongs to; ``NOBODY`` for an end that only receives and has none.
-
-    :raises ConfigError: when the source names no robot
-    """
-    if source is not None:
-        return source.src_id()
-    return NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id
+        if self.beacon_s and not self.hears:
+            raise ConfigError(
+                f"beacon_s = {self.beacon_s:g}: this end never hears anybody, so it would fall silent for ever; set 0, "
+                "or run a link both ways"
+            )
 
 
 def settings_of(
-    source: SourceConfig | None, sink: SinkConfig | None, *, hears: bool, half_duplex: bool = False, fixed: bool = True
+    source: SourceConfig | None,
+    sink: SinkConfig | None,
+    *,
+    hears: bool,
+    half_duplex: bool = False,
+    fixed: bool = True,
+    airtime_share: float = 1.0,
 ) -> Settings:
     """The settings of an end, made from those of its blocks.
 
     :param hears: whether it receives and can report
     :param fixed: whether every packet must be as long as the longest
+    :param airtime_share: see :class:`Settings`
     :raises ConfigError: neither block names the robot, although it would send something
     """
     send = SourceConfig() if source is None else source
@@ -94,9 +108,22 @@ def settings_of(
         half_duplex=half_duplex,
         hold_s=take.hold_s,
         max_age_s=take.max_age_s,
+        max_ages={
+            name.lstrip("/"): options.max_age_s
+            for name, options in take.topic_options.items()
+            if options.max_age_s != AUTO
+        },
         repeat_s=send.repeat_s,
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,
         packet_rate=send.packet_rate,
         queue_depth=send.queue_depth,
+        commands=take.commands if source is None else send.commands,
+        deadlines={
+            name.lstrip("/"): options.deadline_s
+            for name, options in take.topic_options.items()
+            if options.deadline_s != AUTO
+        },
+        airtime_share=airtime_share,
+        beacon_s=send.beacon_s,
     )

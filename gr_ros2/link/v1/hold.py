@@ -2,7 +2,8 @@
 
 A packet that is on the air cannot be interrupted. A repair that is not over when the next message of a periodic topic
 comes delays that message. So the endpoint learns the period of each topic, and a repair that nobody has asked for waits
-if it would delay the message that is due next.
+if it would delay the message that is due next. Without this, odometry of ``paper-ofdm-paced`` is 28 % older (± 4 %) at
+20 % loss one way.
 
 *Bounds.* A repair is not held back if:
 

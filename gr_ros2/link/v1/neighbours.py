@@ -14,8 +14,8 @@ accepted, before a packet above it is used. So after a restart of this robot, ev
 refused, but not what it never heard.
 
 The newest boot number of every robot is stored. An older start of a robot is accepted only with a proof; where packets
-are not sealed, after a silence. A robot whose boot number is stored was heard before this robot restarted, so its
-packets count from the first hello on, and no message comes out twice.
+are not sealed, any other start is accepted a second after the last one. A robot whose boot number is stored was heard
+before this robot restarted, so its packets count from the first hello on, and no message comes out twice.
 
 Invariants: no body is given out that was not opened; no control packet is given out twice; work per packet is bounded;
 where packets are sealed, nothing is given out that was sealed before this start and could be a replay.
@@ -46,15 +46,13 @@ from gr_ros2.link.v1.repair import START
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
-    HEADER_LEN,
-    QOS_STANDING,
+    QOS_REPAIR,
     TAG_LEN,
-    Entry,
+    EntryV1,
     Header,
-    Standing,
-    body_room,
+    RepairHeader,
     read_body,
-    read_standing,
+    read_repair_header,
 )
 
 Save = Callable[[int, int, int], None]
@@ -66,8 +64,11 @@ Save = Callable[[int, int, int], None]
 _HALF = 1 << 15
 _EARLY = 64
 """Number of packets kept per robot that cannot be opened yet."""
-_RETREAT_S = 1.0
-"""s of silence after which a robot that does not seal may return with a smaller boot number."""
+_CHANGE_S = 1.0
+"""s after which another start of a robot that does not seal is taken: forged hellos silence it for half of the time at
+most, and a robot that restarts is met soon."""
+_STARTS = 256
+"""Starts that have ended of which is known how far they were heard."""
 _ROWS_KEPT = 512
 """Packet numbers, counted back from the newest, for which it is known which rows were used."""
 _ECHOES = 64
@@ -90,6 +91,8 @@ class Neighbour:
     trailer: Trailer
     inbox: Inbox
     hello: Hello
+    hello_number: int
+    """The packet number at which its newest hello stands."""
     heard: float
     floor: int = 0
     """Stored packet number below which nothing is accepted after a restart of this robot."""
@@ -100,7 +103,7 @@ class Neighbour:
     failed: bool = False
     """Whether storing failed the last time."""
     rows: dict[int, int] = field(default_factory=dict)
-    """Rows of standing packets that carried entries, as bits, by packet number."""
+    """Rows of repair packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When each topic was requested."""
     proofs: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_ECHOES))
@@ -126,7 +129,7 @@ class Neighbour:
         return number
 
     def new(self, number: int, row: int) -> bool:
-        """Whether a packet was not here before, as far as this is known; notes the row of a standing packet."""
+        """Whether a packet was not here before, as far as this is known; notes the row of a repair packet."""
         if row == SOURCE_ROW:
             return self.inbox.lacks_packet(number)
         oldest = self.inbox.newest - _ROWS_KEPT
@@ -160,9 +163,9 @@ class Opened:
     neighbour: Neighbour
     header: Header
     number: int
-    standing: Standing | None
+    repair: RepairHeader | None
     body: bytes
-    entries: list[Entry] | None = None
+    entries: list[EntryV1] | None = None
     met: bool = False
     replaced: Neighbour | None = None
     new: bool = True
@@ -202,6 +205,8 @@ class Neighbours:
         self._early: dict[int, deque[bytes]] = {}
         self._met_at: dict[int, float] = {}
         """When the present start of each robot was heard for the first time."""
+        self._ended: dict[tuple[int, int], int] = {}
+        """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
         self._hellos: dict[bytes, float] = {}
         """When the newest hellos of this robot left, by their ends."""
 
@@ -235,25 +240,25 @@ class Neighbours:
         :raises WireError: the packet cannot be opened, or must not be
         """
         start, end = header.size, len(data) - self._keys.trailer_len
-        standing = None
-        if header.qos == QOS_STANDING:
-            standing = read_standing(data, start, end)
-            if standing.clear:
-                return self._hello(data, header, standing, now)
-            start += standing.size
+        repair = None
+        if header.qos == QOS_REPAIR:
+            repair = read_repair_header(data, start, end)
+            if repair.clear:
+                return self._hello(data, header, repair, now)
+            start += repair.size
         neighbour = self._known.get(header.src_id)
         if neighbour is None:
             self._keep(header.src_id, data)
             self.dropped["early"] += 1
             return None
         number = neighbour.number(header.number)
-        row = SOURCE_ROW if standing is None else standing.row
+        row = SOURCE_ROW if repair is None else repair.row
         try:
             body = neighbour.trailer.open(data[:start], data[start:], number, row)
         except (CrcError, TagError):
             self._keep(header.src_id, data)
             raise
-        control = standing is not None and not standing.mask
+        control = repair is not None and not repair.mask
         if not control and self.proves(neighbour.hello):
             if neighbour.proven is None:
                 self._keep(header.src_id, data)
@@ -266,7 +271,7 @@ class Neighbours:
         if control and not new:
             raise ReplayedError(f"row {row} at packet {number} of robot {header.src_id} was here before")
         met = new and self._heard(neighbour, number, now)
-        return Opened(neighbour, header, number, standing, body, met=met, new=new)
+        return Opened(neighbour, header, number, repair, body, met=met, new=new)
 
     def proves(self, hello: Hello) -> bool:
         """Whether a robot can prove when it sealed a packet: it hears this one, and packets are sealed."""
@@ -277,7 +282,7 @@ class Neighbours:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
         return any(n.proven is None and not n.gone and self.proves(n.hello) for n in self._known.values())
 
-    def proved(self, neighbour: Neighbour, number: int, entries: Sequence[Entry]) -> bool:
+    def proved(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> bool:
         """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
         before = neighbour.proven
         for since, at in self._proofs(number, entries, neighbour.not_before):
@@ -308,14 +313,14 @@ class Neighbours:
 
         :raises SameIdError: it is a hello of another start
         """
-        if header.qos != QOS_STANDING or header.sealed != self._keys.sealed:
+        if header.qos != QOS_REPAIR or header.sealed != self._keys.sealed:
             return
-        standing = read_standing(data, header.size, len(data) - self._keys.trailer_len)
-        if not standing.clear:
+        repair = read_repair_header(data, header.size, len(data) - self._keys.trailer_len)
+        if not repair.clear:
             return
-        hello, _, clear, rest = self._read_hello(data, header, standing)
+        hello, _, clear, rest = self._read_hello(data, header, repair)
         if hello.boot != self._own[1]:
-            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, standing.row))
+            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, repair.row))
             raise SameIdError(
                 f"robot {header.src_id} is this robot, but start {hello.boot:016x} has that id too: two robots have it "
                 "(give one another robot_id), or a recording of an earlier start is on the air"
@@ -332,38 +337,42 @@ class Neighbours:
                 neighbour.reserve = _RESERVE
                 self._store(neighbour, exact, now)
 
-    def _read_hello(self, data: bytes, header: Header, standing: Standing) -> tuple[Hello, list[Entry], bytes, bytes]:
+    def _read_hello(
+        self, data: bytes, header: Header, repair: RepairHeader
+    ) -> tuple[Hello, list[EntryV1], bytes, bytes]:
         """A hello, all entries of its packet, and the packet before and after its body begins."""
-        start = header.size + standing.size
-        room = body_room(self._settings.packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
+        start = header.size + repair.size
+        room = header.room(self._settings.packet_len)
         entries = read_body(data[start : len(data) - self._keys.trailer_len], room)
         if not entries or not isinstance(entries[0], Hello):
             raise EntryKindError("a packet in the clear that does not begin with a hello")
         return entries[0], entries, data[:start], data[start:]
 
-    def _hello(self, data: bytes, header: Header, standing: Standing, now: float) -> Opened:
+    def _hello(self, data: bytes, header: Header, repair: RepairHeader, now: float) -> Opened:
         """Open a packet with a hello, which itself says how the packet is opened."""
         src_id, sealed = header.src_id, self._keys.sealed
-        hello, entries, clear, rest = self._read_hello(data, header, standing)
+        hello, entries, clear, rest = self._read_hello(data, header, repair)
         number = hello.turns << 16 | header.number
         neighbour = self._known.get(src_id)
         if neighbour is not None and neighbour.boot == hello.boot:
-            neighbour.trailer.open(clear, rest, number, standing.row, plain=True)
+            neighbour.trailer.open(clear, rest, number, repair.row, plain=True)
             jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
             if not (jumps and neighbour.gone):
-                if jumps or not neighbour.new(number, standing.row):
+                if jumps or not neighbour.new(number, repair.row):
                     raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
-                neighbour.hello = hello
-                return Opened(neighbour, header, number, standing, b"", entries, self._heard(neighbour, number, now))
+                if number >= neighbour.hello_number:
+                    neighbour.hello, neighbour.hello_number = hello, number
+                return Opened(neighbour, header, number, repair, b"", entries, self._heard(neighbour, number, now))
         boot, floor = self._stored.get(src_id, (-1, 0))
         before = self._met_at.get(src_id, -inf)
         proofs = self._proofs(number, entries, before) if sealed else ()
-        newest = boot
+        refused = hello.boot < boot and not proofs
         if not sealed:
-            newest = -1 if neighbour is None or now - neighbour.heard >= _RETREAT_S else neighbour.boot
-        if hello.boot < newest and not proofs:
+            refused = neighbour is not None and now < before + _CHANGE_S
+        if refused:
+            newest = boot if neighbour is None else neighbour.boot
             raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
-        trailer = self._trailer(src_id, hello, clear, rest, (number, standing.row))
+        trailer = self._trailer(src_id, hello, clear, rest, (number, repair.row))
         again, stores = boot == hello.boot, self._counts_on_store(hello)
         if again and stores and number < floor:
             raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
@@ -372,17 +381,24 @@ class Neighbours:
         first = 1 if number <= START else number + 1
         if again:
             first = max(first, floor if stores else number + 1)
-        room = body_room(self._settings.packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
-        met = Neighbour(src_id, hello.boot, trailer, self._make_inbox(src_id, hello.boot, first, room), hello, now)
+        if neighbour is not None:
+            self._ended[neighbour.src_id, neighbour.boot] = neighbour.inbox.newest + 1
+            if len(self._ended) > _STARTS:
+                del self._ended[next(iter(self._ended))]
+        first = max(first, self._ended.pop((src_id, hello.boot), 0))
+        room = header.room(self._settings.packet_len)
+        met = Neighbour(
+            src_id, hello.boot, trailer, self._make_inbox(src_id, hello.boot, first, room), hello, number, now
+        )
         if self.proves(hello):
             met.inbox.sealed_after = met.sealed_after
         met.not_before, self._met_at[src_id] = before, now
-        met.new(number, standing.row)
+        met.new(number, repair.row)
         self._known[src_id] = met
         self._store(met, max(first, number + 1) if stores else 0, now)
-        return Opened(met, header, number, standing, b"", entries, True, neighbour)
+        return Opened(met, header, number, repair, b"", entries, True, neighbour)
 
-    def _proofs(self, number: int, entries: Sequence[Entry], before: float) -> list[tuple[int, float]]:
+    def _proofs(self, number: int, entries: Sequence[EntryV1], before: float) -> list[tuple[int, float]]:
         """What entries prove: packets of their sender above a number were sealed after a time in s.
 
         :param number: at which the entries stand

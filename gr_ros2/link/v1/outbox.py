@@ -21,30 +21,32 @@ ends in being sent or in a Refused with its row.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 from math import inf
+from typing import Any, Protocol
 from zlib import crc32
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.events import Accepted, Missed, Refused, SentEntry
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.queues import Dropped, TopicQueue, queue_for
+from gr_ros2.link.queues import Dropped, TopicQueue, qos_class, queue_for
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
-from gr_ros2.link.v1.repair import GROUP, Life
+from gr_ros2.link.v1.repair import GROUP, Lifetime
+from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import QueuePolicy
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
-from gr_ros2.wire import QOS_BULK, QOS_LATENCY, QOS_NAMES
-from gr_ros2.wire.table import Row as TableRow
-from gr_ros2.wire.table import write_table
-from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, Entry, Part, fit
+from gr_ros2.settings.registry import CALLS_TYPE, NewTopic, Registry, Topic
+from gr_ros2.wire import QOS_BULK, QOS_LATENCY
+from gr_ros2.wire.table import AnnouncedTopic, write_table
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -67,7 +69,7 @@ receiver goes on without it after ``hold_s``; what comes back later than that is
 REPORTED_DEPTH = 160
 """Newer messages after which a message of a best-effort topic is not repaired any more, where receivers report and the
 publishers' depth is not known."""
-MOST_LIVES = 4096
+MOST_LIFETIMES = 4096
 """The same for a topic that is delivered in order: a bound on memory. Its receivers wait for the message."""
 UNREPORTED_DEPTH = 48
 """Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
@@ -81,7 +83,7 @@ Observer = Callable[[Accepted | Refused | Missed], None]
 class Message(Outgoing):
     """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there."""
 
-    life: Life = field(default_factory=Life)
+    lifetime: Lifetime = field(default_factory=Lifetime)
     begin: int = 0
     place: int = 0
     coded: bool = False
@@ -97,6 +99,8 @@ class _Kept:
     mark: int
     named: float = inf
     """Time in s from which on hellos name it."""
+    until: float = inf
+    """Time in s until which it is sent again."""
 
 
 @dataclass(slots=True, eq=False)
@@ -104,12 +108,13 @@ class _Line:
     """One topic, or the table of topics.
 
     :param qos: QoS class of its messages
-    :param kept: whether its newest messages are kept for robots that join late
+    :param latched: whether its newest messages are kept for robots that join late, however old they are
     :param depth: of its publishers' history, 0 for unbounded or unknown
     :param ordered: whether all its publishers are reliable
+    :param command: whether its messages are commands
     :param hidden: whether the table leaves it out: a service whose server is not there
     :param newest: when the newest of its messages that have left was submitted, s
-    :param lives: lifetimes of its messages that have left, and the packets of each
+    :param lifetimes: lifetimes of its messages that have left, and the packets of each
     :param packets: the packets of all of them
     """
 
@@ -117,13 +122,19 @@ class _Line:
     queue: TopicQueue
     qos: int
     weight: float
-    kept: bool
+    latched: bool
     hidden: bool = False
+    command: bool = False
     depth: int = 0
     ordered: bool = True
     newest: float = -inf
-    lives: deque[tuple[Life, int]] = field(default_factory=deque)
+    lifetimes: deque[tuple[Lifetime, int]] = field(default_factory=deque)
     packets: int = 0
+
+    @property
+    def kept(self) -> bool:
+        """Whether its newest messages are kept for robots that lack them."""
+        return self.latched or self.topic.options.keep_s > 0
 
     @property
     def kept_depth(self) -> int:
@@ -146,17 +157,32 @@ class _Line:
 class Filling:
     """The content of a source packet."""
 
-    parts: list[Entry]
+    parts: list[EntryV1]
     sent: tuple[SentEntry, ...]
-    lives: tuple[Life, ...]
+    lifetimes: tuple[Lifetime, ...]
     qos: int
     used: int
 
 
+class Owner(Protocol):
+    """What an outbox tells its endpoint."""
+
+    def submitted(self, topic_id: int, now: float) -> None:
+        """A message of a topic has come."""
+
+    def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
+        """The table of topics has changed.
+
+        :param added: by further topics
+        :param asked: the table has to be sent, although no robot asks
+        """
+
+
 class Outbox:
-    """The queues of one sender.
+    """The messages of one sender.
 
     :param topics: topics that it may send; the announced table is made from them
+    :param owner: is told what comes and changes
     :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
     """
@@ -165,13 +191,17 @@ class Outbox:
         self,
         topics: Registry | None,
         settings: Settings,
+        owner: Owner,
         *,
         boot: int,
         room: int,
         codec: MessageCodec | None,
         observer: Observer | None,
     ) -> None:
+        self.topics = topics
+        """What it sends."""
         self._settings = settings
+        self._owner = owner
         self._boot = boot
         self._room = room
         self._codec = codec
@@ -192,47 +222,60 @@ class Outbox:
         self.digest = 0
         """CRC-32 of the table; 0 if there is nothing to announce."""
         if topics:
-            self.add(topics)
+            self._add(topics)
 
-    def add(self, topics: Sequence[Topic]) -> None:
-        """Send and announce these topics too."""
+    def add(self, rows: Sequence[NewTopic]) -> Registry:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one learn of them from the next
+        hello."""
+        together = (Registry.empty() if self.topics is None else self.topics).extended(rows)
+        topics = together[-len(rows) :] if rows else ()
+        if self._codec is not None:
+            for topic in topics:
+                self._codec.add(topic)
+        self.topics = together
+        self._add(topics)
+        self._owner.topics_changed(added=True)
+        return together
+
+    def _add(self, topics: Sequence[Topic]) -> None:
+        """Queue and announce these topics too."""
         for topic in topics:
-            queue = TopicQueue(*queue_for(topic.options), topic.options.max_rate)
-            self._lines[topic.topic_id] = _line(topic, queue)
+            command = is_command(topic.name, topic.type_name, self._settings.commands)
+            queue = TopicQueue(*queue_for(topic.options, command=command), topic.options.max_rate)
+            self._lines[topic.topic_id] = _line(topic, queue, command=command)
         if TABLE_TOPIC not in self._lines:
             self._lines[TABLE_TOPIC] = _line(Topic(TABLE_TOPIC, "", ""), TopicQueue("latest"))
         self._find_deadlines()
         self._tabulate()
 
-    def recoded(self) -> bool:
-        """Announce how topics are coded now.
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one are told."""
+        if self._codec is None:
+            return
+        self._codec.learn(type_name, definitions)
+        if self._tabulate():
+            self._owner.topics_changed(asked=True)
 
-        :return: whether the table of topics has changed
-        """
-        before = self.digest
-        self._tabulate()
-        return self.digest != before
-
-    def offer(self, topic_id: int, *, offered: bool) -> bool:
-        """Announce a service, or no longer.
-
-        :return: whether the table of topics has changed
-        """
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         self._lines[topic_id].hidden = not offered
-        before = self.digest
-        self._tabulate()
-        return self.digest != before
+        if self._tabulate():
+            self._owner.topics_changed(asked=True)
 
-    def sends(self, topic_id: int) -> bool:
-        """Whether this is a topic that it may send."""
-        return topic_id in self._lines and topic_id != TABLE_TOPIC
+    def missed(self, topic_id: int, total: int) -> None:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        new = total - self.stats.missed[topic_id]
+        if new > 0:
+            self.stats.missed[topic_id] = total
+            if self._observer is not None:
+                self._observer(Missed(topic_id, new))
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
-        """Take a message. It may be refused, or cause other messages of its topic to be dropped.
-
-        :param lifespan_s: see :class:`gr_ros2.link.fragment.Outgoing`
-        """
-        line = self._lines[topic_id]
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        line = self._lines.get(topic_id)
+        if line is None or topic_id == TABLE_TOPIC:
+            raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
+        self._owner.submitted(topic_id, now)
         self._turns.join(topic_id)
         serial = self._serial
         self._serial += 1
@@ -248,7 +291,8 @@ class Outbox:
             return
         if line.kept:
             kept = self._kept.setdefault(topic_id, deque(maxlen=max(line.kept_depth, 1)))
-            kept.append(_Kept(serial, payload, codec is not None, crc32(payload)))
+            until = inf if line.latched else now + line.topic.options.keep_s
+            kept.append(_Kept(serial, payload, codec is not None, crc32(payload), until=until))
         self._admit(
             line,
             Message(serial, topic_id, payload, line.qos, now, line.weight, lifespan_s, coded=codec is not None),
@@ -265,13 +309,16 @@ class Outbox:
         if line is None or any(message.repeat for message in line.queue):
             return
         for kept in self._kept.get(topic_id, ()):
+            if now > kept.until:
+                continue
             if topic_id == TABLE_TOPIC:
                 # Nothing is delivered without the table. A long table does not delay urgent messages.
                 qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
                 line.queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
             else:
+                qos = QOS_BULK if line.latched else line.qos
                 again = Message(
-                    kept.serial, topic_id, kept.payload, QOS_BULK, now, line.weight, repeat=True, coded=kept.coded
+                    kept.serial, topic_id, kept.payload, qos, now, line.weight, repeat=True, coded=kept.coded
                 )
                 self._admit(line, again)
             self.stats.repeats += 1
@@ -290,25 +337,30 @@ class Outbox:
         return [
             (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC and now >= messages[-1].named
+            if topic_id != TABLE_TOPIC and messages[-1].named <= now <= messages[-1].until
         ]
 
     def follow(
-        self, topic_id: int, *, reliable: bool, latched: bool, depth: int, lifespan_s: float, period_s: float
+        self,
+        topic_id: int,
+        *,
+        reliable: bool = True,
+        latched: bool = False,
+        depth: int = 0,
+        lifespan_s: float = 0.0,
+        period_s: float = 0.0,
     ) -> bool:
-        """Take over the QoS of a topic's publishers, where the configuration leaves it open.
-
-        :return: whether the table of topics has changed
-        """
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        queue = self.queue(topic_id)
         line = self._lines[topic_id]
         topic = line.topic
         line.depth, line.ordered = depth, reliable
-        line.kept = topic.latched or (latched and topic.options.durability == AUTO)
-        line.queue.change(*queue_for(topic.options, depth, lifespan_s, period_s))
+        line.latched = topic.latched or (latched and topic.options.durability == AUTO)
+        line.queue.change(*queue_for(topic.options, depth, lifespan_s, period_s, command=line.command))
         self._find_deadlines()
-        before = self.digest
-        self._tabulate()
-        return self.digest != before
+        if self._tabulate():
+            self._owner.topics_changed()
+        return self.queue(topic_id) != queue
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """Policy and deadline (s, 0 for none) of a topic's queue."""
@@ -369,7 +421,10 @@ class Outbox:
         return any(line.queue and line.queue[0].qos == QOS_LATENCY for line in self._sending())
 
     def _rank(self, message: Outgoing) -> float:
-        return RANK[message.qos] + 0.5 * (len(message.payload) > LONG * self._room)
+        return RANK[message.qos] + 0.5 * self._long(message)
+
+    def _long(self, message: Outgoing) -> bool:
+        return len(message.payload) > LONG * self._room
 
     @property
     def idle(self) -> bool:
@@ -385,8 +440,8 @@ class Outbox:
         line = self._lines[topic_id]
         return line.queue.room(self._queue_depth(line))
 
-    def _tabulate(self) -> None:
-        """Make the table of topics."""
+    def _tabulate(self) -> bool:
+        """Make the table of topics; returns whether it has changed."""
         rows = []
         for line in self._sending():
             if line.hidden:
@@ -395,8 +450,10 @@ class Outbox:
             depth = min(line.kept_depth if line.kept else line.depth if options.depth == AUTO else options.depth, 255)
             codec = "" if self._codec is None else self._codec.announcement(topic.topic_id)
             fresh = line.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
+            if options.max_age_s != AUTO:
+                fresh = options.max_age_s > 0
             rows.append(
-                TableRow(
+                AnnouncedTopic(
                     topic.topic_id,
                     topic.name,
                     topic.type_name,
@@ -409,10 +466,11 @@ class Outbox:
                 )
             )
         if not rows and not self.digest:
-            return
-        table = write_table(rows)
+            return False
+        table, before = write_table(rows), self.digest
         self.digest = crc32(table)
         self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
+        return self.digest != before
 
     def _sending(self) -> Iterator[_Line]:
         """All topics, without the table of topics."""
@@ -460,25 +518,26 @@ class Outbox:
         return message.started or message.qos == 1 or message.remaining > LARGE * room
 
     def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
-        parts: list[Entry] = []
+        parts: list[EntryV1] = []
         sent: list[SentEntry] = []
-        lives: list[Life] = []
+        lifetimes: list[Lifetime] = []
         stats, qos = self.stats, picks[0][0].qos
         for place, (message, taken) in enumerate(picks):
             topic_id, offset = message.topic_id, message.offset
             line = self._lines[topic_id]
             if not message.index:
                 message.begin, message.place = number, place
-                message.life.expires = message.expires
-                message.life.in_order = line.in_order
+                message.lifetime.expires = message.expires
+                message.lifetime.in_order, message.lifetime.long = line.in_order, self._long(message)
                 line.queue.started(now)
+            message.lifetime.awaited = len(line.queue) > 1
             payload = message.take(taken)
             last, begin = message.offset == len(message.payload), message.begin
             parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
             key = Key(self._boot, begin, message.place)
             total = message.index if last else 0
             sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
-            lives.append(message.life)
+            lifetimes.append(message.lifetime)
             if RANK[message.qos] < RANK[qos]:
                 qos = message.qos
             stats.payload_bytes += taken
@@ -487,26 +546,28 @@ class Outbox:
                 self._left(message, line, now)
         self._turns.sent(self._holder)
         stats.entries += len(picks)
-        return Filling(parts, tuple(sent), tuple(lives), qos, used)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used)
 
     def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""
-        topic_id, life = message.topic_id, message.life
+        topic_id, lifetime = message.topic_id, message.lifetime
         line.newest = max(line.newest, message.submitted)
         self.stats.sent[topic_id] += not message.repeat
-        lives = line.lives
+        lifetimes = line.lifetimes
         most = UNREPORTED_DEPTH
         if line.queue.policy == "latest":
             most = 1
         elif self.reported:
-            most = MOST_LIVES if line.in_order else line.depth or REPORTED_DEPTH
-        elif lives:
-            before, _ = lives[-1]
+            most = MOST_LIFETIMES if line.in_order else line.depth or REPORTED_DEPTH
+        elif lifetimes:
+            before, _ = lifetimes[-1]
             before.expires = min(before.expires, now + WORTH * self._settings.hold_s)
-        lives.append((life, message.index))
+        lifetimes.append((lifetime, message.index))
         line.packets += message.index
-        while len(lives) > 1 and (len(lives) > most or (line.packets > GROUP and not self.reported)):
-            replaced, count = lives.popleft()
+        while len(lifetimes) > 1 and (
+            len(lifetimes) > most or (line.packets - lifetimes[0][1] > GROUP and not self.reported)
+        ):
+            replaced, count = lifetimes.popleft()
             replaced.end()
             line.packets -= count
         if topic_id not in self._kept:
@@ -517,13 +578,13 @@ class Outbox:
         if not self.reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
             table, waited = topic_id == TABLE_TOPIC, now - message.submitted
-            life.expires = self._starting_until if table else min(life.expires, now + 2 * waited + 2.0)
+            lifetime.expires = self._starting_until if table else min(lifetime.expires, now + 2 * waited + 2.0)
 
     def _drop(self, dropped: list[Dropped]) -> None:
         for item in dropped:
             item.message.index = max(item.message.index, 1)
             if isinstance(item.message, Message):
-                item.message.life.end()
+                item.message.lifetime.end()
             if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
 
@@ -533,6 +594,7 @@ class Outbox:
             self._observer(Refused(serial, topic_id, reason, detail))
 
 
-def _line(topic: Topic, queue: TopicQueue) -> _Line:
-    options = topic.options
-    return _Line(topic, queue, QOS_NAMES.index(options.qos), options.weight, topic.latched, not topic.is_topic)
+def _line(topic: Topic, queue: TopicQueue, *, command: bool = False) -> _Line:
+    options, hidden = topic.options, not topic.is_topic
+    qos = qos_class(options, command=command)
+    return _Line(topic, queue, qos, options.weight, topic.latched, hidden=hidden, command=command)

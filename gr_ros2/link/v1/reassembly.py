@@ -22,7 +22,7 @@ _FEW = 64
 
 
 @dataclass(slots=True, eq=False)
-class Partial:
+class PartialMessage:
     """A message of which a part is missing.
 
     :param place: its place among the entries of the packet in which it began; -1 until that packet is here
@@ -58,11 +58,11 @@ class Reassembly:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._partials: OrderedDict[tuple[int, int], Partial] = OrderedDict()
+        self._partials: OrderedDict[tuple[int, int], PartialMessage] = OrderedDict()
         """By topic id and packet in which they began; the message longest without a new fragment first."""
         self._begins: dict[int, list[int]] = {}
         """By topic id: a heap of the packets in which its messages began; some of them may be over."""
-        self._grown: dict[int, Partial] = {}
+        self._grown: dict[int, PartialMessage] = {}
         """By topic id: the message that had the last fragment."""
         self._held = 0
 
@@ -71,7 +71,7 @@ class Reassembly:
         """Bytes in use."""
         return self._held
 
-    def add(self, part: Part, number: int, place: int, *, repaired: bool, now: float) -> Partial | None:
+    def add(self, part: Part, number: int, place: int, *, repaired: bool, now: float) -> PartialMessage | None:
         """Take a fragment.
 
         :param number: number of its packet
@@ -83,7 +83,7 @@ class Reassembly:
         name = (part.topic_id, begin)
         partial = self._partials.get(name)
         if partial is None:
-            partial = self._partials[name] = Partial(part.topic_id, begin, part.coded, now)
+            partial = self._partials[name] = PartialMessage(part.topic_id, begin, part.coded, now)
             begins = self._begins.setdefault(part.topic_id, [])
             heappush(begins, begin)
             if len(begins) > 2 * len(self._partials) + _FEW:
@@ -108,21 +108,21 @@ class Reassembly:
         self._release(partial)
         return partial
 
-    def overflowing(self) -> list[Partial]:
+    def overflowing(self) -> list[PartialMessage]:
         """Give up the oldest messages while memory is above its bound."""
         ended = []
         while self._held > self._most:
             ended.append(self._release(next(iter(self._partials.values()))))
         return ended
 
-    def expired(self, now: float, after: float) -> list[Partial]:
+    def expired(self, now: float, after: float) -> list[PartialMessage]:
         """Give up messages without a new fragment for so many s."""
         ended = []
         while self._partials and (partial := next(iter(self._partials.values()))).last + after <= now:
             ended.append(self._release(partial))
         return ended
 
-    def overtaken(self, topic_id: int, begin: int) -> list[Partial]:
+    def overtaken(self, topic_id: int, begin: int) -> list[PartialMessage]:
         """Give up messages that began before a later message of the same topic that has been delivered."""
         ended, begins = [], self._begins.get(topic_id, [])
         while begins and begins[0] < begin:
@@ -131,7 +131,7 @@ class Reassembly:
                 ended.append(self._release(partial))
         return ended
 
-    def clear(self) -> list[Partial]:
+    def clear(self) -> list[PartialMessage]:
         """Give up everything."""
         ended = list(self._partials.values())
         self._partials.clear()
@@ -151,7 +151,7 @@ class Reassembly:
             return partial.last
         return None
 
-    def _release(self, partial: Partial) -> Partial:
+    def _release(self, partial: PartialMessage) -> PartialMessage:
         del self._partials[partial.topic_id, partial.begin]
         self._held -= partial.size + _PARTIAL_COST + len(partial.pieces) * _FRAGMENT_COST
         if self._grown.get(partial.topic_id) is partial:

@@ -42,8 +42,8 @@ _info = Struct(">BQ")
 class Trailer(Protocol):
     """Closes and opens the packets of one start of one robot.
 
-    ``clear`` is what stands before the body: the header, and in a standing packet also window, row and mask.
-    ``number`` is the full packet number. ``row`` is the row of a standing packet; for other packets it is
+    ``clear`` is what stands before the body: the header, and in a repair packet also window, row and mask.
+    ``number`` is the full packet number. ``row`` is the row of a repair packet; for other packets it is
     ``SOURCE_ROW``. ``plain``: the body is not encrypted, whatever the mode (as in a hello).
     """
 
@@ -74,10 +74,12 @@ class Checksum:
         self._session = session_crc(boot, 0)
 
     def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+        """See :class:`Trailer`."""
         data = clear + body
         return data + crc(data, self._of(number >> 16))
 
     def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+        """See :class:`Trailer`."""
         body = rest[:-CRC_LEN]
         if crc(clear + body, self._of(number >> 16)) != rest[-CRC_LEN:]:
             raise CrcError("CRC-32 does not match: damaged, or of another start of the sender")
@@ -105,6 +107,7 @@ class Seal:
         self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
 
     def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, row)
         named = clear if len(clear) <= _HOP else without_hop(clear)
         if self.encrypt and not plain:
@@ -112,6 +115,7 @@ class Seal:
         return clear + body + self._cipher.encrypt(nonce, b"", named + body)
 
     def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+        """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, row)
         named = clear if len(clear) <= _HOP else without_hop(clear)
         try:

@@ -31,11 +31,11 @@ struct Report {
     int64_t end;           // index after the last sample that is needed
     int64_t length;        // bytes of the packet
     int64_t soft, points;  // number of soft bits and of points
-    int64_t rung;          // with an adaptive rate, what it was sent with
+    int64_t mcs;          // with an adaptive rate, what it was sent with
 };
 
 // What reading gave: no burst; its bits; or, where the samples end before the burst does, `snr`, `end`, `length` and
-// `rung` of the report only.
+// `mcs` of the report only.
 enum Result { kNoBurst, kRead, kCut };
 
 // The allowed packet lengths, `shortest` to `longest` bytes, and the bits sent for each. If there is only one length,
@@ -91,7 +91,7 @@ class Modem {
 
 struct OfdmParameters {
     int32_t shortest, longest;
-    int32_t rung_count, counted, size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count,
+    int32_t mcs_count, counted, size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count,
         once_count, twice_count, shift_count;
     double level, alike, energy, power, pair_weight, word_weight_sum, pace_gain, memory, reach, doubt;
     const int32_t *frame_bits, *point_counts, *point_bits, *carriers, *data, *pilots, *once, *twice, *shifts;

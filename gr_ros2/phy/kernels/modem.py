@@ -15,7 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, Frames, Heard, ModemConstants, Reading, Samples, Search
+from gr_ros2.phy.burst import (
+    BurstModem,
+    BurstReceiver,
+    DemodulatedPacket,
+    Frames,
+    ModemConstants,
+    Reading,
+    Samples,
+    Search,
+)
 from gr_ros2.phy.kernels.library import address, checked, loaded
 
 _NONE = -(2**63)
@@ -37,7 +46,7 @@ KERNELS: dict[str, tuple[int, Fields]] = {
     "ofdm": (
         0,
         _fields(
-            int32="shortest longest rung_count counted size prefix repeat degrees chunk carrier_count data_count "
+            int32="shortest longest mcs_count counted size prefix repeat degrees chunk carrier_count data_count "
             "pilot_count once_count twice_count shift_count",
             float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
             int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
@@ -81,7 +90,7 @@ class _Report(ctypes.Structure):
         ("length", ctypes.c_int64),
         ("soft", ctypes.c_int64),
         ("points", ctypes.c_int64),
-        ("rung", ctypes.c_int64),
+        ("mcs", ctypes.c_int64),
     )
 
 
@@ -121,7 +130,7 @@ class _Stream(ctypes.Structure):
             (name, ctypes.c_int64)
             for name in ["margin", "span", "peak", "burst", "stretch", "cursor", "start", "last", "room"]
         ),
-        *((name, ctypes.c_void_p) for name in ["packets", "lengths", "snrs", "soft", "points"]),
+        *((name, ctypes.c_void_p) for name in ["packets", "lengths", "snrs", "ends", "soft", "points"]),
         *((name, ctypes.c_int64) for name in ["row_size", "row", "whole", "damaged"]),
         ("report", _Report),
         ("row_points", ctypes.c_int64),
@@ -152,15 +161,15 @@ class CompiledModem(BurstModem):
         """Most soft bits and points of a reading."""
         self._samples_of = lru_cache(maxsize=None)(reference.samples_of)
         self._form = _FrameForm(reference.frames)
-        given = reference.rungs
-        self._rungs = tuple(CompiledModem(modem) for modem in given) if len(given) > 1 else ()
+        given = reference.rates
+        self._rates = tuple(CompiledModem(modem) for modem in given) if len(given) > 1 else ()
 
     def __reduce__(self) -> Any:
         return CompiledModem, (self._reference,)  # memory of a library stays in its process
 
     @property
-    def rungs(self) -> Sequence[BurstModem]:
-        return self._rungs or (self,)
+    def rates(self) -> Sequence[BurstModem]:
+        return self._rates or (self,)
 
     def samples_of(self, packet_len: int) -> int:
         return self._samples_of(packet_len)
@@ -220,9 +229,9 @@ class CompiledModem(BurstModem):
         if result == _NO_BURST:
             return None
         if result == _CUT:
-            return Reading(report.length, None, points[:0], report.snr, report.end, report.rung)
+            return Reading(report.length, None, points[:0], report.snr, report.end, report.mcs)
         read = (soft[: report.soft], points[: report.points])
-        return Reading(report.length, *read, report.snr, report.end, report.rung)
+        return Reading(report.length, *read, report.snr, report.end, report.mcs)
 
 
 class CompiledReceiver(BurstReceiver):
@@ -239,6 +248,7 @@ class CompiledReceiver(BurstReceiver):
         self._packets = np.empty(_ROOM * modem.frames.packet_len, np.uint8)
         self._lengths = np.empty(_ROOM, np.int32)
         self._newest_snrs = np.empty(_ROOM, np.float64)
+        self._ends = np.empty(_ROOM, np.int64)
         soft, points = modem.reading_size
         self._soft, self._points = np.empty(soft, np.float32), np.empty((2, points), np.complex64)
         self._stream = stream = _Stream()
@@ -247,14 +257,14 @@ class CompiledReceiver(BurstReceiver):
         stream.peak, stream.burst, stream.stretch = modem.peak_samples, modem.burst_samples, self._stretch
         stream.room, stream.row_size = _ROOM, points
         stream.packets, stream.lengths = address(self._packets), address(self._lengths)
-        stream.snrs = address(self._newest_snrs)
+        stream.snrs, stream.ends = address(self._newest_snrs), address(self._ends)
         stream.soft, stream.points = address(self._soft), address(self._points)
 
-    def _take(self) -> list[Heard]:
+    def _take(self) -> list[DemodulatedPacket]:
         stream = self._stream
         stream.count, stream.cursor = self._end, self._cursor
         stream.start, stream.last = (_NONE if at is None else at for at in (self._start, self._last))
-        packets: list[Heard] = []
+        packets: list[DemodulatedPacket] = []
         reason = None
         while reason != _NEEDS_SAMPLES:
             stream.whole = stream.damaged = 0
@@ -268,21 +278,21 @@ class CompiledReceiver(BurstReceiver):
         self._start, self._last = (None if at == _NONE else at for at in (stream.start, stream.last))
         return packets
 
-    def _whole(self) -> list[Heard]:
+    def _whole(self) -> list[DemodulatedPacket]:
         """The packets of the last call."""
         stream, packets, begin = self._stream, [], 0
         lengths, snrs = self._lengths[: stream.whole].tolist(), self._newest_snrs[: stream.whole].tolist()
         joined = self._packets[: sum(lengths)].tobytes()
-        for length, snr in zip(lengths, snrs, strict=True):
-            packets.append(Heard(joined[begin : begin + length], snr))
+        for length, snr, end in zip(lengths, snrs, self._ends[: stream.whole].tolist(), strict=True):
+            packets.append(DemodulatedPacket(joined[begin : begin + length], snr, self._counted(end)))
             begin += length
         self._measured(self._points[stream.row, : stream.row_points], snrs)
         return packets
 
-    def _unwrapped(self) -> list[Heard]:
+    def _unwrapped(self) -> list[DemodulatedPacket]:
         """The packet of the burst that was read, if its CRC-32 matches."""
         stream, report = self._stream, self._stream.report
-        frames = self._modem.rungs[report.rung].frames
+        frames = self._modem.rates[report.mcs].frames
         packet = frames.of(report.length).unwrap(self._soft[: report.soft])
         if packet is None:
             self.damaged += 1
@@ -291,7 +301,7 @@ class CompiledReceiver(BurstReceiver):
             stream.cursor = report.end - stream.margin
             self._measured(self._points[stream.row, : report.points], [report.snr])
         stream.start = stream.last = _NONE
-        return [] if packet is None else [Heard(packet, report.snr, report.rung)]
+        return [] if packet is None else [DemodulatedPacket(packet, report.snr, self._counted(report.end), report.mcs)]
 
     def _measured(self, points: Samples, snrs: list[float]) -> None:
         self.points = points.copy()

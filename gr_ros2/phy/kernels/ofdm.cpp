@@ -87,7 +87,7 @@ class Ofdm final : public Modem {
           smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
           smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
           crosswise_(copied(p.crosswise, 2 * p.twice_count)),
-          headers_(copied(p.headers, static_cast<size_t>(p.rung_count) * lengths_.count() * kWordBits)),
+          headers_(copied(p.headers, static_cast<size_t>(p.mcs_count) * lengths_.count() * kWordBits)),
           header_mask_(copied(p.header_mask, p.data_count)),
           word_weight_(copied(p.word_weight, used_)),
           bpsk_(bpsk()),
@@ -95,9 +95,9 @@ class Ofdm final : public Modem {
           roots_(kToneSize) {
         const Sample* points = p.points;
         const uint8_t* marks = p.marks;
-        for (int rung = 0; rung < p.rung_count; rung++) {
-            const int count = p.point_counts[rung], bits = p.point_bits[rung];
-            rungs_.push_back({Lengths(p.shortest, p.longest, p.frame_bits + rung * lengths_.count()),
+        for (int mcs = 0; mcs < p.mcs_count; mcs++) {
+            const int count = p.point_counts[mcs], bits = p.point_bits[mcs];
+            rates_.push_back({Lengths(p.shortest, p.longest, p.frame_bits + mcs * lengths_.count()),
                               Constellation(points, count, bits, marks)});
             most_points_ = std::max(most_points_, count);
             points += count;
@@ -158,10 +158,10 @@ class Ofdm final : public Modem {
         const float noise = first_estimate(s);
         report->snr = signal_to_noise(s);
         const Told told = head(s, noise);
-        const Constellation& points = rungs_[told.rung].points;
+        const Constellation& points = rates_[told.mcs].points;
         const int all = points_of(told), count = symbols(told) - kHead;
         report->length = told.length;
-        report->rung = told.rung;
+        report->mcs = told.mcs;
         report->end = start + static_cast<int64_t>(symbols(told)) * symbol_ - back_;
         if (report->end > samples.count) return kCut;
         report->points = all;
@@ -185,7 +185,7 @@ class Ofdm final : public Modem {
     void modulate(const uint8_t* bits, int32_t length, Sample* out) const override {
         Scratch& s = prepared();
         const Told sent{0, length};
-        const Constellation& points = rungs_[0].points;
+        const Constellation& points = rates_[0].points;
         const int frame_bits = lengths_.bits(length), count = symbols(sent);
         const uint8_t* header = &headers_[static_cast<size_t>(lengths_.row(length)) * kWordBits];
         int taken = 0;
@@ -212,20 +212,20 @@ class Ofdm final : public Modem {
     }
 
    private:
-    // What packets of one rung are sent with.
-    struct Rung {
+    // What packets of one MCS are sent with.
+    struct Mcs {
         Lengths lengths;
         Constellation points;
     };
 
     // What a header says.
     struct Told {
-        int rung, length;
+        int mcs, length;
     };
 
     int points_of(Told told) const {
-        const Rung& rung = rungs_[told.rung];
-        return (rung.lengths.bits(told.length) + rung.points.bits() - 1) / rung.points.bits();
+        const Mcs& mcs = rates_[told.mcs];
+        return (mcs.lengths.bits(told.length) + mcs.points.bits() - 1) / mcs.points.bits();
     }
 
     int symbols(Told told) const { return kHead + (points_of(told) + p_.data_count - 1) / p_.data_count; }
@@ -241,11 +241,11 @@ class Ofdm final : public Modem {
         return said(s.header.data());
     }
 
-    // Rung and length in a header. Also for headers of GNU Radio's blocks, which count frames and send only the longest.
+    // MCS and length in a header. Also for headers of GNU Radio's blocks, which count frames and send only the longest.
     Told said(const float* soft) const {
         const int row = counted(soft);
         if (row >= 0) return {0, lengths_.shortest() + row};
-        const int likeliest = likeliest_word(signs_.data(), p_.rung_count * lengths_.count(), soft);
+        const int likeliest = likeliest_word(signs_.data(), p_.mcs_count * lengths_.count(), soft);
         return {likeliest / lengths_.count(), lengths_.shortest() + likeliest % lengths_.count()};
     }
 
@@ -614,14 +614,14 @@ class Ofdm final : public Modem {
     }
 
     OfdmParameters p_;  // its numbers; arrays are copied below
-    Lengths lengths_;   // of the first rung
+    Lengths lengths_;   // of the first MCS
     int symbol_, half_, window_, back_, used_, most_points_ = 0;
     std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
     std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_;
     std::vector<uint8_t> headers_, header_mask_;
     std::vector<float> signs_;
     std::vector<float> word_weight_;
-    std::vector<Rung> rungs_;
+    std::vector<Mcs> rates_;
     Constellation bpsk_;
     Fft fft_;
     std::vector<Sample> roots_;

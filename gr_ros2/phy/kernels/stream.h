@@ -20,6 +20,7 @@ struct Stream {
     uint8_t* packets;                     // their bytes, one packet after the other
     int32_t* lengths;
     double* snrs;
+    int64_t* ends;     // index after the last sample of each packet's burst
     float* soft;       // of the newest burst
     Sample* points;    // two rows: the newest whole packet's, and one to read into
     int64_t row_size;
@@ -75,6 +76,7 @@ inline Taken take(const Modem& modem, Stream& s) {
             packet += s.report.length;
             s.lengths[s.whole] = static_cast<int32_t>(s.report.length);
             s.snrs[s.whole] = s.report.snr;
+            s.ends[s.whole] = s.report.end;
             s.whole++;
             s.row = row;
             s.row_points = s.report.points;

@@ -21,7 +21,7 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Experiment, Scenario, Time, dump, load_scenario
-from gr_ros2.settings.config import ChannelConfig, Text, build, read_yaml, replaced
+from gr_ros2.settings.config import ScenarioChannel, Text, build, read_yaml, replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import BUILTIN_DIR as SCENARIO_DIR
 from gr_ros2.settings.files import find_registry
@@ -234,7 +234,7 @@ def _check(sweep: Sweep, scenario: Scenario, phys: dict[str, Phy]) -> None:
     registry = scenario.load_registry()
     names: list[str] = []
     for way in scenario.directions():
-        beside_channel = repr(replaced(way, channel=ChannelConfig()))
+        beside_channel = repr(replaced(way, channel=ScenarioChannel(), reports=None, receivers=()))
         if beside_channel not in phys:
             phys[beside_channel] = make_phy(way, registry)
         phys[beside_channel].check_channel(way.channel)

@@ -7,12 +7,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from gr_ros2.link import ReceivedPacket
+from gr_ros2.link.access import Access
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
+from tests.packets import data_of
 
 KEY = bytes(range(32))
 SLOT_S = 1 / 75
@@ -32,6 +35,7 @@ class Robot:
     """An endpoint, what it told, and what it must not forget.
 
     :param coding: its codec, and what makes a decoder from the table of another robot
+    :param access: what decides when it may send
     """
 
     def __init__(
@@ -41,9 +45,11 @@ class Robot:
         *,
         mode: SealMode = "none",
         coding: tuple[Any, Any] = (None, None),
+        access: Access | None = None,
         **settings: Any,
     ) -> None:
         self.src_id, self.topics, self.coding = src_id, topics, coding
+        self.access = access
         self.keys = keys(mode)
         self.settings = Settings(src_id, **{"packet_len": 64, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
@@ -55,7 +61,7 @@ class Robot:
     def start(self, boot: int | None = None) -> None:
         """Start anew: everything but the stored state is forgotten."""
         self.boot = self.boot + 1 if boot is None else boot
-        self.end = Endpoint(
+        self.end = EndpointV1(
             self.topics,
             self.settings,
             boot=self.boot,
@@ -65,18 +71,19 @@ class Robot:
             heard=dict(self.stored),
             save=lambda src_id, boot, floor: self.save(src_id, (boot, floor)),
             observer=self.events.append,
+            access=self.access,
         )
-        self.end.use_credit()
+        self.end.pace.use_credit()
 
     def slot(self, now: float) -> bytes | None:
         """What it sends in a slot."""
-        if self.end.out_of_credit:
-            self.end.credit()
-        return self.end.next_packet(now)
+        if self.end.pace.out_of_credit:
+            self.end.pace.credit()
+        return data_of(self.end.next_packet(now))
 
-    def receive(self, data: bytes, now: float) -> list[ReceiverEvent]:
+    def receive(self, data: bytes, now: float, began: float | None = None) -> list[ReceiverEvent]:
         """What a packet causes."""
-        events = self.end.receive(data, now)
+        events = self.end.receive(ReceivedPacket(data, began), now)
         self.events += events
         return events
 

@@ -13,7 +13,7 @@ from gr_ros2.link.events import Lost, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.wire.table import Row
+from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.v1.air import SLOT_S, Air, Robot
 
@@ -26,7 +26,7 @@ def payload(number: int) -> bytes:
     return b"\0\1\0\0" + struct.pack("<ixxxx6d", number, *[number / 8] * 6)
 
 
-def decoder(rows: tuple[Row, ...]) -> LinkCodec:
+def decoder(rows: tuple[AnnouncedTopic, ...]) -> LinkCodec:
     topics = [Topic(row.topic_id, row.name, row.type_name) for row in rows]
     return LinkCodec(()).of(topics, {row.topic_id: row.codec for row in rows})
 
@@ -53,16 +53,16 @@ def test_nothing_is_lost_while_receivers_learn(hears: bool, table_lost: bool) ->
     air.lost = lambda robot, _: losing[0] and robot is sender and carries_table(sender)
     for number in range(60):
         if number == 20:
-            sender.end.learn(THING, TYPES)
+            sender.end.messages.learn(THING, TYPES)
             losing[0] = table_lost
         if number == 30:
             losing[0] = False
-        sender.end.submit(0, payload(number), air.now)
+        sender.end.messages.submit(0, payload(number), air.now)
         air.run(4 * SLOT_S)
     air.run(5.0)
     assert receiver.delivered(1) == [payload(number) for number in range(60)]
     assert codec.encode(0, payload(1))[0] >> 4 == ANNOUNCED
-    assert sender.end.outbox.digest == next(iter(receiver.end.neighbours)).inbox.digest
+    assert sender.end.messages.digest == next(iter(receiver.end.neighbours)).inbox.announced.digest
 
 
 def test_what_is_never_announced_is_lost_by_name_and_memory_is_bounded() -> None:
@@ -71,12 +71,12 @@ def test_what_is_never_announced_is_lost_by_name_and_memory_is_bounded() -> None
     air.run(1.0)
     codec.learn(THING, TYPES)  # and not announced
     for number in range(400):
-        sender.end.submit(0, payload(number), air.now)
+        sender.end.messages.submit(0, payload(number), air.now)
         air.run(2 * SLOT_S)
     lost = [event for event in receiver.events if isinstance(event, Lost)]
     assert len(lost) >= 400 - 256 - 5 and {event.reason for event in lost} == {LedgerRow.UNKNOWN_DICTIONARY}
     assert not receiver.delivered(1)
-    sender.end.learn(THING, TYPES)
+    sender.end.messages.learn(THING, TYPES)
     air.run(1.0)
     assert receiver.delivered(1)[-1] == payload(399)
 
@@ -85,9 +85,9 @@ def test_a_table_that_says_the_same_is_not_sent_again() -> None:
     sender, receiver, _ = robots(hears=True)
     air = Air(sender, receiver)
     air.run(2.0)
-    sender.end.learn(THING, TYPES)
+    sender.end.messages.learn(THING, TYPES)
     air.run(2.0)
     before = sender.end.sent.repeats
-    sender.end.learn(THING, TYPES)
+    sender.end.messages.learn(THING, TYPES)
     air.run(2.0)
     assert sender.end.sent.repeats == before

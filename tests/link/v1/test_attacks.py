@@ -9,12 +9,14 @@ from collections.abc import Iterator
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered, Gone, Rejected
 from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Seal, SealMode, subkey
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.wire.control import Report
-from gr_ros2.wire.v1 import Header, Part, Standing, body_room, write_body, write_header, write_standing
+from gr_ros2.wire.v1 import Header, Part, RepairHeader, body_room, write_body, write_header, write_repair_header
 from tests.link.v1.air import KEY, Air, Robot, registry
 
 SEALED: list[SealMode] = ["authenticate", "encrypt"]
@@ -30,7 +32,7 @@ def pair(mode: SealMode = "encrypt", **settings: object) -> tuple[Robot, Robot, 
 
 def talk(one: Robot, air: Air, first: int, count: int) -> None:
     for number in range(first, first + count):
-        one.end.submit(0, b"genuine %d" % number, air.now)
+        one.end.messages.submit(0, b"genuine %d" % number, air.now)
         air.run(0.03)
     air.run(1.0)
 
@@ -53,7 +55,7 @@ def check_alive(one: Robot, two: Robot, air: Air, seconds: float = 2.0) -> None:
     """Something new crosses soon. What was sent just before a receiver restarted may not: it could be a replay."""
     two.events.clear()
     for number in range(int(seconds * 10)):
-        one.end.submit(0, b"after it %d" % number, air.now)
+        one.end.messages.submit(0, b"after it %d" % number, air.now)
         air.run(0.1, lambda: bool(two.delivered()))
         if two.delivered():
             return
@@ -125,7 +127,7 @@ def test_a_retired_key_and_no_key() -> None:
     foreign.keys = Keys((OTHER,), "encrypt")
     foreign.boot = one.boot + 100
     foreign.start()
-    foreign.end.submit(0, b"foreign", 0.0)
+    foreign.end.messages.submit(0, b"foreign", 0.0)
     attack(two, [data for n in range(20) if (data := foreign.slot(n / 75)) is not None], air.now)
     assert two.end.received.rejected["wrong_key"] > 0
     open_one = Robot(1, registry())
@@ -157,7 +159,7 @@ def test_keys_are_changed_without_stopping() -> None:
 def test_another_robots_packet_under_this_robots_id() -> None:
     one, two, air = pair()
     three = Robot(3, registry(), mode="encrypt")
-    three.end.submit(0, b"of three", 0.0)
+    three.end.messages.submit(0, b"of three", 0.0)
     packets = [data for n in range(20) if (data := three.slot(n / 75)) is not None]
     attack(two, [data[:1] + b"\1" + data[2:] for data in packets], air.now)
     attack(two, [data[:1] + b"\2" + data[2:] for data in packets], air.now)
@@ -167,11 +169,11 @@ def test_another_robots_packet_under_this_robots_id() -> None:
 def test_nothing_is_confirmed_that_never_arrived() -> None:
     one, two, air = pair()
     air.lost = lambda sender, _: sender is one
-    one.end.submit(0, b"not heard", air.now)
+    one.end.messages.submit(0, b"not heard", air.now)
     air.run(0.2)
     newest = one.end.window.newest
     forged = Report(1, one.boot & 0xFFFF, newest & 0xFFFF, (1 << 64) - 1, True, 0)
-    clear = write_header(Header(3, True, 2, two.end.window.newest & 0xFFFF)) + write_standing(Standing(100))
+    clear = write_header(Header(3, True, 2, two.end.window.newest & 0xFFFF)) + write_repair_header(RepairHeader(100))
     body = write_body([forged], body_room(64, sealed=True)).ljust(64 - 14, b"\0")
     for trailer in (Seal(OTHER, 2, two.boot, encrypt=True), Seal(KEY, 1, one.boot, encrypt=True)):
         one.receive(trailer.close(clear, body, two.end.window.newest, 100), air.now)
@@ -191,7 +193,7 @@ def test_a_report_of_an_earlier_start_confirms_nothing() -> None:
     recorded = of(air, two)
     one.start()
     air.lost = lambda *_: True
-    one.end.submit(0, b"new", air.now)
+    one.end.messages.submit(0, b"new", air.now)
     air.run(0.06)
     for data in recorded:
         one.receive(data, air.now)
@@ -209,11 +211,29 @@ def test_no_link_is_silenced_for_longer_than_the_attack_lasts() -> None:
                 data[rng.randrange(64)] ^= 1 << rng.randrange(8)
             two.receive(bytes(data), air.now)
             one.receive(bytes(data), air.now)
-        one.end.submit(0, b"meanwhile %d" % number, air.now)
+        one.end.messages.submit(0, b"meanwhile %d" % number, air.now)
         air.run(0.04)
     air.run(1.0)
     here = [payload for payload in two.delivered() if payload.startswith(b"meanwhile")]
     assert here == [b"meanwhile %d" % number for number in range(100)]
+
+
+def test_forged_starts_silence_a_robot_for_half_of_the_time_at_most() -> None:
+    """Without a key; hellos of a start that is no robot's, ten times a second."""
+    one, two = Robot(1, registry()), Robot(2)
+    air = Air(one, two)
+    air.run(2.0)
+    forger = Robot(1, registry())
+    forger.start(boot=(1 << 64) - 1)
+    for number in range(600):
+        forged = forger.slot(air.now)
+        if forged is not None:
+            two.receive(forged, air.now)
+        one.end.messages.submit(0, b"meanwhile %d" % number, air.now)
+        air.run(0.1)
+    here = [payload for payload in two.delivered() if payload.startswith(b"meanwhile")]
+    assert len(here) >= 250
+    assert len(set(here)) == len(here)
 
 
 def test_no_pair_of_key_and_nonce_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,7 +268,7 @@ def test_no_pair_of_key_and_nonce_comes_twice(monkeypatch: pytest.MonkeyPatch) -
         for _ in range(70_000 if part == 0 else 3000):
             now += SLOT
             if part == 0 or rng.random() < 0.05:
-                one.end.submit(rng.randrange(3), rng.randbytes(30), now)
+                one.end.messages.submit(rng.randrange(3), rng.randbytes(30), now)
             one.slot(now)
     assert len(seen) > 70_000
     assert {row for *_, row in seen} >= {SOURCE_ROW, *range(128)}
@@ -272,7 +292,7 @@ def test_what_a_receiver_never_heard_is_not_taken_as_fresh() -> None:
     one.start()
     air.robots = [one]
     for number in range(100):
-        one.end.submit(0, b"old %d" % number, air.now)
+        one.end.messages.submit(0, b"old %d" % number, air.now)
         air.run(0.03)
     recorded = of(air, one)[-300:]
     attack(two, recorded, air.now + 1.0)  # still on
@@ -303,7 +323,7 @@ def test_a_start_of_both_at_once_loses_no_first_message(mode: SealMode) -> None:
         air = Air(one, two, loss=loss)
         for number in range(20):
             for robot in (one, two):
-                robot.end.submit(0, b"%d" % number, air.now)
+                robot.end.messages.submit(0, b"%d" % number, air.now)
             air.step()
         air.run(5.0)
         assert len(one.delivered()) == len(two.delivered()) == 20
@@ -311,18 +331,21 @@ def test_a_start_of_both_at_once_loses_no_first_message(mode: SealMode) -> None:
 
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 def test_a_recorded_packet_is_no_sign_of_life(mode: SealMode) -> None:
-    one, two, air = pair(mode)
+    one, two = Robot(1, registry(), mode=mode), Robot(2, registry(), mode=mode)
+    air = Air(one, two)  # without losses: what it replays, two has heard
+    talk(one, air, 0, 30)
     recorded = of(air, one)
     snr_db = []
+    two.end.mcs_table = (Mcs("the only one", 0.01, 10.0, 1.0),)  # so that it reports an SNR
     air.robots = [two]
     for _ in range(200):
         air.run(0.1)
         for data in recorded[-30:]:
-            two.events += two.end.receive(data, air.now, snr_db=40.0)
+            two.events += two.end.receive(ReceivedPacket(data, snr_db=40.0), air.now)
         known = two.end.neighbours.get(1)
         assert known is not None
-        assert not known.inbox.unreported or air.now < 3.0
-        snr_db.append(known.inbox.snr_db)
+        assert not known.inbox.reports.unreported or air.now < 3.0
+        snr_db.append(known.inbox.reports.snr.snr_db)
     assert any(isinstance(event, Gone) for event in two.events)
     assert snr_db[-1] is None
 
@@ -332,8 +355,8 @@ def test_equal_ids_are_told_to_both_and_share_no_key() -> None:
     one.start(boot=5 << 32 | 77)
     other.start(boot=5 << 32 | 78)
     air = Air(one, other)
-    one.end.submit(0, b"secret", 0.0)
-    other.end.submit(0, b"public", 0.0)
+    one.end.messages.submit(0, b"secret", 0.0)
+    other.end.messages.submit(0, b"public", 0.0)
     air.run(2.0)
     for robot in (one, other):
         assert robot.end.received.rejected["same_id"] > 0
@@ -376,15 +399,15 @@ def test_what_was_withheld_for_long_is_not_executed() -> None:
     one, two = Robot(1, rows, mode="encrypt"), Robot(2, registry(), mode="encrypt")
     air = Air(one, two, loss=0.2)
     for number in range(100):
-        one.end.submit(0, b"go %d" % number, air.now)
+        one.end.messages.submit(0, b"go %d" % number, air.now)
         air.run(0.05)
     assert len(two.delivered()) > 90
     withheld = len(air.recorded)
     usual = air.lost
     air.lost = lambda sender, receiver: sender is one or usual(sender, receiver)
     for number in range(100):
-        one.end.submit(0, b"late %d" % number, air.now)
-        one.end.submit(1, b"line %d" % number, air.now)
+        one.end.messages.submit(0, b"late %d" % number, air.now)
+        one.end.messages.submit(1, b"line %d" % number, air.now)
         air.run(0.1)
     recorded = [data for who, data in air.recorded[withheld:] if who is one]
     air.robots = [two]
@@ -404,7 +427,7 @@ def test_what_is_fresh_is_taken(loss: float) -> None:
     air = Air(one, two, loss=loss)
     air.run(2.0)
     for number in range(600):
-        one.end.submit(0, b"go %d" % number, air.now)
+        one.end.messages.submit(0, b"go %d" % number, air.now)
         air.run(0.1)
     assert len(two.delivered()) >= 599
     assert not two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value]

@@ -6,7 +6,7 @@ import pytest
 
 from bench.repair_backlog import CASES, LOSSES, OLDER, run
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.endpoint import GIVE_UP_S
+from gr_ros2.link.v1.receiving import GIVE_UP_S
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import Air, Robot, registry
 
@@ -19,7 +19,16 @@ def test_long_messages_back_to_back_arrive_beside_odometry(name: str, loss: floa
     alone, beside = run((), loss), run(CASES[name], loss)
     assert beside.delivered == list(CASES[name])
     assert beside.done < 9.1 / (1 - loss) * 1.05
-    assert beside.age <= OLDER[loss] * alone.age
+    assert beside.age <= OLDER * alone.age
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_long_messages_arrive_one_way_too(name: str, odometry: bool) -> None:
+    """At the expected loss, with the repairs that are enough for it and no more."""
+    outcome = run(CASES[name], 0.2, odometry=odometry, reports=False)
+    assert outcome.delivered == list(CASES[name])
+    assert outcome.done < 9.1 * 1.6
 
 
 def test_a_full_link_repairs_what_later_messages_wait_for() -> None:
@@ -28,9 +37,9 @@ def test_a_full_link_repairs_what_later_messages_wait_for() -> None:
     air = Air(one, two, loss=0.2)
     air.run(1.0)
     for number in range(100):
-        one.end.submit(0, b"few %d" % number, air.now)
+        one.end.messages.submit(0, b"few %d" % number, air.now)
         for _ in range(10):
-            one.end.submit(1, bytes(46), air.now)
+            one.end.messages.submit(1, bytes(46), air.now)
             air.step()
     air.run(1.0)
     assert [text for text in two.delivered() if text.startswith(b"few")] == [b"few %d" % n for n in range(100)]
@@ -43,10 +52,10 @@ def test_a_message_given_up_by_its_sender_keeps_nothing_back() -> None:
     air = Air(one, two)
     air.run(2.0)
     air.lost = lambda sender, _: sender is one
-    one.end.submit(0, b"stale", air.now)
+    one.end.messages.submit(0, b"stale", air.now)
     air.run(0.2)
     air.lost = lambda *_: False
-    one.end.submit(1, b"next", air.now)
+    one.end.messages.submit(1, b"next", air.now)
     assert air.run(3.0, lambda: bool(two.delivered())) < 1.0
     assert two.delivered() == [b"next"]
 
@@ -57,14 +66,14 @@ def test_a_receiver_waits_as_long_as_its_sender_repairs() -> None:
     air = Air(one, two)
     air.run(2.0)
     air.lost = lambda sender, _: sender is one
-    one.end.submit(0, b"first", air.now)
+    one.end.messages.submit(0, b"first", air.now)
     air.step()
 
     def repairs(sender: Robot, _: Robot) -> bool:
         return sender is one and next(e.kind for e in reversed(one.events) if isinstance(e, SentPacket)) == "repair"
 
     air.lost = repairs
-    one.end.submit(0, b"second", air.now)
+    one.end.messages.submit(0, b"second", air.now)
     air.run(60.0)
     assert two.delivered() == []
     air.lost = lambda *_: False
@@ -77,10 +86,10 @@ def test_a_receiver_goes_on_when_its_sender_is_gone() -> None:
     air = Air(one, two)
     air.run(2.0)
     air.lost = lambda sender, _: sender is one
-    one.end.submit(0, b"first", air.now)
+    one.end.messages.submit(0, b"first", air.now)
     air.step()
     air.lost = lambda *_: False
-    one.end.submit(0, b"second", air.now)
+    one.end.messages.submit(0, b"second", air.now)
     air.step()
     air.robots.remove(one)
     air.run(GIVE_UP_S - 1)

@@ -8,21 +8,24 @@ import pytest
 
 from fuzz.loop import work
 from gr_ros2.core.errors import ReplayedError
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Rejected
 from gr_ros2.link.v1.decoder import RepairDecoder
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import SOURCE_ROW, SealMode
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Hello
-from gr_ros2.wire.v1 import Header, Packet, Part, Standing
+from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader
 from tests.link.v1.air import Air, Robot, keys, registry
 
 MOST_LINES = 5_000
 
 
 def hello(boot: int, number: int) -> bytes:
-    packet = Packet(Header(3, False, 1, number & 0xFFFF), (Hello(boot, number >> 16, 1, 0),), Standing(9, clear=True))
+    packet = PacketV1(
+        Header(3, False, 1, number & 0xFFFF), (Hello(boot, number >> 16, 1, 0),), RepairHeader(9, clear=True)
+    )
     return v1.encode(packet, 64, boot, number >> 16)
 
 
@@ -30,18 +33,18 @@ def test_a_forged_hello_does_not_hang_a_robot_without_a_key() -> None:
     one, two = Robot(1, registry()), Robot(2, registry())
     air = Air(one, two)
     air.run(1.0)
-    lines, events = work(lambda: two.end.receive(hello(one.boot, 0xFFFF_FFFF << 16), air.now))
+    lines, events = work(lambda: two.end.receive(ReceivedPacket(hello(one.boot, 0xFFFF_FFFF << 16)), air.now))
     assert lines < MOST_LINES
     assert isinstance(events[-1], Rejected)
     assert isinstance(events[-1].error, ReplayedError)
-    one.end.submit(0, b"still here", air.now)
+    one.end.messages.submit(0, b"still here", air.now)
     air.run(1.0)
     assert two.delivered() == [b"still here"]
     # A robot of which nothing was heard for long may have sent many packets meanwhile.
     air.robots = [two]
     air.run(12.0)
     for number in (5_000_000, (1 << 48) - 1):
-        lines, _ = work(lambda number=number: two.end.receive(hello(one.boot, number), air.now))
+        lines, _ = work(lambda number=number: two.end.receive(ReceivedPacket(hello(one.boot, number)), air.now))
         assert lines < MOST_LINES
         air.run(12.0)
 
@@ -61,22 +64,24 @@ def test_a_sealed_robot_that_comes_back_after_millions_of_packets() -> None:
         return events  # type: ignore[return-value]
 
     two.receive = counted  # type: ignore[method-assign, assignment]
-    one.end.submit(0, b"back", air.now)
+    one.end.messages.submit(0, b"back", air.now)
     air.run(3.0)
-    one.end.submit(0, b"back again", air.now)
+    one.end.messages.submit(0, b"back again", air.now)
     air.run(3.0)
     assert b"back again" in two.delivered()
     assert most < MOST_LINES
 
 
 def test_jumps_of_short_packets_cost_no_more_than_others() -> None:
-    end = Endpoint(None, Settings(2, 64, fixed=False), boot=1)
-    end.receive(hello(7, 0), 0.0)
+    end = EndpointV1(None, Settings(2, 64, fixed=False), boot=1)
+    end.receive(ReceivedPacket(hello(7, 0)), 0.0)
     trailer = keys("none").own(1, 7)
     for step in range(1, 200):
         number = step * 32_000
         data = trailer.close(v1.write_header(Header(0, False, 1, number & 0xFFFF)), b"", number, SOURCE_ROW)
-        lines, _ = work(lambda data=data, step=step: (end.receive(data, step * 0.1), end.handle_timeout(step * 0.1)))
+        lines, _ = work(
+            lambda data=data, step=step: (end.receive(ReceivedPacket(data), step * 0.1), end.handle_timeout(step * 0.1))
+        )
         assert len(data) == 8
         assert lines < MOST_LINES
 
@@ -96,8 +101,8 @@ def test_a_chain_of_repairs_is_bounded() -> None:
 def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
     """First fragments of one byte, one to a packet: what they cost is bookkeeping."""
     most = 4_000_000
-    end = Endpoint(None, Settings(2, packet_len, max_source_bytes=most), boot=1)
-    end.receive(hello(7, 0), 0.0)
+    end = EndpointV1(None, Settings(2, packet_len, max_source_bytes=most), boot=1)
+    end.receive(ReceivedPacket(hello(7, 0)), 0.0)
     trailer = keys("none").own(1, 7)
     room = v1.body_room(packet_len)
 
@@ -108,7 +113,7 @@ def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
     for number in range(1, 14_001):
-        end.receive(packet(number), number * 1e-3)
+        end.receive(ReceivedPacket(packet(number)), number * 1e-3)
     used = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert used < 1.1 * most

@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
-from gr_ros2.link.v1.endpoint import GIVE_UP_S
-from gr_ros2.link.v1.endpoint_settings import NOBODY, Settings
+from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.receiving import GIVE_UP_S
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import NOBODY, TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, MAX_TOPICS, Part, body_room, read_header
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
@@ -31,8 +32,8 @@ def test_messages_cross_both_ways_with_nothing_known_beforehand(mode: SealMode, 
     one, two = (Robot(n, registry(), mode=mode, fixed=fixed) for n in (1, 2))
     air = Air(one, two, loss=0.2)
     for number in range(60):
-        one.end.submit(ODOM, text(number), air.now)
-        two.end.submit(MAP, text(number, 300), air.now) if number % 10 == 0 else None
+        one.end.messages.submit(ODOM, text(number), air.now)
+        two.end.messages.submit(MAP, text(number, 300), air.now) if number % 10 == 0 else None
         air.run(0.03)
     air.run(2.0)
     assert two.delivered() == [text(number) for number in range(60)]
@@ -54,7 +55,7 @@ def test_nothing_but_new_packets_and_reports_leaves_without_losses() -> None:
     air.run(1.5)
     before = one.end.sent.air["new"]
     for number in range(100):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         air.run(0.05)
     assert len(two.delivered()) == 100
     assert one.end.sent.air["new"] - before == 100
@@ -65,13 +66,13 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     one, two = Robot(1, registry()), Robot(2)
     air = Air(one, two)
     air.run(1.5)
-    one.end.submit(ODOM, text(1), air.now)
+    one.end.messages.submit(ODOM, text(1), air.now)
     air.run(3 * SLOT_S)
     now = air.now
-    one.end.submit(ODOM, text(2), now)
+    one.end.messages.submit(ODOM, text(2), now)
     message = one.slot(now)
     assert message is not None
-    two.end.receive(message, now)
+    two.end.receive(ReceivedPacket(message), now)
     due = two.end.next_departure(credited=True)
     assert not two.end.urged, "a message alone lets nothing leave"
     assert due is not None
@@ -80,10 +81,10 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     later = one.end.next_departure(credited=True)
     assert later is not None
     assert later > now, "a credit alone lets nothing leave"
-    one.end.add([("late", "std_msgs/msg/String", TopicOptions())])
+    one.end.messages.add([("late", "std_msgs/msg/String", TopicOptions())])
     hello = one.slot(now)
     assert hello is not None
-    two.end.receive(hello, now)
+    two.end.receive(ReceivedPacket(hello), now)
     assert two.end.urged, "it asks for the table of topics"
     two.slot(now)
     assert not two.end.urged
@@ -97,7 +98,7 @@ def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_lo
         """How many reports leave in so many seconds of odometry."""
         before, end = two.end.sent.air["report"], air.now + seconds
         while air.now < end:
-            one.end.submit(ODOM, text(0), air.now)
+            one.end.messages.submit(ODOM, text(0), air.now)
             air.run(0.03)
         return two.end.sent.air["report"] - before
 
@@ -106,7 +107,7 @@ def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_lo
     assert reports(5.0) <= 12
     assert one.end.sent.air["repair"] == 0
     air.lost = lambda sender, _: sender is one
-    one.end.submit(ODOM, text(0), air.now)
+    one.end.messages.submit(ODOM, text(0), air.now)
     air.run(3 * SLOT_S)
     air.lost = lambda *_: False
     assert reports(1.0) >= 8
@@ -117,7 +118,7 @@ def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_f
     one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
     air = Air(one, two, loss=0.2)
     for number in range(200):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         air.run(0.1)
     air.run(3.0)
     assert len(two.delivered()) == 200
@@ -132,9 +133,9 @@ def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None
     air.run(0.5)
     lose = [True]
     air.lost = lambda *_: lose[0]
-    one.end.submit(SCAN, text(1), air.now)
+    one.end.messages.submit(SCAN, text(1), air.now)
     air.run(2 * SLOT_S)
-    one.end.submit(SCAN, text(2), air.now)
+    one.end.messages.submit(SCAN, text(2), air.now)
     air.run(2 * SLOT_S)
     lose[0] = False
     air.run(0.5)
@@ -146,7 +147,7 @@ def test_an_end_without_an_id_listens(mode: SealMode) -> None:
     one, listener = Robot(1, registry(), mode=mode, hears=False), Robot(NOBODY, mode=mode, hears=False)
     air = Air(one, listener)
     air.run(0.5)
-    one.end.submit(SCAN, text(1), air.now)
+    one.end.messages.submit(SCAN, text(1), air.now)
     air.run(0.5)
     assert listener.delivered() == [text(1)]
     assert not listener.end.sent.air
@@ -158,10 +159,10 @@ def test_a_message_waits_for_an_earlier_one_and_not_for_ever() -> None:
     air.run(0.5)
     lose = [True]
     air.lost = lambda *_: lose[0]
-    one.end.submit(ODOM, text(1), air.now)
+    one.end.messages.submit(ODOM, text(1), air.now)
     air.run(4 * SLOT_S)  # a hello and the table of topics may go before it
     lose[0] = False
-    one.end.submit(ODOM, text(2), air.now)
+    one.end.messages.submit(ODOM, text(2), air.now)
     air.run(0.2)
     assert two.delivered() == []
     assert two.end.next_timeout() is not None
@@ -175,7 +176,7 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips(delay: 
     topics = registry(odom=TopicOptions(), map=LATCHED)
     one, two, late = Robot(1, topics), Robot(2), Robot(3)
     air = Air(one, two, delay=delay)
-    one.end.submit(1, text(1, 700), air.now)
+    one.end.messages.submit(1, text(1, 700), air.now)
     air.run(20.0)
     assert two.delivered() == [text(1, 700)]
     sent = one.end.sent.air["new"]
@@ -199,7 +200,7 @@ def test_several_messages_are_kept_of_a_topic_whose_depth_is_set(hears: bool) ->
     air = Air(one, two)
     sent = [text(number) for number in range(5)]
     for payload in sent:
-        one.end.submit(1, payload, air.now)
+        one.end.messages.submit(1, payload, air.now)
         air.run(1.0)
     air.run(20.0)
     assert two.delivered() == sent
@@ -220,8 +221,8 @@ def test_an_earlier_map_never_comes_after_a_later_one(hears: bool) -> None:
     one, two = Robot(1, topics, **settings), Robot(2, hears=hears)
     air = Air(one, two, loss=0.2)
     for number in range(3):
-        one.end.follow(1, reliable=True, latched=True, depth=10)
-        one.end.submit(1, text(number, 300), air.now)
+        one.end.messages.follow(1, reliable=True, latched=True, depth=10)
+        one.end.messages.submit(1, text(number, 300), air.now)
         air.run(20.0)
     assert two.delivered() == [text(number, 300) for number in range(3)]
     rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
@@ -231,7 +232,7 @@ def test_an_earlier_map_never_comes_after_a_later_one(hears: bool) -> None:
     air.run(20.0)
     assert two.delivered()[before:] == [text(2, 300)]
     one.start()
-    one.end.submit(1, text(2, 300), air.now)  # the mapper is still there
+    one.end.messages.submit(1, text(2, 300), air.now)  # the mapper is still there
     air.run(20.0)
     assert two.delivered()[before:] == [text(2, 300)]
 
@@ -241,19 +242,19 @@ def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_kee
     air = Air(one, two, loss=0.2)
     air.run(2.0)
     for number in range(MAX_TOPICS):
-        one.end.add([(f"topic_{number}", "std_msgs/msg/String", TopicOptions())])
-        one.end.follow(number, reliable=True, latched=number == 7)
+        one.end.messages.add([(f"topic_{number}", "std_msgs/msg/String", TopicOptions())])
+        one.end.messages.follow(number, reliable=True, latched=number == 7)
     with pytest.raises(ConfigError, match="241 topics; a link carries at most 240"):
-        one.end.add([("one_more", "std_msgs/msg/String", TopicOptions())])
+        one.end.messages.add([("one_more", "std_msgs/msg/String", TopicOptions())])
     sent = [text(number) for number in range(MAX_TOPICS)]
     for number in reversed(range(MAX_TOPICS)):
-        one.end.submit(number, sent[number], air.now)
+        one.end.messages.submit(number, sent[number], air.now)
     air.run(60.0, lambda: len(two.delivered()) == MAX_TOPICS)
     assert sorted(two.delivered()) == sorted(sent)
     rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
     assert [row.topic_id for row in rows if row.latched] == [7]
-    assert one.end.topics is not None
-    assert len(rows) == len(one.end.topics) == MAX_TOPICS
+    assert one.end.messages.topics is not None
+    assert len(rows) == len(one.end.messages.topics) == MAX_TOPICS
     late = Robot(3)
     air.robots.append(late)
     air.run(60.0, lambda: bool(late.delivered()))
@@ -265,17 +266,31 @@ def test_a_kept_message_with_the_same_bytes_as_the_one_before_comes_out_once() -
     one, two = Robot(1, registry(odom=TopicOptions(), map=LATCHED)), Robot(2)
     air = Air(one, two)
     for number in (1, 1, 2, 1):
-        one.end.submit(1, text(number), air.now)
+        one.end.messages.submit(1, text(number), air.now)
         air.run(2.0)
     assert two.delivered() == [text(1), text(2), text(1)]
     assert two.end.received.repeats >= 1
+
+
+def test_an_older_hello_makes_nobody_ask_for_what_was_replaced() -> None:
+    """A new map comes before the next hello, which names it."""
+    latched = TopicOptions(queue="latest", reliability="reliable", durability="transient_local")
+    one, two = Robot(1, registry(map=latched)), Robot(2)
+    air = Air(one, two)
+    air.run(5.0)
+    before = one.end.sent.repeats
+    for number in range(10):
+        one.end.messages.submit(0, b"map %d" % number, air.now)
+        air.run(3.7)
+    assert two.delivered() == [b"map %d" % number for number in range(10)]
+    assert one.end.sent.repeats == before
 
 
 def test_where_nobody_can_ask_what_is_kept_is_repeated() -> None:
     topics = registry(odom=TopicOptions(), map=LATCHED)
     one, late = Robot(1, topics, hears=False, repeat_s=3.0), Robot(3, hears=False)
     air = Air(one)
-    one.end.submit(1, text(1, 300), air.now)
+    one.end.messages.submit(1, text(1, 300), air.now)
     air.run(5.0)
     air.robots.append(late)
     air.run(9.0)
@@ -287,7 +302,7 @@ def test_a_robot_that_nobody_hears_falls_silent_and_is_there_for_a_newcomer() ->
     one, late = Robot(1, registry(odom=TopicOptions(), map=LATCHED)), Robot(3)
     air = Air(one)
     packets = -(-2500 // 46)
-    one.end.submit(1, text(1, 2500), air.now)
+    one.end.messages.submit(1, text(1, 2500), air.now)
     air.run(20.0)
     assert len(air.recorded) < 5 * packets
     air.run(220.0)
@@ -309,7 +324,7 @@ def test_where_nobody_reports_repair_is_bounded_by_the_losses_that_are_expected(
         air = Air(one, two, loss=0.2, seed=seed)
         air.run(3.0)
         before = one.end.sent.air["repair"]
-        one.end.submit(ODOM, text(seed), air.now)
+        one.end.messages.submit(ODOM, text(seed), air.now)
         air.run(3.0)
         assert 3 <= one.end.sent.air["repair"] - before <= 12
         missing += two.delivered() != [text(seed)]
@@ -330,7 +345,7 @@ def test_restarts_are_recovered_from_within_two_seconds(mode: SealMode, who: str
         first = number
         begin = air.now
         while air.now - begin < 2.0:
-            one.end.submit(ODOM, text(number), air.now)
+            one.end.messages.submit(ODOM, text(number), air.now)
             number += 1
             air.run(0.03)
         here = [int(payload.split()[1]) for payload in two.delivered()]
@@ -343,11 +358,11 @@ def test_a_sender_starts_before_its_receiver_and_the_other_way_round() -> None:
     for first in (0, 1):
         robots = [Robot(1, registry()), Robot(2)]
         air = Air(robots[first])
-        robots[0].end.submit(ODOM, text(0), 0.0)
+        robots[0].end.messages.submit(ODOM, text(0), 0.0)
         air.run(3.0)
         air.robots.append(robots[1 - first])
         air.run(0.2)
-        robots[0].end.submit(ODOM, text(1), air.now)
+        robots[0].end.messages.submit(ODOM, text(1), air.now)
         air.run(1.0)
         assert text(1) in robots[1].delivered()
 
@@ -359,7 +374,7 @@ def test_reports_lost_for_a_minute_cost_no_message() -> None:
     usual = air.lost
     air.lost = lambda sender, receiver: sender is two or usual(sender, receiver)
     for number in range(600):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         air.run(0.1)
     air.lost = usual
     air.run(3.0)
@@ -373,7 +388,7 @@ def test_packet_numbers_come_round() -> None:
     air.run(0.2)
     count = 66_500
     for number in range(count):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         if number % 500 < 495 or number < 64_000:
             data = one.slot(air.now)
             assert data is not None
@@ -384,7 +399,7 @@ def test_packet_numbers_come_round() -> None:
             air.step()
         if number % 20 == 0:
             air.step()
-            while (data := one.slot(air.now)) is not None and one.end.outbox.queued()[ODOM]:
+            while (data := one.slot(air.now)) is not None and one.end.messages.queued()[ODOM]:
                 two.receive(data, air.now)
     air.run(2.0)
     here = [int(payload.split()[1]) for payload in two.delivered()]
@@ -397,7 +412,7 @@ def test_packet_numbers_come_round() -> None:
 def test_a_packet_for_another_robot_is_not_ours() -> None:
     one, two, three = Robot(1, registry(), dst_id=3), Robot(2), Robot(3)
     air = Air(one, two, three)
-    one.end.submit(ODOM, text(1, 35), air.now)
+    one.end.messages.submit(ODOM, text(1, 35), air.now)
     air.run(2.0)
     assert three.delivered() == [text(1, 35)]
     assert two.delivered() == []
@@ -407,7 +422,7 @@ def test_a_packet_for_another_robot_is_not_ours() -> None:
 def test_a_long_message_is_given_up_when_its_memory_is_needed() -> None:
     one, two = Robot(1, registry(), hears=False), Robot(2, hears=False, max_source_bytes=20_000)
     air = Air(one, two)
-    one.end.submit(MAP, bytes(100_000), air.now)
+    one.end.messages.submit(MAP, bytes(100_000), air.now)
     air.run(40.0)
     lost = [event for event in two.events if isinstance(event, Lost)]
     assert lost
@@ -426,7 +441,7 @@ def test_an_announced_length_reserves_nothing() -> None:
 
 def test_a_message_beyond_the_largest_is_refused() -> None:
     one = Robot(1, registry())
-    one.end.submit(MAP, bytes(MAX_MESSAGE + 1), 0.0)
+    one.end.messages.submit(MAP, bytes(MAX_MESSAGE + 1), 0.0)
     assert [event.reason for event in one.events if isinstance(event, Refused)] == ["too_large"]
 
 
@@ -436,7 +451,7 @@ def test_a_lifespan_ends_repair_and_message() -> None:
     air = Air(one, two)
     air.run(2.5)
     air.lost = lambda *_: True
-    one.end.submit(0, text(1), air.now)
+    one.end.messages.submit(0, text(1), air.now)
     air.run(0.25)
     before = one.end.sent.air["repair"]
     assert before > 0
@@ -451,7 +466,7 @@ def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
     air = Air(one, two)
     air.run(0.5)
     air.lost = lambda *_: True
-    one.end.submit(ODOM, text(1), air.now)
+    one.end.messages.submit(ODOM, text(1), air.now)
     air.run(GIVE_UP_S - 1)
     air.lost = lambda *_: False
     air.run(1.5)
@@ -465,7 +480,7 @@ def test_what_the_air_was_spent_on_adds_up(mode: SealMode) -> None:
     one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
     air = Air(one, two, loss=0.3)
     for number in range(100):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         air.run(0.05)
     sent = [event for event in one.events if isinstance(event, SentPacket)]
     assert len(sent) == sum(one.end.sent.air.values()) == sum(robot is one for robot, _ in air.recorded)
@@ -490,15 +505,15 @@ def test_a_service_is_announced_while_it_is_offered() -> None:
     air = Air(one, two, loss=0.2)
 
     def known() -> list[str]:
-        return [row.name for row in two.end.rows(1).values()]
+        return [row.name for row in two.end.topics_of(1).values()]
 
     air.run(3.0)
     assert known() == ["odom"]
     for _ in range(3):
-        one.end.offer(1, offered=True)
+        one.end.messages.offer(1, offered=True)
         air.run(5.0, lambda: known() == ["odom", "add"])
         assert known() == ["odom", "add"]
-        one.end.offer(1, offered=False)
+        one.end.messages.offer(1, offered=False)
         air.run(5.0, lambda: known() == ["odom"])
         assert known() == ["odom"]
 
@@ -507,34 +522,34 @@ def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_
     one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
     air = Air(one, two)
     air.run(2.0)
-    assert one.end.outbox.digest == 0
-    one.end.offer(0, offered=True)
+    assert one.end.messages.digest == 0
+    one.end.messages.offer(0, offered=True)
     air.run(1.0)
-    assert [row.name for row in two.end.rows(1).values()] == ["_calls"]
-    one.end.offer(0, offered=False)
+    assert [row.name for row in two.end.topics_of(1).values()] == ["_calls"]
+    one.end.messages.offer(0, offered=False)
     air.run(1.0)
-    assert not two.end.rows(1)
+    assert not two.end.topics_of(1)
 
 
 def test_a_service_that_is_there_from_the_start_is_announced_though_packets_are_lost() -> None:
     for seed in range(5):
         one, two = Robot(1, Registry.from_rows({"add": "example_interfaces/srv/AddTwoInts"}).with_calls()), Robot(2)
-        one.end.offer(0, offered=True)
+        one.end.messages.offer(0, offered=True)
         air = Air(one, two, loss=0.5, seed=seed)
-        air.run(10.0, lambda: bool(two.end.rows(1)))  # noqa: B023 - called at once
-        assert [row.name for row in two.end.rows(1).values()] == ["add"]
+        air.run(10.0, lambda: bool(two.end.topics_of(1)))  # noqa: B023 - called at once
+        assert [row.name for row in two.end.topics_of(1).values()] == ["add"]
 
 
 def test_a_packet_is_not_repaired_after_the_lifespan_of_its_message() -> None:
     one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
     air = Air(one, two)
-    one.end.offer(0, offered=True)
+    one.end.messages.offer(0, offered=True)
     air.run(1.0)
     lose = [True]
     air.lost = lambda *_: lose[0]
     brief, long = text(1, 51), text(2, 51)  # a packet each: what shares one is repaired together
-    one.end.submit(0, brief, air.now, 0.5)
-    one.end.submit(0, long, air.now, 5.0)
+    one.end.messages.submit(0, brief, air.now, 0.5)
+    one.end.messages.submit(0, long, air.now, 5.0)
     air.run(1.0)
     lose[0] = False
     air.run(3.0)
@@ -546,13 +561,13 @@ def test_a_receiver_that_restarts_at_once_gets_no_message_twice(mode: SealMode) 
     one, two = Robot(1, registry(), mode=mode), Robot(2, mode=mode)
     air = Air(one, two)
     for number in range(20):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         air.run(4.0, lambda: text(number) in two.delivered())  # noqa: B023 - called at once
         two.start()  # before it has reported
         air.run(0.5)
     delivered = two.delivered()
     assert delivered == sorted(set(delivered), key=lambda payload: int(payload.split()[1]))
-    one.end.submit(ODOM, text(20), air.now)
+    one.end.messages.submit(ODOM, text(20), air.now)
     air.run(1.0)
     assert two.delivered()[-1] == text(20)
     assert len(delivered) >= 15
@@ -574,10 +589,10 @@ def test_no_repair_leaves_before_the_sending_thread_is_told_to_look(loss: float)
     one, two = Robot(1, registry()), Robot(2)
     air, repairs = Air(one, two, loss=loss), 0
     for number in range(600):
-        one.end.submit(ODOM, text(number), air.now)
+        one.end.messages.submit(ODOM, text(number), air.now)
         for _ in range(3):
-            if one.end.out_of_credit:
-                one.end.credit()
+            if one.end.pace.out_of_credit:
+                one.end.pace.credit()
             at, before = one.end.next_departure(), one.end.sent.air["repair"]
             air.step()
             if one.end.sent.air["repair"] > before:

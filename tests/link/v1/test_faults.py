@@ -26,7 +26,7 @@ class Traffic:
         """So long, with messages."""
         begin = self.air.now
         while self.air.now - begin < seconds:
-            self.one.end.submit(ODOM, b"%d" % self.count, self.air.now)
+            self.one.end.messages.submit(ODOM, b"%d" % self.count, self.air.now)
             self.count += 1
             self.air.run(EVERY_S)
 
@@ -63,9 +63,11 @@ def test_twenty_restarts_in_a_row(mode: SealMode, who: str) -> None:
     boots = [event.boot for event in two.events if isinstance(event, Met)]
     assert boots == sorted(boots)
     assert boots[-1] == one.boot
-    assert len(set(boots)) > 10 if who != "receiver" else set(boots) == {one.boot}
-    # Packets of a start whose hello was lost cannot be opened; nothing else is refused.
-    assert set(two.end.received.rejected) <= {"crc" if mode == "none" else "tag"}
+    least = 10 if mode != "none" else 4  # without a key, another start is taken once a second
+    assert len(set(boots)) > least if who != "receiver" else set(boots) == {one.boot}
+    # Packets of a start whose hello was lost cannot be opened, nor those of a start that is not taken yet.
+    early = {"replayed"} if mode == "none" and who == "sender" else set()
+    assert set(two.end.received.rejected) <= {"crc" if mode == "none" else "tag"} | early
 
 
 def test_what_was_on_its_way_when_a_sender_restarts_is_named() -> None:
@@ -74,7 +76,7 @@ def test_what_was_on_its_way_when_a_sender_restarts_is_named() -> None:
     traffic.run(1.0)
     usual = traffic.air.lost
     traffic.air.lost = lambda sender, receiver: sender is one or usual(sender, receiver)
-    one.end.submit(2, bytes(400), traffic.air.now)  # a map of ten packets
+    one.end.messages.submit(2, bytes(400), traffic.air.now)  # a map of ten packets
     traffic.air.run(0.02)
     traffic.air.lost = lambda sender, _: sender is two
     traffic.air.run(0.06)

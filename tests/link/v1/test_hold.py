@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.link.events import SenderEvent, SentPacket
-from gr_ros2.link.v1.endpoint import Endpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import WAITED, Hold, Period
 from gr_ros2.settings.config import TopicOptions
@@ -179,9 +179,9 @@ class Sending:
         self.events: list[SenderEvent] = []
         names = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions()) for n in range(len(periods))]
         one_way = Settings(1, packet_len=64, hears=False)
-        self.end = Endpoint(Registry(names), one_way, boot=5, observer=self.events.append)
-        self.end.use_credit()
-        self.end.credit()
+        self.end = EndpointV1(Registry(names), one_way, boot=5, observer=self.events.append)
+        self.end.pace.use_credit()
+        self.end.pace.credit()
         self.free = 0.0
         self.credit_at = inf
 
@@ -189,7 +189,7 @@ class Sending:
         """What leaves now."""
         if now >= self.credit_at:
             self.credit_at = inf
-            self.end.credit()
+            self.end.pace.credit()
         if self.end.next_packet(now) is None:
             return None
         self.free = max(now, self.free) + AIRTIME
@@ -225,11 +225,11 @@ def test_a_hold_delays_no_message_and_starves_no_repair(periods: list[float], ji
         if quiet and left and now > left[-1][0] + 4 * AIRTIME:
             break
         if now >= upcoming:
-            sending.end.submit(topic_id, bytes(size), now)
+            sending.end.messages.submit(topic_id, bytes(size), now)
             count[topic_id] += 1
             coming[topic_id] = count[topic_id] * periods[topic_id] + jitter[count[topic_id] % 8]
-        waiting = not sending.end.outbox.idle
-        free = not sending.end.out_of_credit or now >= sending.credit_at
+        waiting = not sending.end.messages.idle
+        free = not sending.end.pace.out_of_credit or now >= sending.credit_at
         kind = sending.ask(now)
         if kind is not None:
             left.append((now, kind))

@@ -9,6 +9,7 @@ from collections import Counter, deque
 import pytest
 
 from bench.hostile import GROWTH, Kind, attack
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.repair import GROUP
 from gr_ros2.settings.config import TopicOptions
@@ -18,7 +19,7 @@ from tests.link.v1.air import SLOT_S, Robot, registry
 
 TOPICS = 3
 SHORT, LONG = 3_000, (1 << 16) + 1_000
-"""Packets of a sender's lives: some end before, all others behind."""
+"""Packets of a sender's lifetimes: some end before, all others behind."""
 
 
 def topics() -> Registry:
@@ -70,7 +71,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, m
     late: deque[bytes] = deque()
 
     def hear(data: bytes) -> None:
-        for event in two.end.receive(data, now):
+        for event in two.end.receive(ReceivedPacket(data), now):
             if isinstance(event, Delivered):
                 number = sent[event.topic_id].get(event.payload)
                 assert number is not None, f"never sent: {event.payload!r}"
@@ -80,11 +81,11 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, m
 
     while serial < messages:
         now += SLOT_S
-        if rng.random() < 0.4 and sum(one.end.outbox.queued().values()) < 20:
+        if rng.random() < 0.4 and sum(one.end.messages.queued().values()) < 20:
             topic = rng.randrange(TOPICS)
             payload = message(rng, topic, serial)
             sent[topic][payload] = serial
-            one.end.submit(topic, payload, now)
+            one.end.messages.submit(topic, payload, now)
             serial += 1
         newest = one.end.window.newest
         if (newest < SHORT and rng.random() < 1 / SHORT) or newest > LONG:
@@ -109,7 +110,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, m
             hear(late.popleft())
         answer = two.slot(now)
         if answer is not None and not weather.lost():
-            one.end.receive(answer, now)
+            one.end.receive(ReceivedPacket(answer), now)
         if int(now / SLOT_S) % 8 == 0:
             one.end.handle_timeout(now)
             two.end.handle_timeout(now)
@@ -134,7 +135,7 @@ def test_nothing_is_reserved_for_a_message_that_is_announced(per_topic: int) -> 
     """The last fragments of messages of 16 MB, and of none of them anything else."""
     one, two = Robot(1, registry()), Robot(2, max_source_bytes=200_000)
     for n in range(5):
-        two.end.receive(one.slot(n * SLOT_S) or b"", n * SLOT_S)
+        two.end.receive(ReceivedPacket(one.slot(n * SLOT_S) or b""), n * SLOT_S)
     inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
     body_len, number = 30, inbox.newest
     tracemalloc.start()

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from gr_ros2.link.events import Delivered
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.packets import data_of
 
 _STEPS = st.lists(
     st.tuples(st.integers(0, 3), st.sampled_from([0, 5, 40, 45, 46, 47, 300, 1500]), st.floats(0, 0.3)),
@@ -52,22 +53,22 @@ def test_what_is_due_next_is_later(
     now = slot = 0.0
     for topic_id, size, pause in [*steps, (-1, 0, 1.5)]:
         if topic_id >= 0:
-            one.end.submit(topic_id, rng.randbytes(size), now)
+            one.end.messages.submit(topic_id, rng.randbytes(size), now)
         until = now + pause
         while now <= until:
             due = []
             if now >= slot:
                 slot = now + SLOT_S
-                one.end.credit()
-                two.end.credit()
+                one.end.pace.credit()
+                two.end.pace.credit()
             for robot, other in ((one, two), (two, one)):
                 robot.end.handle_timeout(now)
-                data = robot.end.next_packet(now)
+                data = data_of(robot.end.next_packet(now))
                 if data is not None and rng.random() >= loss:
                     other.receive(data, now)
             for robot in (one, two):
                 robot.end.handle_timeout(now)
-                out = robot.end.out_of_credit
+                out = robot.end.pace.out_of_credit
                 if out or robot.end.next_packet(now) is None:
                     departure = robot.end.next_departure()
                     assert departure is None or departure > now, "next_departure"
@@ -89,7 +90,7 @@ def ages(
         now = step * SLOT_S
         while coming and coming[0][0] <= now:
             at, topic_id, size = coming.pop(0)
-            one.end.submit(topic_id, pack(">d", at).ljust(size, b"."), now)
+            one.end.messages.submit(topic_id, pack(">d", at).ljust(size, b"."), now)
         for robot, other in ((one, two), (two, one)):
             data = robot.slot(now)
             for event in [] if data is None else other.receive(data, now):

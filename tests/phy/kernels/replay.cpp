@@ -21,7 +21,7 @@ int modem_read(const void*, const void*, int64_t, int64_t, float*, void*, void*)
 // That of modem.h.
 struct Report {
     double snr;
-    int64_t end, length, soft, points, rung;
+    int64_t end, length, soft, points, mcs;
 };
 
 static std::vector<char> taken(FILE* file, int64_t bytes) {

@@ -19,7 +19,7 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     *(("ofdm", {"fec": name}) for name in ("cc", "ldpc", "polar")),
     ("ofdm", {"payload_modulation": "64qam", "fec": "cc"}),
     ("ofdm", {"rate": "adaptive"}),
-    ("ofdm", {"rate": "adaptive", "rungs": ("qpsk-cc", "64qam-cc"), "fft_len": 128, "scramble": True}),
+    ("ofdm", {"rate": "adaptive", "rates": ("qpsk-cc", "64qam-cc"), "fft_len": 128, "scramble": True}),
     ("ofdm", {"fft_len": 256, "scramble": True}),
     ("ofdm", {"fft_len": 512, "cp_len": 256, "payload_modulation": "16qam"}),
     ("ofdm", {"carriers": 25, "pilots": (-24, -8, 8, 24), "detection_threshold": 0.5}),

@@ -96,7 +96,7 @@ def test_same_as_numpy(name: str, options: dict[str, Any], program: list[str], t
     assert wanted is not None
     assert wanted.soft is not None
     assert (searched, start, read) == (found.searched, found.start, 1)
-    assert told == [wanted.end, wanted.length, len(wanted.soft), len(wanted.points), wanted.rung]
+    assert told == [wanted.end, wanted.length, len(wanted.soft), len(wanted.points), wanted.mcs]
     assert snr == pytest.approx(wanted.snr, rel=EXACT)
     assert np.abs(soft - wanted.soft).max() <= EXACT * float(np.abs(wanted.soft).mean())
     assert phy.modem.frames.of(wanted.length).unwrap(soft) == packets[0]

@@ -97,7 +97,7 @@ def test_same_soft_bits_within_rounding(
             for reading in cut if len(head) < wanted.end else ():
                 assert reading is not None
                 assert reading.soft is None
-                assert (reading.length, reading.rung, reading.end) == (wanted.length, wanted.rung, wanted.end)
+                assert (reading.length, reading.mcs, reading.end) == (wanted.length, wanted.mcs, wanted.end)
             typical = float(np.abs(wanted.soft).mean())
             assert np.abs(found.soft - wanted.soft).max() <= EXACT * typical
             assert np.abs(found.points - wanted.points).max() <= EXACT * np.abs(wanted.points).max()
@@ -112,13 +112,13 @@ def test_same_with_packets_of_all_lengths(
 ) -> None:
     phy, fast = both(name, options, functions, monkeypatch)
     draw = random.Random(8)
-    rungs = list(zip(phy.modem.rungs, fast.rungs, strict=True))
+    rates = list(zip(phy.modem.rates, fast.rates, strict=True))
     packets = [draw.randbytes(length) for length in (1, 64, 13, 40, 2, 33, 7, 58)]
     parts = []
     for number, packet in enumerate(packets):
-        rung, fast_rung = rungs[number % len(rungs)]
-        wanted = rung.modulate(packet)
-        assert fast_rung.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+        mcs, fast_mcs = rates[number % len(rates)]
+        wanted = mcs.modulate(packet)
+        assert fast_mcs.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
         parts += [wanted, np.zeros(phy.gap)]
     samples = delayed(np.concatenate((np.zeros(400), *parts, np.zeros(400))), 0.3)
     for snr_db in (half_point(phy.computed_pdr), 40):

@@ -18,30 +18,31 @@ from gr_ros2.link.v1.endpoint_settings import MIN_PACKET_LEN
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.wire.control import ENCRYPTS, Hello
-from gr_ros2.wire.table import Row, read_table
+from gr_ros2.wire.mac_block import Block, read_block
+from gr_ros2.wire.table import AnnouncedTopic, read_table
 from gr_ros2.wire.v1 import (
     CRC_LEN,
-    HEADER_LEN,
-    QOS_STANDING,
+    QOS_REPAIR,
     TABLE_TOPIC,
     TAG_LEN,
-    Entry,
+    EntryV1,
     Header,
     Part,
-    Standing,
-    body_room,
+    RepairHeader,
     read_body,
     read_header,
-    read_standing,
+    read_repair_header,
 )
 
 _HALF = 1 << 15
 _TABLE_BYTES = 1 << 20
+_STARTS = 256
+"""Starts remembered of each robot: anybody can send hellos of new ones where no key is used."""
 _NO_KEY = "tag not checked: no key"
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Dissection:
     """What is known of a packet.
 
     :param number: the full packet number if it is known, otherwise its low 16 bits
@@ -54,12 +55,17 @@ class Look:
 
     header: Header
     number: int
-    standing: Standing | None
+    repair: RepairHeader | None
     check: str
-    entries: tuple[Entry, ...] = ()
+    entries: tuple[EntryV1, ...] = ()
     combined: bytes = b""
     hidden: bytes = b""
-    announced: tuple[Row, ...] = ()
+    announced: tuple[AnnouncedTopic, ...] = ()
+
+    @property
+    def access(self) -> Block | None:
+        """What the packet says about medium access."""
+        return read_block(self.header.block)[0] if self.header.block else None
 
     def message(self, index: int) -> Part | None:
         """An entry, if it is a message or a fragment of one."""
@@ -96,55 +102,60 @@ class Reader:
         self._current: dict[int, int] = {}
         """The boot number of each robot that is heard now, by its id."""
         self._tables: dict[int, Reassembly] = {}
-        self.topics: dict[int, dict[int, Row]] = {}
+        self.topics: dict[int, dict[int, AnnouncedTopic]] = {}
         """The topics that robots announced, by robot and topic id."""
 
     def learn(self, data: bytes) -> None:
         """Learn from a packet, whatever its position among the others, how its sender's packets are read."""
         try:
-            header, standing, start, end = self._clear(data)
-            if standing is None or not standing.clear:
+            header, repair, start, end = self._clear(data)
+            if repair is None or not repair.clear:
                 return
             hello = self._hello(header, data[start:end])
-            trailers, _ = self._check_hello(header, hello, data, start, standing.row)
+            trailers, _ = self._check_hello(header, hello, data, start, repair.row)
         except WireError:
             return
         starts = self._starts.setdefault(header.src_id, [])
         if all(known.hello.boot != hello.boot for known in starts):
             starts.append(_Start(hello, trailers, _number(header, hello)))
+        if len(starts) > _STARTS:
+            del starts[0]
+            self._current[header.src_id] = max(self._current.get(header.src_id, 0) - 1, 0)
 
-    def read(self, data: bytes) -> Look:
+    def read(self, data: bytes) -> Dissection:
         """Read one packet.
 
         :raises WireError: the bytes are not a packet, or its trailer does not belong to it
         """
-        header, standing, start, end = self._clear(data)
-        if standing is not None and standing.clear:
+        header, repair, start, end = self._clear(data)
+        if repair is not None and repair.clear:
             hello = self._hello(header, data[start:end])
             number, body = _number(header, hello), data[start:end]
-            _, check = self._check_hello(header, hello, data, start, standing.row)
+            _, check = self._check_hello(header, hello, data, start, repair.row)
             self._heard(header.src_id, hello.boot, number)
         else:
-            number, opened, check = self._open(data, header, standing, start, end)
+            number, opened, check = self._open(data, header, repair, start, end)
             if opened is None:
-                return Look(header, number, standing, check, hidden=data[start:end])
+                return Dissection(header, number, repair, check, hidden=data[start:end])
             body = opened
-        if standing is not None and standing.mask:
-            return Look(header, number, standing, check, combined=body)
+        if repair is not None and repair.mask:
+            return Dissection(header, number, repair, check, combined=body)
         entries = tuple(read_body(body, self._room(header)))
-        return Look(header, number, standing, check, entries, announced=self._announced(header.src_id, number, entries))
+        return Dissection(
+            header, number, repair, check, entries, announced=self._announced(header.src_id, number, entries)
+        )
 
-    def _clear(self, data: bytes) -> tuple[Header, Standing | None, int, int]:
+    def _clear(self, data: bytes) -> tuple[Header, RepairHeader | None, int, int]:
         """Header and other fields before the body, and where the body begins and ends."""
         header = read_header(data, self._packet_len)
         start, end = header.size, len(data) - (TAG_LEN if header.sealed else CRC_LEN)
-        if header.qos != QOS_STANDING:
+        if header.qos != QOS_REPAIR:
             return header, None, start, end
-        standing = read_standing(data, start, end)
-        return header, standing, start + standing.size, end
+        repair = read_repair_header(data, start, end)
+        return header, repair, start + repair.size, end
 
     def _room(self, header: Header) -> int:
-        return body_room(self._packet_len, sealed=header.sealed, addressed=header.size > HEADER_LEN)
+        return header.room(self._packet_len)
 
     def _hello(self, header: Header, body: bytes) -> Hello:
         entries = read_body(body, self._room(header))
@@ -175,10 +186,10 @@ class Reader:
         raise failed
 
     def _open(
-        self, data: bytes, header: Header, standing: Standing | None, start: int, end: int
+        self, data: bytes, header: Header, repair: RepairHeader | None, start: int, end: int
     ) -> tuple[int, bytes | None, str]:
         """Full packet number, body (None if it stays encrypted) and the result of the trailer check, in words."""
-        src_id, row = header.src_id, SOURCE_ROW if standing is None else standing.row
+        src_id, row = header.src_id, SOURCE_ROW if repair is None else repair.row
         starts = self._starts.get(src_id, [])
         if not starts:
             missing = f"no hello of robot {src_id} among these packets"
@@ -209,9 +220,9 @@ class Reader:
                 self._current[src_id] = at
                 known.newest = max(known.newest, number)
 
-    def _announced(self, src_id: int, number: int, entries: Sequence[Entry]) -> tuple[Row, ...]:
+    def _announced(self, src_id: int, number: int, entries: Sequence[EntryV1]) -> tuple[AnnouncedTopic, ...]:
         """The table of topics, if it has become complete and was not known yet."""
-        found: tuple[Row, ...] = ()
+        found: tuple[AnnouncedTopic, ...] = ()
         for place, part in enumerate(entries):
             if not isinstance(part, Part) or part.topic_id != TABLE_TOPIC:
                 continue

@@ -6,7 +6,7 @@ import pytest
 
 from fuzz.loop import inputs
 from gr_ros2.core.errors import WireError
-from gr_ros2.link.v1.reader import Look, Reader
+from gr_ros2.link.reader import Dissection, Reader
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.wire.control import Hello, Report
 from tests.link.v1.air import KEY, Air, Robot, registry
@@ -21,13 +21,13 @@ def talk(mode: SealMode, *, restart: bool = False) -> list[bytes]:
     for number in range(30):
         if restart and number == 15:
             one.start()
-        one.end.submit(number % 3, b"%03d " % number * (40 if number % 3 == 2 else 5), air.now)
+        one.end.messages.submit(number % 3, b"%03d " % number * (40 if number % 3 == 2 else 5), air.now)
         air.run(0.06)
     air.run(0.5)
     return list(dict.fromkeys(data for _, data in air.recorded))  # what is sent again is the same
 
 
-def read(packets: list[bytes], keys: tuple[bytes, ...] = ()) -> tuple[Reader, list[Look]]:
+def read(packets: list[bytes], keys: tuple[bytes, ...] = ()) -> tuple[Reader, list[Dissection]]:
     reader = Reader(64, keys)
     for data in packets:
         reader.learn(data)
@@ -49,7 +49,7 @@ def test_every_packet_is_checked_and_every_message_seen(mode: SealMode, restart:
     kinds = {type(entry) for look in looks for entry in look.entries}
     assert {Hello, Report} <= kinds
     assert any(look.combined for look in looks)
-    assert all(look.combined for look in looks if look.standing is not None and look.standing.mask)
+    assert all(look.combined for look in looks if look.repair is not None and look.repair.mask)
 
 
 def test_without_the_key_the_clear_part_is_shown() -> None:
@@ -57,9 +57,9 @@ def test_without_the_key_the_clear_part_is_shown() -> None:
     assert {look.check for look in looks} == {"tag not checked: no key"}
     assert not any(look.hidden for look in looks)
     _, looks = read(talk("encrypt"))
-    assert all(bool(look.hidden) != (look.standing is not None and look.standing.clear) for look in looks)
+    assert all(bool(look.hidden) != (look.repair is not None and look.repair.clear) for look in looks)
     assert {type(entry) for look in looks for entry in look.entries} >= {Hello}
-    numbers = [look.number for look in looks if look.header.src_id == 1 and look.standing is None]
+    numbers = [look.number for look in looks if look.header.src_id == 1 and look.repair is None]
     assert numbers == sorted(set(numbers))
 
 
@@ -104,3 +104,17 @@ def test_any_bytes_are_read_or_refused_by_name() -> None:
                 refused += 1
     assert taken > len(packets)
     assert refused > 3_000
+
+
+def test_forged_hellos_do_not_pile_up() -> None:
+    """Without a key, anybody can announce starts without end."""
+    reader = Reader(64)
+    for boot in range(1, 1001):
+        forger = Robot(1)
+        forger.start(boot)
+        reader.learn(forger.slot(0.0) or b"")
+    packets = talk("none")
+    for data in packets:
+        reader.learn(data)
+    assert sum(reader.read(data).check == "CRC ok" for data in packets) == len(packets)
+    assert len(reader._starts[1]) <= 256

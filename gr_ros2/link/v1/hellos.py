@@ -1,4 +1,4 @@
-"""When a robot sends hellos, what they contain, and what it requests from others.
+"""When a robot sends hellos, and what they contain.
 
 Hellos are sent at the start, several in the first second because any of them may be lost; whenever the table of topics
 changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
@@ -11,12 +11,14 @@ Invariant: a hello names a kept message only after the receivers had time to get
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from math import inf
 from typing import TypeVar
 
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.neighbours import Neighbour
+from gr_ros2.link.v1.neighbours import Neighbours
+from gr_ros2.link.v1.outbox import Outbox
+from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.wire.control import (
     CAN_HEAR,
     ENCRYPTS,
@@ -25,12 +27,9 @@ from gr_ros2.wire.control import (
     MARK_LEN,
     REPORTED,
     WANTS_PROOF,
-    Ask,
     Control,
-    Heard,
     Hello,
 )
-from gr_ros2.wire.v1 import TABLE_TOPIC
 
 _T = TypeVar("_T")
 
@@ -47,25 +46,32 @@ EAGER_S, EAGER = 0.1, 20
 messages are not delivered."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
-ASK_LEN = 3
-"""Bytes of a request for messages, without the topics."""
-ASK_S = 0.5
-"""s after which a request is repeated."""
-LOOK_S = 0.02
-"""s between two checks of what is missing."""
 
 
-class Talk:
-    """The hellos and requests of one robot.
+class Hellos:
+    """The hellos of one robot.
 
+    :param messages: gives the table of topics, and the messages that are kept
     :param encrypts: whether its packets are encrypted
     """
 
-    def __init__(self, settings: Settings, boot: int, *, encrypts: bool) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        boot: int,
+        messages: Outbox,
+        window: RepairWindow,
+        neighbours: Neighbours,
+        *,
+        encrypts: bool,
+    ) -> None:
         self._settings = settings
+        self._messages, self._window, self._neighbours = messages, window, neighbours
         self._boot = boot
         self._capabilities = settings.hears * CAN_HEAR | encrypts * ENCRYPTS
-        self._period = min(max(OFTEN_S, settings.packet_len / HELLO_BYTES_S), SELDOM_S)
+        self._rarer = 1 / settings.airtime_share
+        """By how much longer all times between hellos are than on a channel without a limit."""
+        self._period = min(max(OFTEN_S, settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._rarer
         self._pause = self._period
         """s to the next hello."""
         self._starting: deque[float] = deque()
@@ -73,15 +79,12 @@ class Talk:
         """What did not fit into the last hello and goes into a packet of its own."""
         self._mark = self._heard = self._eager = 0
         self._answering = False
-        self._look_at = -inf
-        self.lacking = False
-        """Whether other robots keep messages that this one lacked when it last looked."""
         self.due = -inf
         """When the next hello is due, s."""
 
     def start(self, now: float) -> None:
         """The first packet may be sent now."""
-        self._starting = deque(now + after for after in STARTING_S)
+        self._starting = deque(now + after * self._rarer for after in STARTING_S)
         self.due = self._starting.popleft()
 
     @property
@@ -91,7 +94,7 @@ class Talk:
 
     def met(self, now: float) -> None:
         """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
-        self._starting = deque(now + after for after in STARTING_S[1:])
+        self._starting = deque(now + after * self._rarer for after in STARTING_S[1:])
         self._eager = EAGER
         self.answer(now)
 
@@ -116,49 +119,40 @@ class Talk:
             return late >= 0
         if self._starting:
             return late >= latency * LATENCY_S
-        return late > (SELDOM_S if heard else OFTEN_S / 2) + latency * LATENCY_S
+        return late > (SELDOM_S if heard else OFTEN_S / 2) * self._rarer + latency * LATENCY_S
 
-    def hello(
-        self,
-        room: int,
-        turns: int,
-        digest: int,
-        marks: Sequence[tuple[int, int]],
-        *,
-        heard: Sequence[Heard],
-        wants: bool,
-        reported: bool,
-        lone: bool,
-        now: float,
-    ) -> list[Control]:
+    @property
+    def lone(self) -> bool:
+        """Whether no robot is heard, though one could be."""
+        return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours)
+
+    def entries(self, room: int, now: float) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
 
-        Where ``heard`` does not fit beside a hello, it goes into the next packet, alone.
+        What proves to other robots that they were heard goes into the next packet, alone, where it does not fit.
 
         :param room: bytes free for it
-        :param turns: how often the packet number has wrapped around
-        :param digest: CRC-32 of the table of topics
-        :param marks: marks of the kept messages
-        :param heard: what proves to the other robots that they were heard
-        :param wants: whether such a proof of another robot is missing here
-        :param reported: whether robots report to this one
-        :param lone: whether nobody is heard, though somebody could be
         """
+        window, neighbours = self._window, self._neighbours
+        wants = neighbours.unproven
         self._answering = False
         if self._apart:
             apart, self._apart = self._apart, []
             self.due = self._next(now, wants=wants)
             return apart
         free = room - HELLO_LEN
-        self._pause = min(2 * self._pause, LONE_S) if lone and not self._starting else self._period
+        lone = self.lone and not self._starting
+        self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else self._period
+        marks, heard = self._messages.marks(now), neighbours.heard(window.newest)
         proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
         if free < HEARD_LEN:
             self._apart, proofs = [*proofs], []
         free -= len(proofs) * HEARD_LEN
         named, self._mark = _in_turn(marks, self._mark, free // MARK_LEN)
         self.due = now if self._apart else self._next(now, wants=wants)
+        reported = window.reported and self._settings.repair != "off"
         capabilities = self._capabilities | reported * REPORTED | wants * WANTS_PROOF
-        return [Hello(self._boot, turns, capabilities, digest, tuple(named)), *proofs]
+        return [Hello(self._boot, window.newest >> 16, capabilities, self._messages.digest, tuple(named)), *proofs]
 
     def _next(self, now: float, *, wants: bool) -> float:
         """When the next hello is due, s."""
@@ -166,27 +160,7 @@ class Talk:
         if not wants or not self._eager:
             return due
         self._eager -= 1
-        return min(due, now + EAGER_S)
-
-    def asks(self, neighbours: Iterable[Neighbour], now: float, room: int) -> list[Ask]:
-        """Requests for messages that other robots keep and this one lacks, as many as ``room`` bytes hold."""
-        found: list[Ask] = []
-        if now < self._look_at or not self._settings.hears:
-            return found
-        self._look_at = now + LOOK_S
-        self.lacking = False
-        for neighbour in neighbours:
-            hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
-            lacking = [mark[0] for mark in hello.marks if inbox.lacks(mark, now)]
-            if hello.digest and hello.digest != inbox.digest and inbox.lacks((TABLE_TOPIC, hello.digest), now):
-                lacking.append(TABLE_TOPIC)
-            self.lacking = self.lacking or bool(lacking)
-            wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
-            if wanted and room >= ASK_LEN + len(wanted):
-                room -= ASK_LEN + len(wanted)
-                found.append(Ask(neighbour.src_id, wanted))
-                asked.update(dict.fromkeys(wanted, now + ASK_S))
-        return found
+        return min(due, now + EAGER_S * self._rarer)
 
 
 def _in_turn(items: Sequence[_T], turn: int, most: int) -> tuple[list[_T], int]:

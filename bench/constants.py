@@ -1,0 +1,162 @@
+"""What each rule and tuned constant of the engine of version 1 gains: every promise of the docs with it switched off,
+halved and doubled, one at a time, over the same messages and losses.
+
+A *promise* is a figure of which less is better, of one seed. A change is shown where its mean over the seeds is at
+least ``SHOWN`` and the 95 % interval of the paired differences (Student's t) leaves out zero. A rule that shows no such
+gain on any promise does not earn its place.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from math import exp, isfinite, log, sqrt
+from statistics import mean, stdev
+from typing import Any
+
+from bench import repair, repair_backlog, saturated
+from bench.rows import Row
+
+SEEDS = range(1, 7)
+SECONDS = 20.0
+"""s of a run."""
+SHOWN = 0.03
+"""Relative change of a promise from which on a rule earns its place."""
+_T = 2.571
+"""97.5 % quantile of Student's t with 5 degrees of freedom."""
+
+Patch = tuple[str, str, Any]
+"""Module of ``gr_ros2.link.v1``, name in it (a dot leads into a class), and its value."""
+
+
+def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list[Patch]]]:
+    value = getattr(import_module(f"gr_ros2.link.v1.{module}"), name)
+    for factor in factors or (0.5, 2.0):
+        new = type(value)(value * factor)
+        yield f"{name} = {new:.4g}, not {value:.4g}", [(module, name, new)]
+
+
+RULES: dict[str, list[Patch]] = {
+    "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime: now)],
+    "no repair ahead of reports": [("repair", "AHEAD", 0.0)],
+    "no early reports": [("repair", "PROMPT", 2.0), ("reports", "PROMPT", 2.0)],
+    "no share of repairs for short messages": [("repair", "TURN", 1 << 30)],
+    "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
+    "no turns of topics": [("freshness", "TURN", 1 << 30)],
+    "long messages by value alone": [("outbox", "LONG", 1 << 30)],
+    "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
+}
+CONSTANTS = (
+    ("repair", "GROUP"), ("repair", "AHEAD"), ("repair", "TURN"), ("repair", "_DELAYS"),
+    ("repair", "_ENOUGH"), ("repair", "_MOST_AHEAD"),
+    ("repair", "_SOON"), ("repair", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
+    ("freshness", "LARGE"), ("outbox", "SHARE"), ("outbox", "MIN_FRAGMENT"), ("outbox", "LONG"),
+    ("outbox", "WORTH"), ("outbox", "REPORTED_DEPTH"), ("outbox", "UNREPORTED_DEPTH"),
+)  # fmt: skip
+
+
+def _six(seed: int) -> float:
+    topics, _ = saturated.run("six-topics-paced", 0.2, seed=seed, seconds=SECONDS)
+    return exp(mean(log(topic.age) for topic in topics))
+
+
+def _paced(name: str, seed: int, *, back: bool) -> float:
+    ages = saturated.paced(name, 0.2, back=back, seed=seed, best_effort=())
+    return exp(mean(log(age) for age in ages.values()))
+
+
+def promises(seed: int) -> dict[str, float]:
+    """The figures of the docs' promises with one seed; less is better."""
+    repair_backlog.run.cache_clear()
+    found: dict[str, float] = {}
+
+    def add(name: str, **settings: Any) -> None:
+        outcome = repair.run(seed=seed, repair="auto", seconds=SECONDS, **settings)
+        found[f"{name}: age"], found[f"{name}: p99"] = outcome.age, outcome.p99
+        found[f"{name}: packets"] = outcome.packets
+
+    add("odometry, reports", loss=0.2, back=0.2)
+    add("odometry, one way", loss=0.2)
+    add("odometry, bursts", loss=0.2, back=0.2, burst=3.0)
+    add("odometry, 5 %", loss=0.05, back=0.05)
+    add("busy", hz=55.0, loss=0.1, back=0.1)
+    add("15 packets", hz=3.0, size=700, loss=0.2, back=0.2)
+    add("15 packets, one way", hz=3.0, size=700, loss=0.2)
+    for reports in (True, False):
+        beside = repair_backlog.run((300_000, 1), 0.2, reports=reports, seed=seed)
+        way = "reports" if reports else "one way"
+        found[f"beside 300 kB, {way}: age"], found[f"300 kB, {way}: s"] = beside.age, beside.done
+    found["six topics, full"] = _six(seed)
+    found["odometry, full"] = saturated.run("narrow-ofdm-paced", 0.2, seed=seed, seconds=SECONDS)[0][0].age
+    found["paced, one way"] = _paced("paper-ofdm-paced", seed, back=False)
+    found["paced, reports"] = _paced("paper-ofdm-paced", seed, back=True)
+    found["paced, six topics"] = _paced("six-topics-paced", seed, back=False)
+    return found
+
+
+@contextmanager
+def patched(patches: Sequence[Patch]) -> Iterator[None]:
+    """The engine with other constants or without rules, wherever they are imported."""
+    before: list[tuple[Any, str, Any]] = []
+    for module, name, value in patches:
+        place = import_module(f"gr_ros2.link.v1.{module}")
+        first, _, rest = name.partition(".")
+        if rest:
+            holders = [getattr(place, first)]
+        else:
+            known = getattr(place, name)
+            engine = [m for key, m in list(sys.modules.items()) if key.startswith("gr_ros2.link.v1.")]
+            public = not name.startswith("_") and sum(hasattr(m, name) for m in engine) > 1
+            holders = [m for m in engine if getattr(m, name, None) is known and public] or [place]
+        for holder in holders:
+            before.append((holder, rest or name, getattr(holder, rest or name)))
+            setattr(holder, rest or name, value)
+    try:
+        yield
+    finally:
+        for holder, name, value in reversed(before):
+            setattr(holder, name, value)
+
+
+def _measure(job: tuple[str, int]) -> tuple[str, int, dict[str, float]]:
+    name, seed = job
+    with patched(variants()[name]):
+        return name, seed, promises(seed)
+
+
+@cache
+def variants() -> dict[str, list[Patch]]:
+    """What is changed, by name; the first changes nothing."""
+    scaled = [item for module, name in CONSTANTS for item in _scaled(module, name)]
+    return {"": [], **RULES, **dict(scaled)}
+
+
+def changes(own: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
+    """Mean relative change of a promise and half of its 95 % interval; nan where something was never delivered."""
+    shares = [b / a - 1 for a, b in zip(own, other, strict=True)]
+    if not all(map(isfinite, shares)):
+        return float("inf"), 0.0
+    return mean(shares), _T * stdev(shares) / sqrt(len(shares))
+
+
+def constants(chosen: Callable[[str], bool] = lambda _: True) -> list[Row]:
+    """One row per variant: the promises that it changes."""
+    names = [name for name in variants() if not name or chosen(name)]
+    found: dict[str, dict[int, dict[str, float]]] = {name: {} for name in names}
+    with ProcessPoolExecutor(2) as pool:
+        for name, seed, figures in pool.map(_measure, [(name, seed) for name in names for seed in SEEDS]):
+            found[name][seed] = figures
+    rows = []
+    for name in names[1:]:
+        notes, worst = [], 0.0
+        for promise in found[""][SEEDS[0]]:
+            change, half = changes(*([found[n][seed][promise] for seed in SEEDS] for n in ("", name)))
+            if abs(change) >= SHOWN and abs(change) > half:
+                notes.append(f"{promise} {change:+.1%}")
+                worst = max(worst, change)
+        rows.append(Row(f"constants: {name}: worst change", worst * 100, "%", form="{:.1f}", note=", ".join(notes)))
+    return rows

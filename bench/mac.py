@@ -1,0 +1,212 @@
+"""Medium access at packet level: one cell, hidden robots, robots that come, go and move; beside ALOHA, CSMA and SOTDMA.
+
+75 packets/s, 10 Hz of one-packet messages per robot, 10 ms from hearing to sending, guard 1 ms.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable, Sequence
+from statistics import mean
+
+from bench.mac_rivals import Csma, Sotdma
+from bench.rows import Row
+from gr_ros2.mac import Aloha, Slots
+from gr_ros2.run.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
+
+AIRTIME_S = 1 / 75
+SLOT_S = AIRTIME_S + 0.001
+SEEDS = (1, 2, 3)
+Graph = list[set[int]]
+
+
+def slots(number: int, rng: random.Random) -> Slots:
+    return Slots(number, SLOT_S, rng)
+
+
+def aloha(number: int, rng: random.Random) -> Aloha:
+    return Aloha(number, AIRTIME_S, rng)
+
+
+def line(robots: int, reach: int) -> Graph:
+    """Robots in a row of which each hears the next ``reach`` on both sides."""
+    return [{j for j in range(robots) if j != i and abs(i - j) <= reach} for i in range(robots)]
+
+
+def within(places: Sequence[tuple[float, float]], reach: float) -> Graph:
+    """Robots that hear whom they are near."""
+    return [
+        {j for j, there in enumerate(places) if j != i and math.dist(here, there) <= reach}
+        for i, here in enumerate(places)
+    ]
+
+
+def at_random(robots: int, reach: float, seed: int) -> Graph:
+    """Robots in a square of 1 × 1 that all reach each other over some hops."""
+    rng = random.Random(seed)
+    while True:
+        graph = within([(rng.random(), rng.random()) for _ in range(robots)], reach)
+        seen, queue = {0}, [0]
+        for one in queue:
+            queue += graph[one] - seen
+            seen |= graph[one]
+        if len(seen) == robots:
+            return graph
+
+
+def joined(each: int) -> Graph:
+    """Two cells with one robot that hears both."""
+    graph = [set(range(each)) - {i} | {2 * each} for i in range(each)]
+    graph += [set(range(each, 2 * each)) - {i} | {2 * each} for i in range(each, 2 * each)]
+    return [*graph, set(range(2 * each))]
+
+
+HIDDEN: dict[str, tuple[Graph, float]] = {
+    "three in a row": (line(3, 1), 3),
+    "line of 10": (line(10, 1), 5),
+    "grid of 5 × 4": (within([(x, y) for x in range(5) for y in range(4)], 1.5), 5),
+    "50 at random": (at_random(50, 0.25, 4), 5),
+    "two cells of 8, one robot between": (joined(8), 3),
+}
+"""Graph, and the target without other losses in %."""
+LOSSY = 8
+"""Target in % with 10 % of the packets lost."""
+
+
+def moving(speed: float, seed: int) -> Callable[[float], Graph]:
+    """Twenty robots that drive from one random place to the next in 160 × 160 m, and hear each other within 50 m."""
+    rng = random.Random(seed)
+    places = [(rng.uniform(0, 160), rng.uniform(0, 160)) for _ in range(20)]
+    goals = [(rng.uniform(0, 160), rng.uniform(0, 160)) for _ in range(20)]
+    state: list[tuple[float, Graph]] = [(0.0, within(places, 50))]
+
+    def graph(now: float) -> Graph:
+        while now >= state[0][0] + 0.5:
+            for robot, (place, goal) in enumerate(zip(places, goals, strict=True)):
+                way, step = math.dist(place, goal), speed * 0.5
+                if way <= step:
+                    places[robot], goals[robot] = goal, (rng.uniform(0, 160), rng.uniform(0, 160))
+                elif way:
+                    share = step / way
+                    places[robot] = place[0] + (goal[0] - place[0]) * share, place[1] + (goal[1] - place[1]) * share
+            state[0] = state[0][0] + 0.5, within(places, 50)
+        return state[0][1]
+
+    return graph
+
+
+def swarm(
+    graph: Graph | Callable[[float], Graph],
+    config: SwarmConfig,
+    make: Callable[..., Slots | Aloha] = slots,
+    **times: float,
+) -> Swarm:
+    return Swarm(make, HearingGraph(graph, config), config, **times).run()
+
+
+def cells() -> list[Row]:
+    """One cell: messages/s per receiver, mean age, Jain, collisions, and what others carry."""
+    rows = []
+    targets = {20: (57, 0.26), 50: (60, 0.5)}
+    for robots in (2, 5, 10, 20, 50):
+        ran = [swarm(fully_meshed(robots), SwarmConfig(seed=seed)) for seed in SEEDS]
+        rate, age = mean(one.rate for one in ran), mean(one.age for one in ran)
+        least, most = targets.get(robots, (0, 0))
+        what = f"{robots} robots"
+        rows.append(Row(f"{what}: messages/s", rate, "", "≥" if least else None, least, "{:.1f}"))
+        rows.append(Row(f"{what}: mean age", age, "s", "≤" if most else None, most, "{:.3f}"))
+        rows.append(Row(f"{what}: Jain", min(one.jain for one in ran), "", "≥", 0.99, "{:.3f}"))
+        collided = max(one.lost("collision", "sending") for one in ran)
+        rows.append(Row(f"{what}: receptions that collide", collided, "", "=" if robots == 20 else None, 0))
+        last = max(max(one.first_heard.values()) if len(one.first_heard) == robots else math.inf for one in ran)
+        rows.append(Row(f"{what}: all heard from cold", last, "s", "≤" if robots == 50 else None, 15, "{:.1f}"))
+        others = {
+            "ALOHA": mean(swarm(fully_meshed(robots), SwarmConfig(seed=seed), aloha).rate for seed in SEEDS),
+            "CSMA": max(mean(Csma(robots, seed, window).rate() for seed in SEEDS) for window in (0.5, 1, 2, 4, 8)),
+            "SOTDMA": mean(Sotdma(robots, seed).rate() for seed in SEEDS),
+        }
+        rows += [Row(f"{what}: {name}, messages/s", value, form="{:.1f}") for name, value in others.items()]
+        if robots == 20:
+            best = max(others["ALOHA"], others["CSMA"])
+            rows.append(Row(f"{what}: times the best of ALOHA and CSMA", rate / best, "", "≥", 3.5, "{:.1f}"))
+            rows.append(Row(f"{what}: times SOTDMA", rate / others["SOTDMA"], "", "≥", 1, "{:.2f}"))
+    ran = [swarm(fully_meshed(10), SwarmConfig(seed=seed, loss=0.05)) for seed in SEEDS]
+    rows.append(Row("10 robots, 5 % lost: messages/s", mean(one.rate for one in ran), "", "≥", 50, "{:.1f}"))
+    return rows
+
+
+def hidden() -> list[Row]:
+    """Share of receptions that collide."""
+    rows = []
+    for loss in (0.0, 0.1):
+        for name, (graph, target) in HIDDEN.items():
+            ran = [swarm(graph, SwarmConfig(seed=seed, loss=loss)) for seed in SEEDS]
+            most = LOSSY if loss else target
+            note = f"mean age {mean(one.age for one in ran):.2f} s"
+            what = f"{name}, {100 * loss:.0f} % lost: collide"
+            rows.append(Row(what, 100 * mean(one.collided for one in ran), "%", "≤", most, "{:.1f}", note))
+    for speed in (0, 2, 10):
+        ran = [swarm(moving(speed, seed), SwarmConfig(seed=seed, loss=0.02), t1=100) for seed in SEEDS]
+        collided = 100 * mean(one.collided for one in ran)
+        rows.append(Row(f"20 robots at {speed} m/s, 2 % lost: collide", collided, "%", "≤", 5, "{:.1f}"))
+    return rows
+
+
+def changes() -> list[Row]:
+    """A newcomer, one that leaves, clocks, a host that freezes, and two groups that meet."""
+    rows = []
+    heard, back = [], []
+    for seed in SEEDS:
+        one = swarm(fully_meshed(20), SwarmConfig(seed=seed, present={19: (30.0, math.inf), 5: (0.1, 50.0)}))
+        heard.append(one.first_heard.get(19, math.inf) - 30)
+        back.append(sum(54 <= at < 64 for times in one.heard_at.values() for at in times) / 10 / 18)
+    rows.append(Row("newcomer among 19: heard after", max(heard), "s", "≤", 1.1, "{:.2f}"))
+    rows.append(Row("messages/s from 4 s after one leaves", min(back), "", "≥", 57, "{:.1f}"))
+    for what, config in (
+        ("±50 ppm", {"ppm": 50.0, "jitter_s": 0.0005}),
+        ("a clock jumps by 1 s, after 5 s", {"jumps": [(15.0, 2, 1.0)]}),
+        ("a host freezes for 1 s, after 5 s", {"frozen": [(14.0, 2, 1.0)]}),
+    ):
+        ran = [swarm(fully_meshed(20), SwarmConfig(seed=seed, **config)) for seed in SEEDS]  # type: ignore[arg-type]
+        rows.append(
+            Row(
+                f"20 robots, {what}: receptions that collide",
+                max(one.lost("collision", "sending") for one in ran),
+                "",
+                "=",
+                0,
+            )
+        )
+    apart = [set(range(5)) - {n} for n in range(5)] + [set(range(5, 10)) - {n} for n in range(5, 10)]
+    together = fully_meshed(10)
+    ran = [swarm(lambda now: apart if now < 15 else together, SwarmConfig(seed=seed)) for seed in range(1, 9)]
+    rows.append(
+        Row(
+            "two groups of 5, 5 s after they meet: collide",
+            max(one.lost("collision", "sending") for one in ran),
+            "",
+            "=",
+            0,
+        )
+    )
+    return rows
+
+
+def scale() -> list[Row]:
+    """255 robots that each hear about ten, and the cost of a packet heard."""
+    config = SwarmConfig()
+    made = Swarm(slots, HearingGraph(at_random(255, 0.125, 1), config), config, t1=100)
+    began = time.process_time()
+    made.run()
+    seconds = time.process_time() - began
+    sent = sum(robot.sent for robot in made.robots)
+    return [
+        Row("255 robots: s for 150,000 packets", seconds * 150_000 / sent, "s", "≤", 60, note=f"{sent:,} packets"),
+    ]
+
+
+def mac() -> list[Row]:
+    """All of it."""
+    return [*cells(), *hidden(), *changes(), *scale()]

@@ -1,0 +1,185 @@
+"""What a link does right now, as tables; `gr-ros2 status` and `gr-ros2 peers`, which ask a running link for it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import click
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.control_socket import request, running_programs
+from gr_ros2.core.errors import ConfigError, RunError
+
+STATUS, PING = "status", "ping"
+"""Questions to the control socket of a link."""
+_EVERY_S = 0.5
+
+Stats = Mapping[str, Any]
+
+pid_option = click.option("--pid", type=int, help="Process of the link, where several run.")
+json_option = click.option("--json", "as_json", is_flag=True, help="One line of JSON instead of tables.")
+
+
+def tables(stats: Stats) -> Group:
+    """Who is heard, what crosses, and what the airtime is used for.
+
+    :param stats: from :meth:`gr_ros2.radio.robot_link.RobotLink.stats`
+    """
+    return Group(_heading(stats), peer_table(stats["peers"]), _topic_table(stats), *_air(stats), *_troubles(stats))
+
+
+def _heading(stats: Stats) -> str:
+    phy = stats["phy"]
+    rate = f" at {phy['sample_rate']:,.0f} samples/s" if phy["sample_rate"] else ""
+    mcs = f", {phy['mcs']}" if "mcs" in phy else ""
+    where = f"{stats['front_end']['name']}, {phy['name']}{rate}{mcs}"
+    return f"robot {stats['source']['src_id']} ({stats['name']}) on {where}, for {stats['uptime_s']:.0f} s"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("robot", "topic", "dropped", "state") else "right")
+    return table
+
+
+def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
+    """The robots that were heard."""
+    if not peers:
+        return "nobody heard yet (gr-ros2 link --check says why)"
+    table = _table("robot", "state", "heard ago", "SNR", "packets lost", "topics", "sealed")
+    for peer in peers:
+        table.add_row(
+            str(peer["robot"]),
+            "silent" if peer["silent"] else "heard",
+            _seconds(peer["heard_s"]),
+            _decibels(peer["snr_db"]),
+            f"{peer['loss']:.1%}",
+            str(peer["topics"]),
+            "yes" if peer["sealed"] else "no",
+        )
+    return table
+
+
+def _topic_table(stats: Stats) -> Table | str:
+    table = _table("topic", "messages", "age", "latency", "waiting", "dropped")
+    for name, topic in stats["source"]["topics"].items():
+        lost = {**topic["refused"], "lost_on_graph": topic["lost_on_graph"]}
+        table.add_row(f"→ {name}", str(topic["sent"]), "", "", str(topic["queued"]), _reasons(lost))
+    for name, topic in stats["sink"]["topics"].items():
+        recent = topic["recent_latency_s"]
+        latency = "" if recent is None else _seconds(recent["p50"])
+        age = "" if topic["age_s"] is None else _seconds(topic["age_s"])
+        table.add_row(f"← {name}", str(topic["delivered"]), age, latency, "", _reasons(topic["lost"]))
+    return table if table.row_count else "no topics yet"
+
+
+def _air(stats: Stats) -> list[str]:
+    air = stats["source"]["air"]
+    total = sum(air.values())
+    shares = ", ".join(f"{kind} {count / total:.0%}" for kind, count in air.items()) if total else "nothing"
+    packets = stats["packets"]
+    return [
+        f"packets sent: {packets['out']} ({shares}), {packets['backlog']} wait; received: {stats['sink']['packets']}"
+    ]
+
+
+def _troubles(stats: Stats) -> list[str]:
+    sink, packets = stats["sink"], stats["packets"]
+    lost = {
+        **stats["front_end"]["lost"],
+        **{f"refused: {reason}": count for reason, count in sink["rejected"].items()},
+        "damaged": packets["damaged"],
+        "not sent": packets["refused"],
+        "not published": sink["publish_failed"],
+    }
+    words = _reasons(lost)
+    return ([f"dropped: {words}"] if words else []) + list(stats.get("findings", ()))
+
+
+def _reasons(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.1f} s" if value >= 1 else f"{value * 1e3:.0f} ms"
+
+
+def _decibels(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f} dB"
+
+
+def find_link(pid: int | None) -> int:
+    """The process of the running link.
+
+    :param pid: None: the only one of this user
+    :raises RunError: when none runs
+    :raises ConfigError: when several run
+    """
+    if pid is not None:
+        return pid
+    running = running_programs()
+    if not running:
+        raise RunError("no link of yours runs; start one with gr-ros2 link")
+    if len(running) > 1:
+        several = ", ".join(f"{pid} ({name})" for pid, name in running.items())
+        raise ConfigError(f"several run: {several}; say which with --pid")
+    return next(iter(running))
+
+
+def status_of(pid: int) -> dict[str, Any]:
+    """What a running link counts.
+
+    :raises RunError: when it has ended, or is no link
+    """
+    answer = request(pid, {STATUS: True})
+    if STATUS not in answer:
+        raise RunError(f"process {pid}: {answer.get('name', '?')} is no link")
+    found: dict[str, Any] = answer[STATUS]
+    return found
+
+
+def show_until(console: Console, look: Callable[[], Any], *, live: bool) -> None:
+    """Show something once, or again and again until Ctrl-C."""
+    if not live:
+        console.print(look(), soft_wrap=True)
+        return
+    try:
+        with Live(look(), console=console, auto_refresh=False, transient=False) as shown:
+            while True:
+                time.sleep(_EVERY_S)
+                shown.update(look(), refresh=True)
+    except KeyboardInterrupt:
+        return
+
+
+@click.command()
+@click.option("--live", is_flag=True, help="Show it again and again until Ctrl-C.")
+@pid_option
+@json_option
+def status(*, live: bool, pid: int | None, as_json: bool) -> None:
+    """What a running link does: who is heard, each topic, what the air is used for, and what is dropped and why."""
+    chosen = find_link(pid)
+    if as_json:
+        click.echo(json.dumps(status_of(chosen)))
+        return
+    show_until(make_console(), lambda: tables(status_of(chosen)), live=live)
+
+
+@click.command()
+@pid_option
+@json_option
+def peers(*, pid: int | None, as_json: bool) -> None:
+    """The robots that a running link hears, the newest first."""
+    found = status_of(find_link(pid))["peers"]
+    if as_json:
+        click.echo(json.dumps(found))
+    else:
+        make_console().print(peer_table(found), soft_wrap=True)

@@ -1,0 +1,28 @@
+"""What decides when a robot may send on a channel that it shares; the engines are in ``gr_ros2.mac``."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+
+class Access(Protocol):
+    """Medium access of one robot. All times are s of the caller's clock.
+
+    The caller asks for the departure after whatever it has told the engine, waits until then, takes a block, and sends
+    a packet that carries it at once.
+    """
+
+    def departure(self, now: float) -> float:
+        """When the next packet may begin."""
+
+    def block(self) -> bytes | None:
+        """The bytes behind the header of the packet that begins at the departure. None: nothing may begin there after
+        all; ask for the departure again."""
+
+    def hear(self, src_id: int, block: Any, began: float, *, trusted: bool = True) -> None:
+        """A packet of a robot was received.
+
+        :param block: as read, None where packets carry none
+        :param began: when its burst began
+        :param trusted: its trailer has been checked
+        """

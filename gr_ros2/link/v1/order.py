@@ -1,0 +1,170 @@
+"""The order of delivery: how long a complete message waits for an earlier one.
+
+A message of a topic with reliable publishers waits until every packet before the one in which it began is here or
+given up, unless it is known that those packets carried other topics (``gap_contents``). A sender that gets reports
+repairs a missing packet, or says that it does not any more. Only then it is given up, or when the sender is gone, or
+when the messages that wait fill the memory. From a sender without reports a missing packet is also given up ``hold_s``
+after it was missed, or at once if hardly any missing packet comes back.
+
+Invariants: messages of one topic come out in the order in which they began; the bytes that wait are bounded.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.gap_contents import GapContents
+from gr_ros2.link.v1.repair import MAP
+
+_VOID = 1024
+"""Packets noted as left out of repairs before the notes about old ones are dropped."""
+_SMOOTHING = 1 / 16
+_COST = 250
+"""Bytes beside its payload that a message takes which waits (``sys.getsizeof`` and its share of lists)."""
+
+
+@dataclass(slots=True)
+class Ready:
+    """A complete message.
+
+    :param order: number of the packet in which it began, and its place among the entries there
+    :param qos: QoS class of the packet that completed it; -1 if that packet was recovered
+    """
+
+    topic_id: int
+    order: tuple[int, int]
+    payload: bytes
+    qos: int
+    coded: bool
+    repaired: bool
+
+
+class Order:
+    """Which packets of one sender are still waited for, and the messages that wait for them.
+
+    :param decoder: knows which packets are here
+    :param first: packets before this number are neither waited for nor needed
+    :param hold_s: s that a message waits for an earlier one whose sender gets no reports
+    :param most: bytes of messages that may wait
+    :param room: bytes of the longest body
+    :ivar contents: which topics missing packets can have carried
+    :ivar told: whether the sender gets reports. It then says which packets it does not repair any more
+    :ivar low: every packet before this number is here or given up
+    :ivar wanted: every packet before this number is here, or is not repaired any more
+    :ivar held: bytes of the messages that wait
+    """
+
+    def __init__(self, decoder: RepairDecoder, first: int, hold_s: float, most: int, room: int) -> None:
+        self.told = False
+        self.low = self.wanted = first
+        self.held = 0
+        self.contents = GapContents(decoder, room)
+        self._passed: dict[int, int] = {}
+        """By topic: no missing packet before this number can have carried something of it."""
+        self._decoder = decoder
+        self._hold_s = hold_s
+        self._most = most
+        self._dead = first
+        """The sender does not repair packets before this number any more."""
+        self._void: set[int] = set()
+        """Packets that their sender has left out of a repair."""
+        self._most_void = _VOID
+        self._gaps: deque[tuple[float, int, int]] = deque()
+        """Packets that are missing: since when (s), the first and the last of them."""
+        self._recovery = 1.0
+        """Share of missing packets that are recovered in time."""
+        self._waiting: dict[int, list[Ready]] = {}
+
+    def missing(self, now: float, first: int, last: int) -> None:
+        """Note that these packets had not arrived when the sender went on."""
+        self._gaps.append((now, first, last))
+
+    def repaired_from(self, number: int) -> None:
+        """The sender does not repair packets before this number any more."""
+        self._dead = max(self._dead, number)
+
+    def left_out(self, number: int, mask: int) -> None:
+        """Note the packets that a sender has left out of a repair with holes in its window: it does not repair them.
+
+        :param mask: bit i says that packet ``number - i`` is part of it
+        """
+        for back in range(mask.bit_length()):
+            if not mask >> back & 1 and number - back not in self._decoder and number - back >= self.wanted:
+                self._void.add(number - back)
+        if len(self._void) > self._most_void:
+            self._void = {left_out for left_out in self._void if left_out >= self.wanted}
+            self._most_void = 2 * len(self._void) + _VOID
+
+    def wait(self, ready: Ready) -> None:
+        """Keep a message until nothing before it is missing."""
+        self.held += len(ready.payload) + _COST
+        self._waiting.setdefault(ready.topic_id, []).append(ready)
+
+    def settle(self, now: float) -> list[Ready]:
+        """Find up to which packet everything is here or given up; the messages that waited for that, topic by topic."""
+        decoder, void, gaps = self._decoder, self._void, self._gaps
+        newest, floor = decoder.newest, decoder.floor
+        dead = max(self._dead, floor)
+        low = max(self.low, min(dead, newest + 1))
+        while gaps and gaps[0][2] < floor:
+            gaps.popleft()
+        if self.held > self._most:
+            low = newest + 1
+        elif gaps and not self.told:
+            low = self._give_up(low, dead, now)
+        while low <= newest and (low in decoder or low in void):
+            low += 1
+        wanted = max(self.wanted, dead)
+        while wanted <= newest and (wanted in decoder or wanted in void):
+            wanted += 1
+        self.wanted = wanted
+        self.low = low
+        due: list[Ready] = []
+        may_carry = self.contents.may_carry
+        for topic_id, line in self._waiting.items():
+            if line:
+                passed = max(low, self._passed.get(topic_id, 0))
+                while passed <= newest and (passed in decoder or passed in void or not may_carry(passed, topic_id)):
+                    passed += 1
+                self._passed[topic_id] = passed
+                line.sort(key=_in_order)
+                while line and line[0].order[0] <= passed:
+                    due.append(line.pop(0))
+                    self.held -= len(due[-1].payload) + _COST
+        return due
+
+    def next_timeout(self) -> float | None:
+        """Time in s at which missing packets are given up for which messages wait."""
+        if not self.told and self._gaps and any(self._waiting.values()):
+            return self._gaps[0][0] + self._hold_s
+        return None
+
+    def without(self, topic_ids: Collection[int]) -> list[Ready]:
+        """Give up the messages that wait, except those of these topics."""
+        given_up: list[Ready] = []
+        for topic_id in [topic_id for topic_id in self._waiting if topic_id not in topic_ids]:
+            given_up += self._waiting.pop(topic_id)
+        self.held -= sum(len(ready.payload) + _COST for ready in given_up)
+        return given_up
+
+    def _give_up(self, low: int, dead: int, now: float) -> int:
+        """The number up to which missing packets are given up; also updates the share of packets that are recovered."""
+        gaps, decoder = self._gaps, self._decoder
+        while gaps and gaps[0][0] + self._hold_s <= now:
+            _, first, last = gaps.popleft()
+            for number in range(max(first, last + 1 - MAP), last + 1):  # earlier ones hardly count
+                if number in decoder:
+                    self._recovery += (1 - self._recovery) * _SMOOTHING
+                elif number >= dead and number not in self._void:
+                    self._recovery -= self._recovery * _SMOOTHING
+            low = max(low, last + 1)
+        if gaps and self._recovery < 0.5:
+            low = max(low, gaps[-1][2] + 1)
+        return low
+
+
+def _in_order(ready: Ready) -> tuple[int, int]:
+    return ready.order

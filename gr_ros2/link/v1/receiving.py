@@ -1,0 +1,291 @@
+"""What arrives: packets are opened, taken, and reported as events.
+
+Invariant: ``receive`` never raises, whatever the bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+
+from gr_ros2.core.errors import EntryKindError, NoKeyError, NotSealedError, WireError
+from gr_ros2.link.access import Access
+from gr_ros2.link.events import (
+    Delivered,
+    Gone,
+    Lost,
+    Met,
+    PacketId,
+    Received,
+    ReceivedPacket,
+    ReceiverEvent,
+    Rejected,
+)
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.rate import RateController
+from gr_ros2.link.stats import ReceiverStats
+from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.inbox import Inbox
+from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
+from gr_ros2.link.v1.outbox import Outbox
+from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
+from gr_ros2.link.v1.sending import SendingSide
+from gr_ros2.settings.config import NOBODY
+from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, REPORTED, WANTS_PROOF, About, Ask, Control, Hello, Ping, Report
+from gr_ros2.wire.mac_block import read_block
+from gr_ros2.wire.table import AnnouncedTopic
+from gr_ros2.wire.v1 import BROADCAST, Header, PacketV1, read_body, read_header
+
+GIVE_UP_S = 10.0
+"""s of silence after which a robot is regarded as gone."""
+
+
+class ReceivingSide:
+    """The receiving half of one robot.
+
+    :param rows: topics of robots that announce none
+    :param decoder_for: makes the decoder for a robot's messages from its table of topics
+    :param heard: what ``save`` stored before this start
+    :param access: is told what is heard on a channel that others share
+    :ivar stats: what arrived and what did not
+    :ivar neighbours: the robots that are heard
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        boot: int,
+        keys: Keys,
+        *,
+        rows: tuple[AnnouncedTopic, ...],
+        decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
+        access: Access | None = None,
+        heard: Mapping[int, tuple[int, int]],
+        save: Save | None,
+    ) -> None:
+        self._access = access
+        self.stats = ReceiverStats()
+        self._settings = settings
+        self._boot = boot
+        self._sealed = keys.sealed
+        self._give_up_s = GIVE_UP_S / settings.airtime_share
+        self._rows = rows
+        self._decoder_for = decoder_for
+        self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
+        """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
+        own = settings.src_id, boot
+        self.neighbours = Neighbours(
+            own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
+        )
+        self._events: list[ReceiverEvent] = []
+        self._now = -inf
+        self._sender: Neighbour | None = None
+        """The sender of the packet that is processed."""
+
+    def tell(self, sending: SendingSide, messages: Outbox, window: RepairWindow, rate: RateController | None) -> None:
+        """Use the parts of the sending half that what arrives can change."""
+        self._sending, self._messages, self._window, self._rate = sending, messages, window, rate
+
+    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+        """Take one packet; the events it causes, in order."""
+        self._now = now
+        self._receive(arrival, now)
+        events, self._events = self._events, []
+        return events
+
+    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
+        """Give up missing packets, and forget robots that are silent."""
+        self._now = now
+        for neighbour in self.neighbours:
+            self._report_all(neighbour.inbox.handle_timeout(now))
+        self.neighbours.settle(now)
+        for gone in self.neighbours.silent(now, self._give_up_s):
+            self._forget(gone.src_id)
+            gone.inbox.order.told = False
+            self._report_all(gone.inbox.handle_timeout(now))
+            self._events.append(Gone(gone.src_id, gone.boot))
+        self._messages.reported = self._window.reported
+        events, self._events = self._events, []
+        return events
+
+    def next_timeout(self) -> float | None:
+        """When ``handle_timeout`` has something to do, if no other method is called before."""
+        times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
+        times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
+        return min(times, default=None)
+
+    def unpublished(self, event: Delivered) -> Lost:
+        """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
+        neighbour = self.neighbours.get(event.src_id)
+        if neighbour is not None:
+            neighbour.inbox.marks.pop(event.topic_id, None)
+        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
+
+    def _receive(self, arrival: ReceivedPacket, now: float) -> None:
+        try:
+            header = read_header(arrival.data, self._settings.packet_len)
+            opened = self._open(arrival.data, header, now)
+            if opened is None or opened.new:  # what was here before says nothing about now
+                self._note_slot(header, arrival, trusted=opened is not None)
+            if opened is None:
+                return
+            if arrival.snr_db is not None and opened.new:
+                opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
+            proved = self._use(arrival, opened, now)
+        except WireError as error:
+            self.stats.rejected[error.kind] += 1
+            self._events.append(Rejected(arrival.data, error))
+            return
+        if opened.met or proved:
+            for early in self.neighbours.early(opened.neighbour.src_id):
+                self._receive(ReceivedPacket(early), now)
+
+    def _note_slot(self, header: Header, arrival: ReceivedPacket, *, trusted: bool) -> None:
+        """Tell medium access what was heard, and when its burst began."""
+        if self._access is None or arrival.received_at is None or header.src_id == self._settings.src_id:
+            return
+        block = read_block(header.block)[0] if header.block else None
+        self._access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+
+    def _open(self, data: bytes, header: Header, now: float) -> Opened | None:
+        own = self._settings.src_id
+        if header.src_id == own:
+            self.neighbours.check_own(data, header)
+            self.stats.dropped["own"] += 1
+            return None
+        if header.dst_id not in (BROADCAST, own) and own != NOBODY:
+            self.stats.dropped["not_for_us"] += 1
+            return None
+        if header.sealed and not self._sealed:
+            raise NoKeyError(f"a sealed packet of robot {header.src_id}, and no key is configured here")
+        if self._sealed and not header.sealed:
+            raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
+        return self.neighbours.open(data, header, now)
+
+    def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
+        """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
+        self.stats.packets += 1
+        neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
+        sending = self._sending
+        sending.heard_at = now
+        sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.requests.lacking
+        if opened.met:
+            self._meet(opened, now)
+        self._sender, inbox = neighbour, neighbour.inbox
+        if repair is None:
+            entries = read_body(opened.body, self._room(header))
+            packet = PacketV1(header, tuple(entries), encrypted=neighbour.encrypts)
+            self._arrived(arrival, neighbour, number, SOURCE_ROW, packet)
+            self._report_all(inbox.source(number, opened.body, entries, header.qos, now))
+            return False
+        if repair.mask:
+            packet = PacketV1(header, (), repair, opened.body, neighbour.encrypts)
+            self._arrived(arrival, neighbour, number, repair.row, packet)
+            oldest, new = repair.oldest, opened.new
+            self._report_all(
+                inbox.repair(number, repair.mask, repair.row, opened.body, oldest=oldest, now=now, new=new)
+            )
+            return False
+        entries = opened.entries if opened.entries is not None else read_body(opened.body, self._room(header))
+        packet = PacketV1(header, tuple(entries), repair, b"", neighbour.encrypts and not repair.clear)
+        self._arrived(arrival, neighbour, number, repair.row, packet)
+        if repair.clear:
+            neighbour.echo = arrival.data[-ECHO_LEN:], self._window.newest
+            if neighbour.hello.capabilities & WANTS_PROOF:
+                sending.hellos.answer(now)
+        proved = self.neighbours.proved(neighbour, number, entries)
+        for entry in entries:
+            if isinstance(entry, Hello):
+                inbox.order.told = self._settings.hears and entry.capabilities & REPORTED != 0
+            elif isinstance(entry, (Ask, Report)):
+                self._entry(entry)
+            elif isinstance(entry, (Ping, About)):
+                sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
+        self._report_all(inbox.heard(number, now, over=repair.oldest))
+        return proved
+
+    def _room(self, header: Header) -> int:
+        """Bytes of the longest body that can be in a packet."""
+        return header.room(self._settings.packet_len)
+
+    def _arrived(self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, row: int, packet: PacketV1) -> None:
+        """Report a packet before the events that it causes."""
+        identity = PacketId(neighbour.src_id, neighbour.boot, number, row)
+        self._events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
+
+    def _meet(self, opened: Opened, now: float) -> None:
+        """A robot is heard for the first time, or is heard again."""
+        neighbour = opened.neighbour
+        if opened.replaced is not None:
+            self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
+        self._forget(neighbour.src_id)
+        hears = neighbour.hello.capabilities & CAN_HEAR != 0
+        if hears:
+            self._window.meet(neighbour.src_id, now)
+            if self._rate is not None:
+                self._rate.meet(neighbour.src_id)
+            self._messages.reported = True
+        self._sending.met(now)
+        self._events.append(Met(neighbour.src_id, neighbour.boot, hears))
+
+    def _entry(self, entry: Control) -> None:
+        """Handle an entry that is not a message, from the sender of the packet that is processed."""
+        assert self._sender is not None
+        if isinstance(entry, Report):
+            self._reported(self._sender.src_id, entry)
+        elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
+            for topic_id in entry.topic_ids:
+                self._messages.ask(topic_id, self._now)
+
+    def _reported(self, sender: int, report: Report) -> None:
+        """A robot says which packets it has."""
+        if report.src_id != self._settings.src_id or report.boot != self._boot & 0xFFFF:
+            return
+        newest = self._window.newest
+        number = newest - ((newest - report.number) & 0xFFFF)
+        if number < 0:
+            raise EntryKindError(f"a report of packet {report.number}, which was never sent")
+        loss, now = report.loss / 128, self._now
+        self._window.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
+        self._sending.reported()
+        self._messages.reported = True
+        if self._rate is not None and report.snr_db is not None:
+            self._rate.report(sender, report.snr_db, loss, now)
+
+    def _forget(self, src_id: int) -> None:
+        """A receiver is gone, or has started again."""
+        self._window.forget(src_id)
+        if not self._window.reported:
+            self._sending.hellos.hurry(self._now)
+        if self._rate is not None:
+            self._rate.forget(src_id)
+
+    def _inbox(self, src_id: int, boot: int, first: int, room: int) -> Inbox:
+        inbox = Inbox(
+            src_id,
+            boot,
+            first,
+            room,
+            self._settings,
+            topics=self._rows,
+            decoder_for=self._decoder_for,
+            marks=self._marks.setdefault(src_id, {}),
+            stats=self.stats,
+            control=self._entry,
+        )
+        inbox.reports.tells_snr = self._rate is not None
+        return inbox
+
+    def _report_all(self, events: Sequence[ReceiverEvent]) -> None:
+        stats = self.stats
+        for event in events:
+            self._events.append(event)
+            if isinstance(event, Delivered):
+                stats.delivered[event.src_id, event.topic_id] += 1
+                stats.repaired[event.src_id, event.topic_id] += event.repaired
+            elif isinstance(event, Lost):
+                stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
+                stats.message_loss_est += 1

@@ -1,0 +1,136 @@
+"""When one robot's packets are reported to it, and what a report says.
+
+A report is due after some packets, or some time after the first of them; after a loss at once. It becomes rarer while
+nothing is lost, because it costs both ends as much as a message. While messages wait for an earlier one, reports go on:
+the last one may be lost, and with it that they wait.
+
+Invariant: a report tells state, not events, so a lost report costs nothing but time.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.order import Order
+from gr_ros2.link.v1.repair import MAP, PROMPT
+from gr_ros2.link.v1.snr import SnrFilter
+from gr_ros2.wire.control import REPORT_LEN, Report, reportable
+
+_EVERY = 5
+"""Packets received from one report to the next; more while none is lost."""
+_SMOOTHING = 1 / 32
+_PAUSE_S, _CALM_S = 0.1, 0.5
+"""s after which a report is due, even about a single packet: at first and after a loss, and at most."""
+_CALM = 1 / 128
+"""Share of lost packets up to which reports become rarer."""
+_SLOWER = 1.1
+"""By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
+must not grow faster."""
+
+
+class Reporter:
+    """The reports about one start of one robot.
+
+    :param sender: id and boot number of the robot
+    :param decoder: knows which packets are here
+    :param order: knows which packets are waited for
+    :param half_duplex: whether reports take airtime from the other end
+    :param airtime_share: part of the time that this robot may send, above 0..1
+    :ivar unreported: packets since the last report
+    :ivar loss: recent share of lost packets
+    :ivar snr: SNR of its packets
+    :ivar tells_snr: whether reports give the SNR, as an adaptive rate needs
+    """
+
+    def __init__(
+        self,
+        sender: tuple[int, int],
+        decoder: RepairDecoder,
+        order: Order,
+        *,
+        half_duplex: bool,
+        airtime_share: float = 1.0,
+    ) -> None:
+        self.unreported = 0
+        self.loss = 0.0
+        self.snr = SnrFilter()
+        self.tells_snr = True
+        self._sender = sender
+        self._decoder, self._order = decoder, order
+        self._half_duplex = half_duplex
+        self._scarce = airtime_share < 1
+        self._shortest = _PAUSE_S / airtime_share
+        self._arrived = 0
+        """Source packets that have arrived."""
+        self._missed = False
+        """Whether a packet went missing since the last report."""
+        self._reported_at = 0.0
+        self._pause = self._shortest
+        """s after which the next report is due."""
+        self._old_turn = False
+
+    def arrived(self, *, late: bool) -> None:
+        """Note a source packet.
+
+        :param late: a later one was here before
+        """
+        self.unreported += 1
+        self._arrived += 1
+        if not late:
+            self.loss -= self.loss * _SMOOTHING
+
+    def missed(self, packets: int, *, counts: bool) -> None:
+        """Note packets that have not arrived.
+
+        :param counts: whether they were lost; otherwise nobody listened
+        """
+        self._missed = True
+        if counts:
+            self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(packets, 1000)
+
+    def due(self, now: float) -> float:
+        """When the next report is due, s; infinite if there is nothing to report."""
+        if not self.unreported:
+            return self._reported_at + max(_CALM_S, self._shortest) if self._order.told and self._order.held else inf
+        half = self._half_duplex or self._scarce
+        every = _EVERY * (4 if half else 1)
+        most = min(every * self._pause / self._shortest, max(every, MAP // 2))
+        if ((self._missed or (self.tells_snr and self.snr.changed)) and not half) or self.unreported >= most:
+            return now
+        return self._reported_at + self._pause
+
+    @property
+    def helps(self) -> bool:
+        """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
+        return self.unreported > 0 and self.loss >= PROMPT and not self._half_duplex and not self._scarce
+
+    @property
+    def size(self) -> int:
+        """Bytes of a report."""
+        return REPORT_LEN + (self.tells_snr and self.snr.snr_db is not None)
+
+    def make(self, now: float) -> Report:
+        """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
+        calm = not self._missed and self.loss < _CALM and self._arrived > MAP
+        self._pause = min(self._pause * _SLOWER, max(_CALM_S, self._shortest)) if calm else self._shortest
+        self.unreported = 0
+        self._missed = False
+        self._reported_at = now
+        decoder, wanted = self._decoder, self._order.wanted
+        newest = decoder.newest
+        base = newest
+        self._old_turn = not self._old_turn
+        if self._old_turn and wanted < newest - MAP + 1:
+            base = wanted + MAP - 1
+        arrived = 0
+        for back in range(MAP):
+            number = base - back
+            if number in decoder or number < wanted:
+                arrived |= 1 << back
+        settled = wanted > base - MAP
+        loss = min(round(self.loss * 128), 127)
+        snr = self.snr
+        snr_db = snr.reported_db = reportable(snr.snr_db) if self.tells_snr and snr.snr_db is not None else None
+        src_id, boot = self._sender
+        return Report(src_id, boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss, snr_db)

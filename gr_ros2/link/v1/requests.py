@@ -1,0 +1,51 @@
+"""What a robot requests from others: messages that they keep for robots that join late, and this one lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import inf
+
+from gr_ros2.link.v1.neighbours import Neighbour
+from gr_ros2.wire.control import Ask
+from gr_ros2.wire.v1 import TABLE_TOPIC
+
+ASK_LEN = 3
+"""Bytes of a request for messages, without the topics."""
+ASK_S = 0.5
+"""s after which a request is repeated."""
+CHECK_S = 0.02
+"""s between two checks of what is missing."""
+
+
+class Requests:
+    """The requests of one robot.
+
+    :param hears: whether other robots can be heard
+    :ivar lacking: whether they keep messages that this one lacked when it last looked
+    """
+
+    def __init__(self, neighbours: Iterable[Neighbour], *, hears: bool) -> None:
+        self.lacking = False
+        self._neighbours = neighbours
+        self._check_at = -inf if hears else inf
+
+    def entries(self, room: int, now: float) -> list[Ask]:
+        """Requests, as many as ``room`` bytes hold."""
+        found: list[Ask] = []
+        if now < self._check_at:
+            return found
+        self._check_at = now + CHECK_S
+        self.lacking = False
+        for neighbour in self._neighbours:
+            hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
+            marks = list(hello.marks)
+            if hello.digest and hello.digest != inbox.announced.digest:
+                marks.append((TABLE_TOPIC, hello.digest))
+            lacking = [mark[0] for mark in marks if inbox.lacks(mark, neighbour.hello_number, now)]
+            self.lacking = self.lacking or bool(lacking)
+            wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
+            if wanted and room >= ASK_LEN + len(wanted):
+                room -= ASK_LEN + len(wanted)
+                found.append(Ask(neighbour.src_id, wanted))
+                asked.update(dict.fromkeys(wanted, now + ASK_S))
+        return found

@@ -1,0 +1,174 @@
+"""Writes packets: header, body, and the trailer that closes them; and counts and reports what leaves.
+
+Invariants: each number is used once for a source packet, and each row once per number; packets have ``packet_len``
+bytes at most, and exactly as many where all have the same length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from gr_ros2.link.events import AirKind, PacketId, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.rate import RateController
+from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.gf256 import combine
+from gr_ros2.link.v1.hold import Hold
+from gr_ros2.link.v1.repair import Lifetime, Repair, RepairWindow, Sent
+from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
+from gr_ros2.settings.config import NOBODY
+from gr_ros2.wire.v1 import (
+    BROADCAST,
+    QOS_REPAIR,
+    EntryV1,
+    Header,
+    PacketV1,
+    RepairHeader,
+    body_room,
+    read_body,
+    read_header,
+    write_body,
+    write_header,
+    write_repair_header,
+)
+
+HOP = 1
+"""Hop count of addressed packets: nothing relays them yet."""
+
+
+class PacketWriter:
+    """Writes the packets of one robot.
+
+    :param keys: keys that seal them
+    :param window: records what may be repaired, and gives out rows
+    :param rate: chooses the MCS of each packet; None for a fixed rate
+    :param stats: counts what leaves
+    :param hold: is told of new packets
+    :param observer: called with every packet
+    :param shares: packets carry blocks for medium access
+    :ivar block: that of the next packet
+    :ivar room: bytes of the longest body
+    :ivar sealed: whether packets are sealed
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        boot: int,
+        keys: Keys,
+        window: RepairWindow,
+        *,
+        rate: RateController | None,
+        stats: SenderStats,
+        hold: Hold,
+        observer: Callable[[SenderEvent], None] | None,
+        shares: bool = False,
+    ) -> None:
+        self.block = b""
+        self._shares = shares
+        self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
+        self._packet_len = settings.packet_len
+        self._window, self._rate, self._stats, self._hold, self._observer = window, rate, stats, hold, observer
+        self.sealed, self._encrypts = keys.sealed, keys.encrypts
+        self.room = room_of(settings, keys, block=shares)
+        self._end_of_body = settings.packet_len - keys.trailer_len if settings.fixed else 0
+        """Number of bytes to which the packet with its padded body extends."""
+        # An end without an id only listens and closes no packet. Its id makes no key.
+        self._trailer = Checksum(boot) if settings.src_id == NOBODY else keys.own(settings.src_id, boot)
+
+    def source(
+        self,
+        entries: list[EntryV1],
+        lifetimes: tuple[Lifetime, ...],
+        qos: int,
+        parts: tuple[SentEntry, ...],
+        now: float,
+    ) -> SentPacket:
+        """Write a packet with a number of its own.
+
+        :param lifetimes: of the messages in it; () for a packet that is not worth repairing
+        :param parts: what it carries of messages that are sent for the first time
+        """
+        number = self._window.newest + 1
+        body = write_body(entries, self.room)
+        header = self._header(qos, number)
+        clear = write_header(header)
+        data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
+        self._window.sent(number, body, data, lifetimes, now)
+        if lifetimes:
+            self._hold.left(now, self._window.loss)
+        packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
+        return self._leave(data, packet, (number, SOURCE_ROW), "new", now, parts=parts)
+
+    def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
+        """Write a packet of entries that are not messages; it stands at the newest number."""
+        window = self._window
+        row = window.take_row(window.newest)
+        if row is None:
+            return self.source([], window.exhausted(now), 0, (), now)
+        body = write_body(entries, self.room)
+        fields = RepairHeader(row, oldest=not window.unconfirmed(now), clear=clear)
+        return self._repair_packet(fields, window.newest, body, entries, kind=kind, now=now)
+
+    def repair(self, chosen: Sent | Repair, now: float) -> SentPacket:
+        """Write a combination of packets, or a packet again as it was."""
+        if isinstance(chosen, Repair):
+            number, mask, row, oldest, combined = chosen
+            return self._repair_packet(RepairHeader(row, mask, oldest), number, combined, (), kind="repair", now=now)
+        if self._shares:  # with another block it is another packet, and needs a nonce of its own
+            again = self._window.take_row(chosen.number)
+            if again is None:
+                return self.control([], "repair", now)
+            body = combine([(chosen.number, chosen.body)], again)
+            return self._repair_packet(RepairHeader(again, 1), chosen.number, body, (), kind="repair", now=now)
+        header = read_header(chosen.data, self._packet_len)
+        entries = tuple(read_body(chosen.body, self.room))
+        packet = PacketV1(header, entries, encrypted=self._encrypts)
+        return self._leave(chosen.data, packet, (chosen.number, SOURCE_ROW), "repair", now)
+
+    def _repair_packet(
+        self, repair: RepairHeader, number: int, body: bytes, entries: Sequence[EntryV1], *, kind: AirKind, now: float
+    ) -> SentPacket:
+        header = self._header(QOS_REPAIR, number)
+        clear = write_header(header) + write_repair_header(repair)
+        body = self._padded(body, clear)
+        data = self._trailer.close(clear, body, number, repair.row, plain=repair.clear)
+        encrypted = self._encrypts and not repair.clear
+        combined = body if repair.mask else b""
+        packet = PacketV1(header, tuple(entries), repair, combined, encrypted)
+        return self._leave(data, packet, (number, repair.row), kind, now)
+
+    def _leave(
+        self,
+        data: bytes,
+        packet: PacketV1,
+        place: tuple[int, int],
+        kind: AirKind,
+        now: float,
+        *,
+        parts: tuple[SentEntry, ...] = (),
+    ) -> SentPacket:
+        """A packet leaves at its place: number and row."""
+        self._stats.air[kind] += 1
+        self._stats.packets += 1
+        mcs = 0
+        if self._rate is not None:
+            mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
+            if kind in {"hello", "report"}:  # they are also for robots that are not known yet
+                mcs = 0
+        sent = SentPacket(data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs)
+        if self._observer is not None:
+            self._observer(sent)
+        return sent
+
+    def _padded(self, body: bytes, clear: bytes) -> bytes:
+        return body.ljust(self._end_of_body - len(clear), b"\0")
+
+    def _header(self, qos: int, number: int) -> Header:
+        hop = HOP if self._dst_id != BROADCAST else 0
+        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, hop, self.block)
+
+
+def room_of(settings: Settings, keys: Keys, *, block: bool) -> int:
+    """Bytes of the longest body that a robot sends."""
+    return body_room(settings.packet_len, sealed=keys.sealed, addressed=settings.dst_id != BROADCAST, block=block)

@@ -1,0 +1,35 @@
+"""Medium access: when a robot may send on a channel that it shares with others.
+
+Sans-IO: an engine is told what was heard and when it began, and says when the next packet may leave.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+from gr_ros2.link.access import Access
+from gr_ros2.mac.aloha import Aloha
+from gr_ros2.mac.slots import Slots
+from gr_ros2.wire.mac_block import read_block
+
+__all__ = ["GUARD_S", "Aloha", "Slots", "access_of", "read_block"]
+
+GUARD_S = 0.001
+"""s between two slots: twice what clocks that follow each other and bursts that begin at a time differ by."""
+
+
+def access_of(medium: str, airtime_s: float, seed: int) -> Callable[[int], Access | None]:
+    """What makes the engine of a robot from its id.
+
+    :param medium: ``exclusive``, ``slots`` or ``aloha``, see :class:`gr_ros2.settings.config.AnyLink`
+    :param airtime_s: of the longest packet
+    """
+
+    def make(src_id: int) -> Access | None:
+        rng = random.Random(f"access {seed} {src_id}")
+        if medium == "slots":
+            return Slots(src_id, airtime_s + GUARD_S, rng, period_s=0.0)
+        return Aloha(src_id, airtime_s, rng, period_s=0.0) if medium == "aloha" else None
+
+    return make

@@ -1,0 +1,61 @@
+"""Limited ALOHA: every robot sends at random times, so rarely that all of them together start a packet in two airtimes.
+
+That load carries most (Abramson 1970: 1 / 2e of the channel). The number of robots is that of those heard lately. Where
+one hears less than those should bring in its own interval, there are more than are heard, and the interval grows.
+
+Invariants: sans-IO; equal calls give equal times.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+from gr_ros2.wire.mac_block import Block
+
+LOAD = 0.5
+"""Packets that all robots together start in one airtime."""
+HEARD_S = 20.0
+"""s for which a robot counts: at 100 robots each is heard about every 8 s."""
+STEP = 0.25
+"""Logarithm of the factor by which the interval grows for each robot in whose place nothing is heard."""
+LONGEST_S = 4.0
+"""s, mean interval of a robot that hears nobody."""
+
+
+class Aloha:
+    """See the module.
+
+    :param airtime_s: s of the longest packet
+    :param period_s: s from one message to the next; a robot sends no more often
+    """
+
+    def __init__(self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float = 0.1) -> None:
+        self.src_id = src_id
+        self._airtime, self._period, self._rng = airtime_s, period_s, rng
+        self._heard: dict[int, float] = {}
+        self._packets = 0
+        self._every = period_s
+        self._next: float | None = None
+
+    def departure(self, now: float) -> float:
+        """See :class:`gr_ros2.link.access.Access`."""
+        if self._next is None:
+            robots = sum(at > now - HEARD_S for at in self._heard.values())
+            missing = math.exp(-2 * LOAD) - self._packets / robots if robots else 1.0
+            least = max(self._period, self._airtime * (1 + robots) / LOAD)
+            self._every = min(max(least, self._every * math.exp(STEP * missing)), max(LONGEST_S, least))
+            self._packets = 0
+            self._next = now + max(self._airtime, self._rng.expovariate(1 / self._every))
+        return self._next
+
+    def block(self) -> bytes | None:
+        """See :class:`gr_ros2.link.access.Access`. ALOHA says nothing to others."""
+        self._next = None
+        return b""
+
+    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:  # noqa: ARG002
+        """See :class:`gr_ros2.link.access.Access`."""
+        if trusted and src_id != self.src_id:
+            self._heard[src_id] = began
+            self._packets += 1

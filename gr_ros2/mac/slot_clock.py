@@ -1,0 +1,123 @@
+"""Where the slots lie on a robot's own clock. There is no master: the robots follow the packets that they hear.
+
+Each packet names the number of its slot mod 256 and begins when this slot begins. A packet that differs from what this
+clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference, so clocks of ±50 ppm stay together. A
+greater difference has one of three causes:
+
+- *The two robots have not met before.* Numbers are compared as on a circle: who is behind moves to the other's slots,
+  so one of two groups moves and the other stays.
+- *The other robot's clock has jumped*: it agreed before, and others still agree. It will notice, so wait for
+  ``PATIENCE_S``, and compare as above if it has not.
+- *This clock has jumped*: two robots that agreed before differ by the same, and nobody has agreed since. Move.
+
+Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
+for a packet is bounded by the number of robots heard.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from gr_ros2.wire.mac_block import SLOT_NUMBERS
+
+GAIN = 0.2
+"""Share of a difference by which the clock follows. 1 would pass on the jitter of each packet."""
+TOLERANCE = 0.25
+"""Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
+PATIENCE_S = 1.5
+"""s for which a robot whose clock has jumped may take to notice: some packets of two others."""
+MEMORY_S = 3.0
+"""s for which a robot that agreed counts as one that agrees."""
+
+
+class _Odd(NamedTuple):
+    """A robot that differs: the difference in slots, and the time in s at which it was noticed."""
+
+    error: float
+    since: float
+
+
+class SlotClock:
+    """See the module.
+
+    :param slot_s: s that a slot lasts
+    :ivar jumps: how often this clock has moved to other slots
+    """
+
+    def __init__(self, slot_s: float) -> None:
+        self.slot_s = slot_s
+        self.jumps = 0
+        self._zero: float | None = None
+        self._agreed: dict[int, float] = {}
+        self._agreed_at = float("-inf")
+        self._odd: dict[int, _Odd] = {}
+
+    @property
+    def runs(self) -> bool:
+        """Whether there are slots yet."""
+        return self._zero is not None
+
+    def start(self, now: float) -> None:
+        """Let slot 0 begin now, because nobody is heard."""
+        self._zero = now
+
+    def begin(self, slot: int) -> float:
+        """s, when a slot begins."""
+        assert self._zero is not None
+        return self._zero + slot * self.slot_s
+
+    def slot(self, now: float) -> int:
+        """The slot at a time."""
+        assert self._zero is not None
+        return int((now - self._zero) // self.slot_s)
+
+    def heard(self, src_id: int, number: int, began: float, *, trusted: bool, free: bool = False) -> int | None:
+        """Follow a packet of slot ``number`` mod 256 whose burst began at ``began`` s.
+
+        :param trusted: its trailer has been checked. Other packets move nobody who hears a robot that agrees
+        :param free: nobody follows this clock yet, and somebody follows that of the other robot
+        :return: its slot as this clock counts, None where it does not agree
+        """
+        if self._zero is None:
+            self._zero = began - number * self.slot_s
+        exact = (began - self._zero) / self.slot_s
+        error = (exact - number + SLOT_NUMBERS / 2) % SLOT_NUMBERS - SLOT_NUMBERS / 2
+        slot = round(exact - error)
+        if -TOLERANCE <= error <= TOLERANCE:
+            if trusted or not self._agreeing(began):
+                self._zero += GAIN * error * self.slot_s
+            if trusted:
+                self._agreed[src_id] = self._agreed_at = began
+                self._odd.pop(src_id, None)
+            return slot
+        if not (free and trusted) and not self._moves(src_id, error, began, trusted=trusted):
+            return None
+        self._zero += error * self.slot_s
+        self.jumps += 1
+        self._agreed = {src_id: began} if trusted else {}
+        self._agreed_at = began if trusted else float("-inf")
+        self._odd.clear()
+        return slot
+
+    def _agreeing(self, now: float) -> bool:
+        return now - self._agreed_at < MEMORY_S
+
+    def _moves(self, src_id: int, error: float, now: float, *, trusted: bool) -> bool:
+        """Whether to move to the slots of a robot that differs by ``error`` slots: below 0 if it is ahead."""
+        if not trusted:
+            return not self._agreeing(now) and error < 0
+        odd = self._odd.get(src_id)
+        if odd is None or now - odd.since > MEMORY_S or abs(odd.error - error) > 2 * TOLERANCE:
+            odd = self._odd[src_id] = _Odd(error, now)
+        if now - self._agreed.get(src_id, float("-inf")) >= MEMORY_S:
+            return error < 0
+        alike = [
+            other
+            for other, (by, since) in self._odd.items()
+            if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
+        ]
+        if len(alike) > 1:
+            return True
+        if len(self._agreed) == 1:
+            return error < 0  # nobody else can tell whose clock has jumped
+        return error < 0 and now - odd.since > PATIENCE_S

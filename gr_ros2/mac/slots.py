@@ -1,0 +1,337 @@
+"""Slots that robots derive from the packets that they hear, hidden robots included.
+
+Each packet says in which slot it stands and in which two slots its sender sends next (``wire.mac_block``). A robot
+picks its slots among those that nobody it hears has announced, and that no neighbour expects to receive in: a neighbour
+of a neighbour would destroy what that neighbour receives. Of two robots that want one slot, the lower id keeps it.
+
+*Rate.* From one send to the next there are (the most robots that this one or a neighbour hears + 2 + those that have
+entered lately) * 16 / 15 slots, and at least the period of the messages. One slot in 16 is never reserved.
+
+*Entry.* A robot without slots sends in an open slot with probability 1 / v. v grows when no neighbour names the robot
+by its next send, and shrinks with each newcomer that gets in. A neighbour names two robots a packet, newcomers first.
+
+*Who is not heard.* Two robots that always collide at a third one are never heard by it, so no map names their slots.
+Whoever a neighbour does not name for a while picks at random among the first free slots, and so does a robot that
+hears nobody.
+
+Invariants: sans-IO, the caller passes in times of its own clock, and the generator; what arrives with bytes that were
+not checked keeps its sender's announced slots free and does nothing else; the work for a packet heard is bounded by the
+slots it names and, when clocks differ, the robots heard; equal calls give equal slots.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from heapq import nsmallest
+
+from gr_ros2.mac.slot_clock import SlotClock
+from gr_ros2.wire.mac_block import (
+    LONGEST_AHEAD,
+    MAP_SLOTS,
+    NOBODY,
+    SLOT_NUMBERS,
+    Block,
+    announceable,
+    write_block,
+)
+
+OPEN = 16
+"""Every so many slots, one is never reserved."""
+LISTEN_S = 0.5
+"""s for which a robot listens before it enters."""
+HEARD_S = 3.0
+"""s for which a robot that was heard counts as heard; longer where robots send less than three times in it."""
+CHOICE = 8
+"""Free slots among which a robot picks at random where it does so."""
+MIXED = 0.02
+"""Share of picks at random where nothing calls for it: robots in step part."""
+PATIENCE = 4
+"""Packets of a neighbour without this robot's name, beyond those in which it names all its neighbours twice."""
+NAMED = 2.2
+"""Intervals for which a robot that was heard is named: one packet of it may be lost."""
+NEW = 3
+"""Intervals for which a robot that has entered leaves one slot more to those that enter after it."""
+UNSURE = 1.5
+"""Intervals without being named, of which each has two names for each robot, after which a robot may be in step with
+another one."""
+EASED = 0.97
+"""What v is multiplied by in an open slot. With twice v after an entry in vain, about one robot enters in two slots."""
+_ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 64.0, 64.0
+_NEVER = -1 << 40
+_SWEEP = 64
+
+
+class _HeardRobot:
+    """What is known of a robot that is heard."""
+
+    __slots__ = ("ahead", "entered", "heard", "last", "named", "unnamed")
+
+    def __init__(self, slot: int) -> None:
+        self.entered = slot
+        """The slot in which it was first heard since it has entered."""
+        self.last = slot
+        """The slot of its newest packet."""
+        self.heard = 0
+        """Robots that it hears."""
+        self.ahead: tuple[int, ...] = ()
+        """The slots that it has announced."""
+        self.named = _NEVER
+        """The slot in which this robot has last named it."""
+        self.unnamed = 0
+        """Packets of it in a row that do not name this robot."""
+
+
+class Slots:
+    """See the module.
+
+    :param src_id: of this robot
+    :param slot_s: s that a slot lasts: the airtime of the longest packet and the guard
+    :param period_s: s from one message to the next
+    :ivar reserved: whether the block before had announced the slot of the newest one
+    """
+
+    def __init__(self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float = 0.1) -> None:
+        self.src_id = src_id
+        self.clock = SlotClock(slot_s)
+        self.reserved = False
+        self._rng = rng
+        self._period = period_s / slot_s
+        self._mine: list[int] = []
+        self._announced: tuple[int, ...] = ()
+        self._taken: dict[int, int] = {}
+        """Slot -> the robot that has announced it."""
+        self._expected: set[int] = set()
+        """Slots in which a neighbour expects to receive."""
+        self._conflicts: dict[int, int] = {}
+        """Slot that two robots want -> the one of them that gives it up."""
+        self._robots: dict[int, _HeardRobot] = {}
+        self._hidden_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
+        """Slots: a neighbour last named a robot that is not heard here; named this robot; anybody was last heard."""
+        self._entered_at: int | None = None
+        """The slot of the first send since the entry; None outside."""
+        self._rate = _ENTRY_RATE
+        """v; see the module."""
+        self._since: float | None = None
+
+    # ---- sending
+
+    def departure(self, now: float) -> float:
+        """See :class:`gr_ros2.link.access.Access`. A host that is late by more than half a slot takes the next one."""
+        if self._since is None:
+            self._since = now
+        if not self.clock.runs:
+            if now < self._since + LISTEN_S:
+                return self._since + LISTEN_S
+            self.clock.start(now)
+        while self._mine and self.clock.begin(self._mine[0]) < now - self.clock.slot_s / 2:
+            self._mine.pop(0)  # the host was late
+        if not self._mine:
+            self._mine.append(self._entry(self.clock.slot(max(now, self._since + LISTEN_S)) + 1))
+        return self.clock.begin(self._mine[0])
+
+    def block(self) -> bytes | None:
+        """See :class:`gr_ros2.link.access.Access`."""
+        slot = self._mine.pop(0)
+        self._sweep(slot)
+        alone = self._alone(slot)
+        if self._entered_at is None:
+            if not self._open(slot):
+                return None
+            self._entered_at = slot
+        elif not alone and self._confirmed_at < max(self._entered_at, slot - 2 * self._memory()):
+            self._leave()
+            self._rate = min(2 * self._rate, _LEAST_RATE)
+            return None
+        self.reserved = slot in self._announced
+        if alone:
+            self._rate = min(2 * self._rate, _DEAF_RATE)
+        kept: list[int] = []
+        for mine in self._mine:
+            base = kept[-1] if kept else slot
+            if announceable(mine - base) == mine - base:
+                kept.append(mine)
+        self._mine = kept
+        while len(kept) < 2:
+            kept.append(self._pick(kept[-1] if kept else slot, slot))
+        self._announced = tuple(kept)
+        return write_block(self._content(slot))
+
+    def _leave(self) -> None:
+        self._mine.clear()
+        self._announced = ()
+        self._entered_at = None
+
+    def _entry(self, first: int) -> int:
+        """An open slot at random, from ``first`` on."""
+        for slot in range(first, first + LONGEST_AHEAD):
+            if self._open(slot):
+                if self._rng.random() < 1 / self._rate:
+                    return slot
+                self._rate = max(1.0, self._rate * EASED)
+        return first + LONGEST_AHEAD
+
+    def _open(self, slot: int) -> bool:
+        return slot % OPEN == 0 or self._free(slot)
+
+    def _free(self, slot: int) -> bool:
+        return slot % OPEN != 0 and slot not in self._taken and slot not in self._expected
+
+    def _pick(self, base: int, now: int) -> int:
+        """The slot to send in after ``base``."""
+        alone = self._alone(now)
+        step = self._interval(now)
+        if alone:
+            step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
+        ahead = announceable(step)
+        places: list[int] = []
+        unsure = alone or self._confirmed_at < now - UNSURE * step or self._unheard(now)
+        wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
+        while ahead <= LONGEST_AHEAD and len(places) < wanted:
+            if self._free(base + ahead) and base + ahead not in self._mine:
+                places.append(base + ahead)
+            ahead = announceable(ahead + 1) if ahead < LONGEST_AHEAD else ahead + 1
+        return self._rng.choice(places) if places else base + announceable(step)
+
+    def _interval(self, now: int) -> int:
+        """Slots from one send to the next."""
+        oldest = now - self._memory()
+        heard = [robot.heard for robot in self._robots.values() if robot.last >= oldest]
+        most = max([len(heard), *heard])
+        lately = now - NEW * most
+        entered = sum(robot.entered >= lately for robot in self._robots.values())
+        return max(math.ceil(self._period - 1e-9), round((most + 2 + entered) * OPEN / (OPEN - 1)))
+
+    def _memory(self) -> int:
+        """Slots for which a robot that was heard counts as heard."""
+        return round(max(HEARD_S / self.clock.slot_s, 4 * len(self._robots)))
+
+    def _lately(self) -> int:
+        """Slots within which somebody who is there has sent."""
+        return round(max(1.0 / self.clock.slot_s, 3 * len(self._robots)))
+
+    def _alone(self, now: int) -> bool:
+        return self._heard_at < now - self._lately()
+
+    def _unheard(self, now: int) -> bool:
+        """Whether a neighbour does not name this robot although it should."""
+        oldest = now - self._lately()
+        return any(robot.last >= oldest and robot.unnamed > PATIENCE + robot.heard for robot in self._robots.values())
+
+    def _content(self, slot: int) -> Block:
+        oldest = slot - self._memory()
+        heard = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
+        fresh = slot - NAMED * self._interval(slot)
+        names = nsmallest(2, (n for n in heard if heard[n].last >= fresh), key=lambda src_id: heard[src_id].named)
+        for src_id in names:
+            heard[src_id].named = self._turn(slot) if heard[src_id].named == _NEVER else slot
+        first, second = [*names, NOBODY, NOBODY][:2]
+        ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
+        short = Block(slot % SLOT_NUMBERS, ahead, len(heard), (first, second))
+        if self._hidden_at < oldest and all(robot.heard == len(heard) for robot in heard.values()):
+            return short
+        expected = sum(1 << n for n in range(MAP_SLOTS) if slot + 1 + n in self._taken)
+        wanted = min((at for at in self._conflicts if slot < at < slot + SLOT_NUMBERS), default=None)
+        conflict = (0, NOBODY) if wanted is None else (wanted - slot, self._conflicts.pop(wanted))
+        return short._replace(expected=expected, conflict=conflict)
+
+    def _turn(self, now: int) -> int:
+        """When a newcomer counts as named: at random, or all robots would name the same ones at the same time."""
+        return now - self._rng.randrange(LONGEST_AHEAD)
+
+    def _sweep(self, now: int) -> None:
+        """Forget what has passed."""
+        if now < self._swept + _SWEEP:
+            return
+        self._swept = now
+        self._taken = {slot: owner for slot, owner in self._taken.items() if slot > now}
+        self._expected = {slot for slot in self._expected if slot > now}
+        self._conflicts = {slot: loser for slot, loser in self._conflicts.items() if slot > now}
+        oldest = now - 2 * self._memory()
+        self._robots = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
+
+    # ---- what is heard
+
+    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
+        """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
+        if block is None:
+            return
+        jumps = self.clock.jumps
+        settled = self._entered_at is not None and self._confirmed_at >= self._entered_at
+        free = not settled and block.heard > 0
+        slot = self.clock.heard(src_id, block.slot, began, trusted=trusted, free=free)
+        if self.clock.jumps > jumps:
+            self._start_over()
+        if slot is None or src_id == self.src_id:
+            return
+        ahead = [slot + block.ahead[0]] if block.ahead[0] else []
+        if ahead and block.ahead[1]:
+            ahead.append(ahead[0] + block.ahead[1])
+        if not trusted:
+            for at in ahead:
+                self._taken.setdefault(at, src_id)
+            return
+        robot = self._robots.get(src_id)
+        if robot is None:
+            robot = self._robots[src_id] = _HeardRobot(slot)
+            self._rate = max(1.0, self._rate - 1)
+        elif slot not in robot.ahead:
+            robot.named = _NEVER
+            robot.entered = slot
+        self._heard_at = max(self._heard_at, slot)
+        for at in robot.ahead:
+            if at not in ahead and self._taken.get(at) == src_id:
+                del self._taken[at]
+        robot.last, robot.heard, robot.ahead = slot, block.heard, tuple(ahead)
+        for at in ahead:
+            self._claim(at, src_id)
+        self._named(robot, block.names, slot)
+        if block.expected is not None:
+            self._mapped(slot, block.expected, block.conflict)
+
+    def _claim(self, slot: int, src_id: int) -> None:
+        owner = self._taken.get(slot, src_id)
+        if owner != src_id:
+            self._conflicts[slot] = max(owner, src_id)
+        self._taken[slot] = min(owner, src_id)
+        if slot in self._mine:
+            if src_id < self.src_id:
+                self._mine.remove(slot)
+            else:
+                self._conflicts[slot] = src_id
+
+    def _named(self, robot: _HeardRobot, names: tuple[int, int], slot: int) -> None:
+        robot.unnamed += 1
+        for name in names:
+            other = self._robots.get(name)
+            if name == self.src_id:
+                self._confirmed_at = max(self._confirmed_at, slot)
+                self._rate = _ENTRY_RATE
+                robot.unnamed = 0
+            elif other is not None and other.named == _NEVER:
+                other.named = self._turn(slot)  # one confirmation is enough
+            elif name != NOBODY:
+                self._hidden_at = slot
+
+    def _mapped(self, slot: int, expected: int, conflict: tuple[int, int]) -> None:
+        at = slot + 1
+        while expected:
+            skip = (expected & -expected).bit_length()
+            at += skip
+            expected >>= skip
+            if at - 1 not in self._mine:
+                self._expected.add(at - 1)
+        ahead, loser = conflict
+        if ahead and loser == self.src_id and slot + ahead in self._mine:
+            self._mine.remove(slot + ahead)
+
+    def _start_over(self) -> None:
+        """The clock has moved: what was known by slot is void."""
+        self._leave()
+        self._taken.clear()
+        self._expected.clear()
+        self._conflicts.clear()
+        self._robots.clear()
+        self._heard_at = self._confirmed_at = self._hidden_at = _NEVER
+        self._swept = _NEVER
+        self._rate = _ENTRY_RATE

@@ -1,0 +1,145 @@
+"""What a link can say about the other ends: who they are, whether they match, and why nothing is understood.
+
+Invariants: only counters and what other ends have told are read. "Nothing" is said only if the receiver detects
+nothing: a signal, bytes or packets that cannot be used are named, with what they usually mean.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from gr_ros2 import __version__
+from gr_ros2.gr.ends import LiveEnd
+from gr_ros2.gr.health import LOCKED
+from gr_ros2.phy import Phy
+from gr_ros2.radio.config import LinkConfig
+from gr_ros2.state.keys import read_key_file
+
+_FORMAT = {
+    "length": "longer or shorter than packets can be here: set the same packet_len",
+    "version": "of another version of the wire format: set the same version",
+    "crc": "damaged, or of a link with another packet_len",
+    "entry_bounds": "not readable: set the same packet_len",
+    "entry_kind": "not readable: set the same packet_len",
+}
+_ENERGY = ("energy", "bursts_in")
+_NO_PACKETS = ("malformed", "too_long")
+
+
+def about(config: LinkConfig, phy: Phy) -> dict[str, Any]:
+    """What this end tells those who ask: ``packet_len``, numbers for settings of the PHY and for the key, a text."""
+    options = {"name": phy.name, "options": repr(phy.options), "rate": phy.sample_rate if phy.has_samples else 0}
+    digest = zlib.crc32(json.dumps(options, sort_keys=True).encode())
+    key = int.from_bytes(hashlib.sha256(read_key_file(config.key)[0]).digest()[:4], "big") if config.key else 0
+    rate = f" {phy.sample_rate:g}" if phy.has_samples else ""
+    sends = config.front_end.get("frequency")
+    receives = config.front_end.get("frequency_rx", sends)
+    tuned = "" if sends is None else f", sends at {sends} Hz, receives at {receives} Hz"
+    text = f"{__version__} {phy.name}{rate}{tuned}"
+    return {"packet_len": config.packet_len, "phy": digest, "key": key, "text": text}
+
+
+def introduce(live: LiveEnd, told: Mapping[str, Any], snr_db: Callable[[], float | None], now: float) -> None:
+    """From now on, tell those who ask what this end is, what time it has, and how well it receives."""
+    questions = live.endpoint.questions
+    questions.introduce(**told)
+    questions.snr_db, questions.wall_s = snr_db, time.time() - now
+
+
+def peers(live: LiveEnd, now: float) -> list[dict[str, Any]]:
+    """The robots that were heard; the one heard last comes first. Version 0 does not know them."""
+    with live.lock:
+        found = live.endpoint.peers(now)
+    return [{**asdict(peer), "start": f"{peer.start:016x}"} for peer in sorted(found, key=lambda peer: peer.heard_s)]
+
+
+def ping(live: LiveEnd, robot: int, now: float) -> dict[str, Any]:
+    """Ask a robot, and say what has come of all questions to it so far.
+
+    :raises ConfigError: with version 0, which has no such questions
+    """
+    with live.lock:
+        questions = live.endpoint.questions
+        questions.wall_s = time.time() - now  # the clock of the wall may have been set
+        told = questions.put(robot, now)
+        here = next((peer.snr_db for peer in live.endpoint.peers(now) if peer.robot == robot), None)
+        live.work.notify()
+    return {**told, "robot": robot, "snr_here_db": questions.snr_db() if here is None else here}
+
+
+def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """What does not match between this end and another one, which has told what it is."""
+    found = []
+    if other["packet_len"] != own["packet_len"]:
+        there, here = other["packet_len"], own["packet_len"]
+        found.append(f"packet_len is {there} there and {here} here; set the same at both ends")
+    if other["phy"] != own["phy"]:
+        found.append("phy has other settings there; set the same name, sample_rate and options at both ends")
+    if other["key"] != own["key"]:
+        found.append(f"key {other['key']:08x} there, {own['key']:08x} here; copy one file to both ends")
+    version = other["text"].partition(" ")[0]
+    if version and not __version__.startswith(version):
+        found.append(f"gr-ros2 {version} there and {__version__} here")
+    return found
+
+
+def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
+    """Why no other robot is heard, from the counters of the receiver: one line for each sign, nearest first."""
+    found = []
+    for reason, count in stats["sink"]["rejected"].items():
+        meaning = LOCKED.get(reason) or _FORMAT.get(reason, reason)
+        found.append(f"{count} packets refused: {meaning}")
+    early = stats["sink"]["dropped"].get("early", 0)
+    if early:
+        found.append(
+            f"{early} packets wait for a hello, which says how to open them, or for the proof that the other end hears "
+            "this one"
+        )
+    if damaged := stats["packets"]["damaged"]:
+        found.append(
+            f"{damaged} bursts found, with errors: too weak, overlapped, or of another phy, options or packet_len"
+        )
+    counters = {**stats["front_end"]["passed"], **stats["front_end"]["lost"]}
+    no_packets = sum(counters.get(name, 0) for name in _NO_PACKETS)
+    if no_packets:
+        found.append(f"{no_packets} frames that are no packets: another baud rate, framing or packet_len")
+    if foreign := stats["packets"]["foreign"] + counters.get("foreign", 0):
+        found.append(f"{foreign} frames of others: another network, callsign or address")
+    energy = sum(counters.get(name, 0) for name in _ENERGY)
+    if energy and not found:
+        found.append(
+            f"a signal was there {energy} times, and no packet in it: the other end has another phy, sample_rate or "
+            "options, or it is somebody else"
+        )
+    if wrong := counters.get("wrong_rate", 0):
+        found.append(f"{wrong} bursts at another sample rate: set the same phy.sample_rate at both ends")
+    return found or [
+        "nothing: no signal and no bytes. Is the other end switched on, and are frequency and cable right?"
+    ]
+
+
+def in_words(peer: Mapping[str, Any]) -> str:
+    """The figures of a peer that was asked, in words."""
+    times, parts = peer["round_trip_s"], []
+    if times["p50"] is not None:
+        parts.append(f"round trip {times['p50'] * 1e3:.0f} ms (p99 {times['p99'] * 1e3:.0f} ms)")
+    if peer["lost_there"] is not None:
+        parts.append(f"{peer['answered']} of {peer['asked']} answered")
+        parts.append(f"lost {peer['lost_there']} there, {peer['lost_back']} back")
+    else:
+        parts.append(f"{peer['asked']} asked, none answered")
+    snrs = [("here", peer["snr_here_db"]), ("there", peer["snr_there_db"])]
+    if any(snr is not None for _, snr in snrs):
+        parts.append("SNR " + ", ".join(f"{snr:.1f} dB {where}" for where, snr in snrs if snr is not None))
+    if "mcs" in peer:
+        parts.append(f"rate {peer['mcs']}")
+    if peer["clock_s"] is not None:
+        ahead = "ahead of" if peer["clock_s"] >= 0 else "behind"
+        parts.append(f"its clock is {abs(peer['clock_s']) * 1e3:.0f} ms {ahead} this one")
+    return "; ".join(parts)

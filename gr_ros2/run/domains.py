@@ -1,0 +1,42 @@
+"""The ROS domains of a run, so that two runs on one computer do not receive each other's messages."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+
+from gr_ros2.middleware.free_domains import FREE, ReservedDomain
+from gr_ros2.run.scenario import Scenario
+from gr_ros2.settings.config import replaced
+from gr_ros2.settings.fields import AUTO
+
+
+def on_own_domains(scenario: Scenario, stack: ExitStack) -> Scenario:
+    """The scenario on domains that nobody else uses, where ``own_domains`` is set and it names none.
+
+    :param stack: gives the domains back
+    :raises MiddlewareError: when none is free
+    """
+    if not scenario.own_domains:
+        return scenario
+    given = [scenario.ros_source.domain_id, scenario.ros_sink.domain_id]
+    free = (number for number in FREE if number not in given)
+    here, there = (stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given)
+    back = scenario.back
+    if back is not None:  # the way back has the same two graphs
+        ends = {"ros_source": there, "ros_sink": here}
+        back = replace(
+            back,
+            **{
+                name: replaced(end, domain_id=domain)
+                for name, domain in ends.items()
+                for end in (getattr(back, name),)
+                if end.domain_id == AUTO
+            },
+        )
+    return replace(
+        scenario,
+        ros_source=replaced(scenario.ros_source, domain_id=here),
+        ros_sink=replaced(scenario.ros_sink, domain_id=there),
+        back=back,
+    )

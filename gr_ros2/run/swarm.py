@@ -1,0 +1,309 @@
+"""Many robots on one channel at packet level: each sends its newest message, of one packet, whenever it may.
+
+The robots have the engines of ``gr_ros2.mac`` and clocks of their own; nothing else of a robot is simulated. The medium
+is :class:`gr_ros2.medium.packets.PacketMedium` with a PHY that loses nothing unless packets overlap, and the event loop
+is that of ``run.simulate``. A host takes ``latency_s`` from the end of a packet to what it does about it.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from struct import Struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gr_ros2.link.access import Access
+from gr_ros2.mac import read_block
+from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
+from gr_ros2.medium.packets import PacketMedium
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.run.simulate import EventLoop
+from gr_ros2.settings.config import ChannelConfig
+
+_stamp = Struct(">d")
+
+
+@dataclass
+class SwarmConfig:
+    """How a swarm is simulated.
+
+    :param airtime_s: of every packet, s
+    :param latency_s: s from the end of a packet to what its receiver does about it
+    :param period_s: s from one message of a robot to the next
+    :param loss: share of packets that are lost for other reasons than collisions
+    :param jitter_s: a burst begins up to so many s late
+    :param ppm: clocks differ by up to so many parts per million
+    :param present: from when to when in s a robot is there, by its number
+    :param jumps: (s, robot, s): at that time the robot's clock jumps by so much
+    :param frozen: (s, robot, s): from then on the robot's host does nothing for so long
+    """
+
+    airtime_s: float = 1 / 75
+    latency_s: float = 0.010
+    period_s: float = 0.1
+    loss: float = 0.0
+    jitter_s: float = 0.0
+    ppm: float = 0.0
+    seed: int = 1
+    present: dict[int, tuple[float, float]] = field(default_factory=dict)
+    jumps: Sequence[tuple[float, int, float]] = ()
+    frozen: Sequence[tuple[float, int, float]] = ()
+
+
+def fully_meshed(robots: int) -> list[set[int]]:
+    """All robots hear each other."""
+    return [set(range(robots)) - {one} for one in range(robots)]
+
+
+class HearingGraph(Surroundings):
+    """Robots of which each hears others as well as any, or not at all.
+
+    :param hears: for every robot those that hear it, as a function of time: the same object as long as nothing changes
+    """
+
+    moves, passes = True, False
+
+    def __init__(self, hears: Callable[[float], Sequence[set[int]]] | Sequence[set[int]], config: SwarmConfig) -> None:
+        self._hears = hears if callable(hears) else lambda _: hears
+        self._config = config
+        self._now: Sequence[set[int]] = ()
+        self._hearers: list[Hearers] = []
+        self._near = np.zeros((0, 0), bool)
+        self._paths: dict[tuple[int, int], Path] = {}
+        self._look(0.0)
+        self.robots = len(self._now)
+
+    def _look(self, now: float) -> None:
+        hears = self._hears(now)
+        if hears is self._now:
+            return
+        self._now, robots = hears, len(hears)
+        matrix = np.zeros((robots, robots), np.float32)
+        self._hearers = []
+        for sender, others in enumerate(hears):
+            ids = np.array(sorted(others), int)
+            matrix[sender, ids] = 1
+            self._hearers.append(Hearers(ids, np.full(len(ids), math.inf), np.zeros(len(ids)), robots))
+        self._near = (matrix @ matrix.T + matrix + matrix.T) > 0
+
+    def hearers(self, sender: int, now: float) -> Hearers:
+        self._look(now)
+        return self._hearers[sender]
+
+    def path(self, sender: int, receiver: int) -> Path:
+        path = self._paths.get((sender, receiver))
+        if path is None:
+            seed = self._config.seed * 65536 + sender * 256 + receiver
+            channel = ChannelConfig(packet_loss=self._config.loss, seed=seed)
+            path = self._paths[sender, receiver] = Path(receiver, channel, self._config.latency_s)
+        return path
+
+    def reached(self, sender: int) -> list[int]:
+        return sorted(self._now[sender])
+
+    def near(self, sender: int, now: float) -> NDArray[np.bool_]:
+        self._look(now)
+        return np.asarray(self._near[sender])
+
+
+class SwarmRobot:
+    """One robot of a swarm, as the event loop sees it."""
+
+    def __init__(
+        self, number: int, access: Access, config: SwarmConfig, until: float, on: Callable[[Reception], None]
+    ) -> None:
+        rng = random.Random(f"robot {config.seed} {number}")
+        self.number = self.src_id = number
+        self.access, self.endpoint = access, self
+        self.over = False
+        self.sent = 0
+        self._config, self._until, self._on = config, until, on
+        self._rng = rng
+        self._ppm = 1 + (config.ppm * 1e-6 if number == 0 else rng.uniform(-1, 1) * config.ppm * 1e-6)
+        self._offset = rng.uniform(0, 1000)
+        self._phase = rng.uniform(0, config.period_s)
+        self._jumps = sorted((at, by) for at, robot, by in config.jumps if robot == number)
+        self._frozen = [(at, at + by) for at, robot, by in config.frozen if robot == number]
+        self._late: list[tuple[float, Reception]] = []
+        begin, self._end = config.present.get(number, (rng.uniform(0, 0.3), math.inf))
+        self.begin = self.due = begin
+
+    def _local(self, at: float) -> float:
+        while self._jumps and self._jumps[0][0] <= at:
+            self._offset += self._jumps.pop(0)[1]
+        return at * self._ppm + self._offset
+
+    def _asleep(self, now: float) -> float | None:
+        return next((end for begin, end in self._frozen if begin <= now < end), None)
+
+    def newest(self, at: float) -> float:
+        """When the newest message at a time was made, s."""
+        return self._phase + math.floor((at - self._phase) / self._config.period_s) * self._config.period_s
+
+    def _plan(self, now: float) -> None:
+        self.due = max(now, (self.access.departure(self._local(now)) - self._offset) / self._ppm)
+        if self._jumps:
+            self.due = min(self.due, max(now, self._jumps[0][0]))
+        if self.due > min(self._until, self._end):
+            self.over, self.due = True, math.inf
+
+    def step(self, now: float, medium: Medium) -> Iterator[Any]:
+        """Send what may leave."""
+        end = self._asleep(now)
+        if end is not None:
+            self.due = end
+            return
+        late, self._late = self._late, []
+        for _, reception in late:
+            self._hear(reception)
+        at = self.access.departure(self._local(now))
+        if (at - self._offset) / self._ppm <= now + 1e-9:
+            block = self.access.block()
+            if block is not None:
+                start = now + self._rng.uniform(0, self._config.jitter_s)
+                medium.send(self.number, block + _stamp.pack(self.newest(now)), start, self._config.airtime_s)
+                self.sent += 1
+        self._plan(now)
+        yield from ()
+
+    def receive(self, reception: Reception) -> Iterator[Any]:
+        """Take a packet."""
+        if self.begin <= reception.at < self._end:
+            if self._asleep(reception.at) is not None:
+                self._late.append((reception.at, reception))
+                return
+            self._hear(reception)
+            self._on(reception)
+            if not self.over:
+                self._plan(reception.at)
+        yield from ()
+
+    def _hear(self, reception: Reception) -> None:
+        data = reception.data
+        block = read_block(data)[0] if len(data) > _stamp.size else None
+        began = reception.sent.start * self._ppm + self._offset
+        self.access.hear(reception.sent.sender, block, began)
+
+    def expire(self, now: float) -> Iterator[Any]:  # noqa: ARG002
+        yield from ()
+
+    def wake(self, now: float) -> None:
+        """Nothing waits for what is received."""
+
+    def next_timeout(self) -> None:
+        return None
+
+
+class _CountedMedium(PacketMedium):
+    """Losses are counted from ``t0`` on."""
+
+    def __init__(self, around: Surroundings, phys: Sequence[Phy], t0: float) -> None:
+        super().__init__(around, phys, shared=True, ideal=True)
+        self._t0 = t0
+
+    def outcome(self, sent: Transmission) -> Iterator[Reception]:
+        if sent.start >= self._t0 > 0:
+            self._t0 = 0.0
+            self.lost.clear()
+        yield from super().outcome(sent)
+
+
+class Swarm:
+    """Robots, the medium between them, and what is measured from ``t0`` on.
+
+    :param make: the engine of a robot, from its number and its generator
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int, random.Random], Access],
+        around: Surroundings,
+        config: SwarmConfig | None = None,
+        *,
+        t0: float = 20.0,
+        t1: float = 80.0,
+    ) -> None:
+        self.config = config = config or SwarmConfig()
+        count = around.robots
+        self.t0, self.t1, self.count = t0, t1, count
+        phy = PHY.load("direct")(64)
+        self.medium = _CountedMedium(around, [phy] * count, t0)
+        self.robots = [
+            SwarmRobot(n, make(n, random.Random(f"access {config.seed} {n}")), config, t1, self._received)
+            for n in range(count)
+        ]
+        self.pairs = {(one, other) for one in range(count) for other in around.reached(one)}
+        self.heard_at: dict[int, list[float]] = {n: [] for n in range(count)}
+        self.first_heard: dict[int, float] = {}
+        self.received = 0
+        self.got = [[0] * count for _ in range(count)]
+        self._newest: dict[tuple[int, int], float] = {}
+        self._marks: dict[tuple[int, int], float] = {}
+        self._areas: dict[tuple[int, int], float] = {}
+
+    def run(self) -> Swarm:
+        for robot in self.robots:
+            robot.due = robot.begin
+        loop = EventLoop(self.robots, self.medium)  # type: ignore[arg-type]
+        for _ in loop.run():
+            pass
+        for pair in self.pairs:
+            self._settle(pair, self.t1)
+        return self
+
+    def _received(self, reception: Reception) -> None:
+        sender, receiver = reception.sent.sender, reception.receiver
+        at, made = reception.at, _stamp.unpack(reception.data[-8:])[0]
+        self.first_heard.setdefault(sender, at)
+        self.heard_at[sender].append(at)
+        pair = sender, receiver
+        if at >= self.t0:
+            self.received += 1
+        if made <= self._newest.get(pair, -1.0):
+            return
+        self._settle(pair, at)
+        self._newest[pair] = made
+        if self.t0 <= at <= self.t1:
+            self.got[sender][receiver] += 1
+
+    def _settle(self, pair: tuple[int, int], at: float) -> None:
+        mark, at = self._marks.get(pair, self.t0), min(at, self.t1)
+        if at > mark:
+            made = self._newest.get(pair, 0.0)
+            self._areas[pair] = self._areas.get(pair, 0.0) + (at - mark) * ((mark + at) / 2 - made)
+            self._marks[pair] = at
+
+    def lost(self, *reasons: str) -> int:
+        """Packets that one robot did not receive from another, after ``t0``, for these reasons."""
+        return sum(map(self.medium.lost.total, reasons))
+
+    @property
+    def collided(self) -> float:
+        """Share of packets for a robot in range that another one destroyed, or that came while it sent."""
+        collided = self.lost("collision", "sending")
+        return collided / max(1, collided + self.received + self.lost("packet_loss"))
+
+    @property
+    def rate(self) -> float:
+        """New messages per second that a robot receives, from all others together."""
+        return sum(map(sum, self.got)) / (self.t1 - self.t0) / max(1, self.count - 1)
+
+    @property
+    def ages(self) -> list[float]:
+        """Mean age of every pair in range, s, in order."""
+        return sorted(area / (self.t1 - self.t0) for area in self._areas.values())
+
+    @property
+    def age(self) -> float:
+        return sum(self.ages) / max(1, len(self.ages))
+
+    @property
+    def jain(self) -> float:
+        """Jain's index of the messages that the others have received of each robot."""
+        each = [sum(got) for got in self.got]
+        return sum(each) ** 2 / (len(each) * sum(n * n for n in each)) if any(each) else 0.0

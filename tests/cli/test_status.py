@@ -1,0 +1,109 @@
+"""`gr-ros2 status`, `peers`, `ping` and `link --check`, against links in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from tests.radio.cables import free_ports
+from tests.waiting import PATIENCE_S, wait_for
+
+COMMAND = [sys.executable, "-m", "gr_ros2.cli"]
+
+
+class Ends:
+    """Two ends of a link over UDP, on graphs in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.env = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "state")}
+        ports = free_ports(2, socket.SOCK_DGRAM)
+        self.files = [folder / "one.yaml", folder / "two.yaml"]
+        for number, (file, own, other) in enumerate(zip(self.files, ports, reversed(ports), strict=True), 1):
+            file.write_text(
+                f"ros_source: {{robot_id: {number}, namespace: /robot_{number}, topics: [odom], middleware: memory}}\n"
+                "ros_sink: {middleware: memory}\n"
+                "phy: {name: modem, options: {bit_rate: 1000000}}\n"
+                f"front_end: {{name: udp, listen: '127.0.0.1:{own}', send_to: ['127.0.0.1:{other}']}}\n"
+            )
+        self.running: list[subprocess.Popen[str]] = []
+
+    def link(self, number: int, *options: str) -> subprocess.Popen[str]:
+        with (self.folder / f"log-{number}").open("w") as log:
+            process = subprocess.Popen(
+                [*COMMAND, "link", str(self.files[number - 1]), *options],
+                env=self.env,
+                stdout=log,
+                stderr=log,
+                text=True,
+            )
+        self.running.append(process)
+        return process
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([*COMMAND, *words], env=self.env, capture_output=True, text=True, check=False)
+
+    def heard(self) -> bool:
+        answer = self.run("peers", "--json", "--pid", str(self.running[0].pid))
+        return answer.returncode == 0 and bool(json.loads(answer.stdout))
+
+
+@pytest.fixture
+def ends(tmp_path: Path) -> Iterator[Ends]:
+    made = Ends(tmp_path)
+    yield made
+    for process in made.running:
+        process.send_signal(signal.SIGINT)
+        process.wait(PATIENCE_S)
+
+
+def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
+    first = ends.link(1)
+    ends.link(2)
+    wait_for(ends.heard, "the other end")
+    pid = str(first.pid)
+    (peer,) = json.loads(ends.run("peers", "--json", "--pid", pid).stdout)
+    assert (peer["robot"], peer["silent"]) == (2, False)
+    status: dict[str, Any] = json.loads(ends.run("status", "--json", "--pid", pid).stdout)
+    assert status["packets"]["out"] > 0
+    shown = ends.run("status", "--pid", pid).stdout
+    assert "robot 1" in shown
+    assert "packets sent" in shown
+    several = ends.run("status")
+    assert (several.returncode, "say which with --pid" in several.stderr) == (2, True)
+    told = json.loads(ends.run("ping", "2", "--json", "--count", "5", "--interval", "0.2", "--pid", pid).stdout)
+    assert (told["asked"], told["lost_there"], told["about"]["packet_len"]) == (5, 0, 220)
+    assert told["answered"] >= 4
+    assert told["round_trip_s"]["p50"] <= told["round_trip_s"]["p99"]
+
+
+def test_two_ends_that_match_and_two_that_do_not(ends: Ends) -> None:
+    ends.link(2)
+    same = ends.run("link", str(ends.files[0]), "--check")
+    assert (same.returncode, same.stderr) == (0, "")
+    assert "both ends match" in same.stdout
+    alone = ends.run("ping", "2", str(ends.files[0]), "--json", "--count", "3", "--interval", "0.3")
+    assert json.loads(alone.stdout)["answered"] >= 1
+    other = ends.run("link", str(ends.files[0]), "--check", "--set", "packet_len=100")
+    assert other.returncode == 1
+    assert "does not match: packet_len is 220 there and 100 here" in other.stdout
+
+
+def test_nobody_there(ends: Ends) -> None:
+    lone = ends.run("link", str(ends.files[0]), "--check", "--duration", "1")
+    assert lone.returncode == 1
+    assert "nothing: no signal and no bytes" in lone.stdout
+    assert "start one with gr-ros2 link" in ends.run("status").stderr
+    refused = ends.run("ping", "2", str(ends.files[0]), "--set", "version=0")
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)

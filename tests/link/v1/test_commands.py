@@ -1,0 +1,150 @@
+"""Commands come in time or not at all, without any setting."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.events import Delivered, Lost, ReceiverEvent
+from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
+from gr_ros2.settings.config import SourceConfig, TopicOptions, build
+from gr_ros2.settings.registry import Registry, Topic
+from tests.link.v1.air import SLOT_S, Air, Robot
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+def robot(**options: TopicOptions) -> Robot:
+    """It sends commands and large strings."""
+    names = {"cmd_vel": TWIST, "text": "std_msgs/msg/String"}
+    return Robot(
+        1, Registry([Topic(n, name, names[name], options.get(name, TopicOptions())) for n, name in enumerate(names)])
+    )
+
+
+def ages(sender: Robot, *, seconds: float = 4.0, loss: float = 0.0) -> list[float]:
+    """How old commands are that are delivered on a link which is full of other messages and stands still for a second
+    again and again."""
+    air = Air(sender, Robot(2), loss=loss)
+    given: dict[bytes, float] = {}
+    seen: list[float] = []
+
+    def heard(data: bytes, now: float) -> list[ReceiverEvent]:
+        events = receive(data, now)
+        seen.extend(now - given[e.payload] for e in events if isinstance(e, Delivered) and e.topic_id == 0)
+        return events
+
+    receive, air.robots[1].receive = air.robots[1].receive, heard  # type: ignore[method-assign]
+    air.run(1.0)
+    slot = sender.slot
+    begin = air.now
+    while air.now < begin + seconds:
+        payload = b"%f" % air.now
+        given[payload] = air.now
+        sender.end.messages.submit(0, payload, air.now)
+        sender.end.messages.submit(1, bytes(2000), air.now)
+        stands = air.now % 2 > 1
+        sender.slot = (lambda _: None) if stands else slot  # type: ignore[method-assign]
+        air.run(0.1)
+    sender.slot = slot  # type: ignore[method-assign]
+    return seen
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_no_command_comes_late_and_those_that_would_are_counted(loss: float) -> None:
+    sender = robot()
+    found = ages(sender, loss=loss)
+    assert len(found) > 10
+    assert max(found) <= COMMAND_DEADLINE_S + SLOT_S
+    refused = sender.end.sent.refused
+    assert refused[0, "stale"] + refused[0, "cannot_complete"] > 5
+
+
+def test_the_options_of_a_topic_say_otherwise() -> None:
+    assert max(ages(robot(cmd_vel=TopicOptions(deadline_s=0.0)))) > 0.8
+    assert robot(cmd_vel=TopicOptions(deadline_s=1.0)).end.messages.queue(0) == ("deadline", 1.0)
+    assert robot(cmd_vel=TopicOptions(queue="latest")).end.messages.queue(0) == ("latest", COMMAND_DEADLINE_S)
+
+
+def test_what_a_user_names_is_a_command_and_with_no_name_nothing_is() -> None:
+    assert robot().end.messages.queue(1) == ("fifo", 0.0)
+    named = Robot(1, Registry([Topic(0, "arm/goal", "std_msgs/msg/String")]), commands=("arm/*",))
+    assert named.end.messages.queue(0) == ("deadline", COMMAND_DEADLINE_S)
+    none = Robot(1, Registry([Topic(0, "cmd_vel", TWIST)]), commands=())
+    assert none.end.messages.queue(0) == ("fifo", 0.0)
+    assert is_command("/cmd_vel", TWIST, (TWIST,))
+    assert is_command("/arm/goal", "x/msg/Y", ("arm/goal",))
+    assert not is_command("alarm/goal", "x/msg/Y", ("arm/*",))
+    with pytest.raises(ConfigError, match="neither a type such as"):
+        build(SourceConfig, {"commands": ["two words"]})
+
+
+def test_a_lifespan_of_the_publishers_goes_before_the_default() -> None:
+    end = robot().end.messages
+    end.follow(0, lifespan_s=2.0)
+    assert end.queue(0) == ("deadline", 2.0)
+    end.follow(0, depth=1)
+    assert end.queue(0) == ("latest", COMMAND_DEADLINE_S)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row(named: bool) -> None:
+    """The packet with the command is lost, and comes half a second after the packets behind it."""
+    sender = robot()
+    receiver = Robot(2, **({} if named else {"commands": ()}))
+    air = Air(sender, receiver)
+    air.run(2.0)
+    held: list[bytes] = []
+    for number in range(4):
+        sender.end.messages.submit(number > 0, b"%d" % number * 40, air.now)
+        packet = sender.slot(air.now)
+        assert packet is not None
+        if number:
+            receiver.receive(packet, air.now)
+        else:
+            held.append(packet)
+    before = len(receiver.events)
+    receiver.receive(held[0], air.now + 0.5)
+    events = [event for event in receiver.events[before:] if isinstance(event, Delivered | Lost)]
+    (outcome,) = (event for event in events if event.topic_id == 0)
+    assert isinstance(outcome, Delivered) != named
+    assert sum(isinstance(event, Delivered) for event in events if event.topic_id == 1) == 3
+    assert receiver.end.received.lost[1, 0, "late"] == named
+
+
+def test_a_robot_that_hears_nobody_sends_beacons_alone_until_it_hears_somebody() -> None:
+    def packets(beacon_s: float) -> tuple[int, int]:
+        lone = Robot(1, robot().topics, beacon_s=beacon_s)
+        air = Air(lone)
+        for _ in range(300):
+            lone.end.messages.submit(1, bytes(40), air.now)
+            air.run(0.1)
+        alone = len(air.recorded)
+        air.robots.append(Robot(2))
+        took = air.run(30.0, lambda: bool(air.robots[1].delivered()))
+        for _ in range(10):
+            lone.end.messages.submit(1, bytes(40), air.now)
+            air.run(0.1)
+        assert took < beacon_s + 2
+        assert len(air.robots[1].delivered()) >= 10
+        return alone, len(air.recorded) - alone
+
+    always, sparse = packets(1e9), packets(5.0)
+    assert sparse[0] < 0.3 * always[0], "5 s of messages, then one hello per 5 s"
+    with pytest.raises(ConfigError, match="beacon_s = 5: this end never hears anybody"):
+        Robot(1, robot().topics, beacon_s=5.0, hears=False)
+
+
+def test_with_a_small_share_of_the_air_a_robot_says_as_much_less_about_itself() -> None:
+    def kinds(share: float) -> tuple[int, int]:
+        one, two = (Robot(n, robot().topics, airtime_share=share) for n in (1, 2))
+        air = Air(one, two)
+        for _ in range(60):
+            air.run(1.0)
+            one.end.messages.submit(1, b"x", air.now)
+        assert len(two.delivered()) >= 59
+        return one.end.sent.air["hello"], two.end.sent.air["report"]
+
+    (hellos, reports), (few_hellos, few_reports) = kinds(1.0), kinds(0.05)
+    assert few_hellos < hellos / 5
+    assert few_reports <= reports / 2

@@ -1,0 +1,106 @@
+"""Slots at an endpoint: packets that come twice, and a robot without the key."""
+
+from __future__ import annotations
+
+import random
+from itertools import pairwise
+
+import pytest
+
+from gr_ros2.link.v1.sealing import Keys, SealMode
+from gr_ros2.mac import Slots
+from gr_ros2.wire.mac_block import Block, read_block, write_block
+from gr_ros2.wire.v1 import read_header
+from tests.link.v1.air import Robot, registry
+
+AIRTIME = 0.010
+SLOT = 0.011
+
+
+def robot(src_id: int, mode: SealMode) -> tuple[Robot, Slots]:
+    access = Slots(src_id, SLOT, random.Random(src_id))
+    return Robot(src_id, registry(), mode=mode, access=access), access
+
+
+class Greedy:
+    """Announces the next two sends of another robot as its own, and sends in any slot."""
+
+    def __init__(self, victim: Slots) -> None:
+        self.victim = victim
+        self.now = 0.0
+
+    def departure(self, now: float) -> float:
+        self.now = now
+        return now
+
+    def block(self) -> bytes:
+        slot = self.victim.clock.slot(self.now)
+        first, second = [*self.victim._mine, slot + 20, slot + 40][:2]
+        ahead = max(first - slot, 1), max(second - first, 1)
+        return write_block(Block(slot % 256, ahead, 40, (1, 2), 0xFFFFFFFF, (ahead[0], self.victim.src_id)))
+
+    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
+        pass
+
+
+def talk(robots: list[Robot], begin: float, seconds: float) -> list[tuple[float, Robot, bytes]]:
+    """Let robots send, each once it may; what overlaps is lost."""
+    sent: list[tuple[float, Robot, bytes]] = []
+    busy, now = begin, begin
+    for one in robots:
+        one.end.handle_timeout(begin)
+    while now < begin + seconds:
+        now, at = min((max(now, r.end.next_departure(credited=True) or now), n) for n, r in enumerate(robots))
+        data = robots[at].slot(now)
+        if data is None:
+            continue
+        if now >= busy - 1e-9:
+            for other in robots:
+                if other is not robots[at]:
+                    other.receive(data, now + AIRTIME, now)
+        busy = now + AIRTIME
+        sent.append((now, robots[at], data))
+    return sent
+
+
+def state(access: Slots) -> tuple[object, ...]:
+    known = sorted(access._robots), dict(access._taken), set(access._expected), dict(access._conflicts)
+    return access.clock.begin(0), access.clock.jumps, list(access._mine), *known
+
+
+@pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
+def test_a_packet_that_comes_twice_moves_nobody(mode: SealMode) -> None:
+    (one, _), (two, access) = robot(1, mode), robot(2, mode)
+    sent = talk([one, two], 0.0, 5.0)
+    assert access._confirmed_at > 0
+    before = state(access)
+    replayed = [data for _, sender, data in sent if sender is one]
+    assert len(replayed) > 20
+    for number, data in enumerate(replayed):
+        began = 5.0 + SLOT * (number + 0.5)
+        two.receive(data, began + AIRTIME, began)
+    assert state(access) == before
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_a_robot_without_the_key_takes_slots_from_nobody_for_longer_than_it_sends(mode: SealMode) -> None:
+    (one, _), (two, access) = robot(1, "encrypt"), robot(2, "encrypt")
+    talk([one, two], 0.0, 5.0)
+    intruder = Robot(0, registry(), mode=mode, access=Greedy(access))  # the lower id would win
+    intruder.keys = Keys((bytes(32),), "encrypt") if mode == "encrypt" else Keys()
+    intruder.start()
+    before = state(access)
+    slots = access.clock.slot(5.1)
+    for number in range(40):
+        now = access.clock.begin(slots + number)
+        data = intruder.slot(now)
+        assert data is not None
+        two.receive(data, now + AIRTIME, now)
+    zero, jumps, mine, known, taken, *rest = state(access)
+    assert (zero, jumps, mine, known, *rest) == (*before[:4], *before[5:])
+    assert isinstance(taken, dict)
+    assert {slot for slot, owner in taken.items() if owner == 0} <= {*range(slots, slots + 40 + 2 * 40)}
+    sent = [(at, data) for at, sender, data in talk([one, two], now, 5.0) if sender is two]
+    for (at, data), (after, _) in pairwise(sent[2:]):
+        ahead = read_block(read_header(data, 64).block)[0].ahead[0]
+        assert after == pytest.approx(at + ahead * SLOT, abs=SLOT / 2), "each announced send takes place"

@@ -1,0 +1,89 @@
+"""The clock of the slots: it follows, it moves to another group's slots, and it stays where it should."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.mac.slot_clock import MEMORY_S, PATIENCE_S, SlotClock
+
+SLOT = 0.015
+
+
+def clock(now: float = 100.0) -> SlotClock:
+    made = SlotClock(SLOT)
+    made.start(now)
+    return made
+
+
+def hear(of: SlotClock, src_id: int, slot: int, shift: float = 0.0, *, trusted: bool = True) -> int | None:
+    """A packet in this slot of the clock, which begins ``shift`` s late."""
+    return of.heard(src_id, slot % 256, of.begin(slot) + shift, trusted=trusted)
+
+
+def test_the_first_packet_heard_decides_where_the_slots_are() -> None:
+    made = SlotClock(SLOT)
+    assert not made.runs
+    assert made.heard(1, 200, 50.0, trusted=True) == 200
+    assert made.begin(200) == pytest.approx(50.0)
+    assert made.slot(50.0 + 2.5 * SLOT) == 202
+
+
+@given(st.floats(-0.2, 0.2), st.integers(0, 100_000))
+def test_it_follows_a_clock_that_is_a_little_off(shift: float, slot: int) -> None:
+    made = clock()
+    for n in range(40):
+        assert hear(made, 1, slot + n, shift * SLOT if not n else 0.0) == slot + n
+    assert made.jumps == 0
+    assert abs(made.begin(slot) - clock().begin(slot)) <= abs(shift) * SLOT + 1e-9
+
+
+@given(st.floats(1.0, 120.0))
+def test_one_of_two_that_meet_moves(ahead: float) -> None:
+    """To the slots of who is ahead by less than half of the numbers."""
+    ones, others = clock(), clock(100.0 - ahead * SLOT)
+    began = 130.0
+    sent = [(of.slot(began) % 256, of.begin(of.slot(began))) for of in (ones, others)]
+    seen_by_ones = ones.heard(2, *sent[1], trusted=True)
+    seen_by_others = others.heard(1, *sent[0], trusted=True)
+    assert (seen_by_ones is None, seen_by_others is None) == (False, True)
+    assert (ones.jumps, others.jumps) == (1, 0)
+
+
+def test_a_robot_whose_clock_has_jumped_is_given_time_to_notice() -> None:
+    made = clock()
+    for n in range(10):
+        hear(made, 1 + n % 2, n)
+    slots = round(PATIENCE_S / SLOT)
+    for n in range(10, 10 + slots - 1, 2):
+        assert hear(made, 1, n, -1.0) is None
+        assert hear(made, 2, n + 1) == n + 1
+    assert made.jumps == 0
+    assert hear(made, 1, 12 + slots, -1.0) is not None, "it may be another group that it has joined"
+
+
+def test_a_clock_that_has_jumped_itself_goes_back_to_the_others() -> None:
+    made = clock()
+    for n in range(10):
+        hear(made, 1 + n % 3, n)
+    assert hear(made, 1, 10, 1.0) is None
+    assert hear(made, 2, 11, 1.0) is not None
+    assert made.jumps == 1
+    assert hear(made, 3, 12) == 12
+
+
+def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
+    made = clock()
+    hear(made, 1, 0)
+    before = made.begin(0)
+    assert hear(made, 2, 1, -1.0, trusted=False) is None
+    assert hear(made, 2, 2, 0.1 * SLOT, trusted=False) == 2
+    assert made.begin(0) == before
+    late = 60 + round(MEMORY_S / SLOT)
+    assert hear(made, 2, late, -0.7, trusted=False) is not None
+
+
+def test_who_is_followed_by_nobody_follows_a_group() -> None:
+    made = clock()
+    assert made.heard(1, 3, made.begin(3) + 0.4, trusted=True, free=True) is not None

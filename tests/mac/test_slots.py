@@ -1,0 +1,196 @@
+"""Slots from what is heard: rate, entry, who yields, maps, names, late hosts, and packets that are not checked."""
+
+from __future__ import annotations
+
+import random
+from functools import partial
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fuzz.loop import work
+from gr_ros2.core.errors import EntryBoundsError
+from gr_ros2.mac.slots import HEARD_S, OPEN, Slots
+from gr_ros2.wire.mac_block import NOBODY, Block, read_block
+
+SLOT = 0.0145
+
+
+def robot(src_id: int = 5, seed: int = 1, **kwargs: float) -> Slots:
+    made = Slots(src_id, SLOT, random.Random(seed), **kwargs)
+    made.clock.start(0.0)
+    return made
+
+
+def send(of: Slots, now: float) -> tuple[float, Block]:
+    """Its next packet: begin and block."""
+    for _ in range(10):
+        now = of.departure(now)
+        data = of.block()
+        if data is not None:
+            return now, read_block(data)[0]
+    raise AssertionError("it never sends")
+
+
+def hear(of: Slots, src_id: int, slot: int, block: Block, *, trusted: bool = True) -> None:
+    of.hear(src_id, block._replace(slot=slot % 256), of.clock.begin(slot), trusted=trusted)
+
+
+def test_a_robot_keeps_what_it_announces() -> None:
+    made = robot()
+    begin, block = send(made, 1.0)
+    for _ in range(50):
+        slot = made.clock.slot(begin + SLOT / 2)
+        hear(made, 1, slot + 1, Block(0, (200, 200), 1, (5, NOBODY)))
+        begin, after = send(made, begin + SLOT / 2)
+        assert made.clock.slot(begin + SLOT / 2) == slot + block.ahead[0]
+        assert made.reserved
+        assert made.clock.slot(begin + SLOT / 2) % OPEN
+        block = after
+
+
+def test_the_interval_leaves_room_for_the_most_robots_that_anybody_hears() -> None:
+    made = robot()
+    _, block = send(made, 1.0)
+    for other in range(19):
+        hear(made, other if other < 5 else other + 1, 70 + other, Block(0, (30, 30), 19, (5, NOBODY)))
+    begin, _ = send(made, 1.5)
+    for _ in range(8):
+        slot = made.clock.slot(begin + SLOT / 2)
+        for other in range(4):
+            hear(made, other, slot + other + 1, Block(0, (300, 300), 19, (5, NOBODY)))
+        begin, block = send(made, begin + SLOT / 2)
+    assert 22 <= block.ahead[1] <= 30
+
+
+def test_no_slot_is_taken_that_a_neighbour_has_announced_or_expects_to_receive_in() -> None:
+    made = robot()
+    for at in range(400):
+        block = Block(0, (7, 7), 1, (5, NOBODY), expected=0x0F0F0F0F)
+        if at % 7 == 0:
+            hear(made, 1, at, block)
+    free = [slot for slot in range(394, 425) if made._free(slot)]
+    assert 399 + 7 not in free
+    assert not any(393 <= slot < 425 and 0x0F0F0F0F >> (slot - 400) & 1 for slot in free if slot >= 400)
+
+
+def test_the_lower_id_keeps_a_slot_that_two_want() -> None:
+    for other, keeps in ((9, True), (2, False)):
+        made = robot(5)
+        begin, block = send(made, 1.0)
+        slot = made.clock.slot(begin + SLOT / 2)
+        wanted = slot + block.ahead[0]
+        hear(made, other, slot + 1, Block(0, (wanted - slot - 1, 9), 1, (5, NOBODY)))
+        at, _ = send(made, begin + SLOT / 2)
+        assert (made.clock.slot(at + SLOT / 2) == wanted) is keeps
+
+
+def test_a_conflict_that_a_neighbour_names_is_given_up() -> None:
+    made = robot(5)
+    begin, block = send(made, 1.0)
+    slot = made.clock.slot(begin + SLOT / 2)
+    ahead = block.ahead[0]
+    hear(made, 9, slot + 1, Block(0, (99, 9), 1, (5, NOBODY), 0, (ahead - 1, 5)))
+    assert slot + ahead not in made._mine
+
+
+def test_two_that_others_want_are_named_with_who_yields() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (40, 20), 3, (5, NOBODY)))
+    hear(made, 2, 61, Block(0, (39, 20), 2, (5, NOBODY)))
+    begin, block = send(made, 62 * SLOT)
+    assert block.conflict == (100 - made.clock.slot(begin + SLOT / 2), 2)
+
+
+def test_the_map_says_where_it_expects_to_receive_and_only_where_somebody_may_be_hidden() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (20, 20), 1, (5, NOBODY)))
+    begin, block = send(made, 61 * SLOT)
+    assert block.expected is None, "both hear one robot"
+    hear(made, 1, 80, Block(0, (20, 20), 2, (5, 7)))
+    hear(made, 1, 300, Block(0, (20, 20), 2, (5, 7)))
+    begin, block = send(made, max(begin + SLOT, 301 * SLOT))
+    slot = made.clock.slot(begin + SLOT / 2)
+    assert block.expected is not None
+    assert {slot + 1 + n for n in range(32) if block.expected >> n & 1} == {
+        at for at in (320, 340) if 0 < at - slot < 33
+    }
+
+
+def test_newcomers_are_named_first() -> None:
+    made = robot(5)
+    for n in range(6):
+        hear(made, 10 + n, 60 + n, Block(0, (40, 40), 6, (10 + n // 2 * 2, 11 + n // 2 * 2)))
+    begin, _ = send(made, 67 * SLOT)
+    hear(made, 3, made.clock.slot(begin) + 2, Block(0, (40, 40), 6, (5, NOBODY)))
+    _, block = send(made, begin + SLOT)
+    assert 3 in block.names
+
+
+def test_an_entrant_that_nobody_names_starts_over() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (200, 200), 2, (NOBODY, NOBODY)))
+    begin, block = send(made, 61 * SLOT)
+    hear(made, 1, made.clock.slot(begin + SLOT / 2) + 1, Block(0, (200, 200), 2, (7, 8)))
+    assert made.departure(begin + SLOT) == pytest.approx(begin + block.ahead[0] * SLOT)
+    assert made.block() is None
+    send(made, begin + block.ahead[0] * SLOT)
+    assert not made.reserved
+
+
+def test_a_host_that_was_late_sends_in_a_later_slot() -> None:
+    made = robot(5)
+    begin, _ = send(made, 1.0)
+    at, _ = send(made, begin + 1.0)
+    assert at >= begin + 1.0 - SLOT / 2
+
+
+def test_packets_that_are_not_checked_keep_their_slots_free_and_do_nothing_else() -> None:
+    made = robot(5)
+    begin, block = send(made, 1.0)
+    slot = made.clock.slot(begin + SLOT / 2)
+    claim = Block(0, (block.ahead[0] - 1, 5), 60, (9, 9), (1 << 32) - 1, (block.ahead[0] - 1, 5))
+    hear(made, 1, slot + 1, claim, trusted=False)
+    at, after = send(made, begin + SLOT / 2)
+    assert made.clock.slot(at + SLOT / 2) == slot + block.ahead[0], "it stays"
+    assert after.heard == 0
+    hear(made, 1, slot + 20, Block(0, (13, 0)), trusted=False)
+    assert not made._free(slot + 33)
+
+
+def test_robots_that_left_are_forgotten() -> None:
+    made = robot(5)
+    for n in range(10):
+        hear(made, 10 + n, 60 + n, Block(0, (40, 40), 10, (5, NOBODY)))
+    begin, _ = send(made, 71 * SLOT)
+    for _ in range(60):
+        begin, block = send(made, begin + SLOT)
+    assert begin > HEARD_S + 2
+    assert block.heard == 0
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 254), st.floats(0, 20), st.binary(min_size=12, max_size=12), st.booleans()),
+        max_size=60,
+    )
+)
+def test_whatever_is_heard_it_sends_in_slots_and_the_work_is_bounded(
+    heard: list[tuple[int, float, bytes, bool]],
+) -> None:
+    made = robot(5)
+    now = 1.0
+    for src_id, at, data, trusted in heard:
+        try:
+            block = read_block(data)[0]
+        except EntryBoundsError:
+            continue
+        lines, _ = work(partial(made.hear, src_id, block, at, trusted=trusted))
+        assert lines < 600
+        now = made.departure(now)
+        sent = made.block()
+        if sent is not None:
+            assert read_block(sent)[0].ahead[0] > 0
+            now += SLOT / 2

@@ -1,0 +1,52 @@
+"""Signals above the noise are counted, and noise is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gnuradio import blocks, gr
+from numpy.typing import NDArray
+
+from gr_ros2.radio.energy import EnergyCounter
+
+
+def counted(samples: NDArray[np.complex64]) -> int:
+    """How many signals a flowgraph counts in them."""
+    graph, counter = gr.top_block(), EnergyCounter()
+    graph.connect(blocks.vector_source_c(samples), counter)
+    graph.run()
+    return counter.bursts
+
+
+def noise(count: int, power: float, seed: int = 1) -> NDArray[np.complex64]:
+    rng = np.random.default_rng(seed)
+    parts = rng.standard_normal((count, 2)) * np.sqrt(power / 2)
+    return (parts[:, 0] + 1j * parts[:, 1]).astype(np.complex64)
+
+
+def test_noise_of_any_level_is_no_signal() -> None:
+    assert counted(noise(1_000_000, 1e-6)) == 0
+    assert counted(np.concatenate([noise(400_000, 1e-6), noise(400_000, 2e-6, 2)])) == 0
+
+
+@pytest.mark.parametrize("snr_db", [8, 20, 60])
+def test_bursts_are_counted(snr_db: float) -> None:
+    samples = noise(1_000_000, 1e-6)
+    for at in range(100_000, 1_000_000, 100_000):
+        samples[at : at + 4096] += noise(4096, 1e-6 * 10 ** (snr_db / 10), at)
+    assert counted(samples) == 9
+
+
+def test_what_was_blanked_is_no_noise() -> None:
+    samples = noise(200_000, 1e-6)
+    samples[50_100:60_000] = 0
+    assert counted(samples) == 0
+
+
+def test_silence_and_samples_that_are_no_numbers_do_no_harm() -> None:
+    samples = np.zeros(100_000, np.complex64)
+    samples[50_000:60_000] = np.nan
+    assert counted(samples) == 0

@@ -1,0 +1,108 @@
+"""Two ends that do not match hear energy, damaged packets or refusals, never "nothing"; two that match say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.radio.findings import about, differences, heard_nobody, in_words
+from gr_ros2.state.keys import new_key_file
+from tests.radio.cables import SerialCable
+from tests.radio.robots import Robot
+from tests.waiting import wait_for
+
+Wrong = Callable[[Path], dict[str, Any]]
+
+
+def pair(folder: Path, wrong: dict[str, Any], **values: Any) -> tuple[Robot, Robot]:
+    """Two robots over ZeroMQ; ``wrong`` is what the second one has otherwise."""
+    addresses = [f"ipc://{folder}/{number}" for number in (1, 2)]
+
+    def robot(number: int, **own: Any) -> Robot:
+        front_end = {"name": "zmq", "bind": addresses[number - 1], "connect": [addresses[2 - number]]}
+        own = {"version": 1, "state": str(folder / f"state-{number}"), **values, **own}
+        if not own["version"]:
+            del own["state"]
+        return Robot(number, front_end, hears=(3 - number,), **own)
+
+    return robot(1), robot(2, **wrong)
+
+
+def key(folder: Path, name: str) -> str:
+    new_key_file(folder / name)
+    return str(folder / name)
+
+
+def test_ends_that_match_say_so_with_figures(tmp_path: Path) -> None:
+    one, two = pair(tmp_path, {}, key=key(tmp_path, "fleet"), channel={"snr_db": 20})
+    with one, two:
+        wait_for(lambda: one.link.stats()["peers"], "a hello")
+        wait_for(lambda: one.link.ping(2)["answered"] >= 3, "answers")
+        told = one.link.ping(2)
+        (peer,) = one.link.stats()["peers"]
+    assert differences(about(one.link.config, one.link.phy), told["about"]) == []
+    assert abs(told["clock_s"]) < 1.0
+    assert (peer["robot"], peer["sealed"], peer["silent"]) == (2, True, False)
+    assert "answered" in in_words(told)
+    assert "SNR" in in_words(told)
+
+
+def test_another_packet_len_is_named(tmp_path: Path) -> None:
+    one, two = pair(tmp_path, {"packet_len": 128})
+    with one, two:
+        wait_for(lambda: (one.link.ping(2)["about"] or {}).get("packet_len") == 128, "what the other end is")
+        (line,) = differences(about(one.link.config, one.link.phy), one.link.ping(2)["about"])
+    assert "packet_len is 128 there and 64 here" in line
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda folder: {"key": key(folder, "other")}, "sealed with a key that is not accepted here"),
+        (lambda _: {"phy": {"name": "gfsk", "sample_rate": 2e6}}, "another phy"),
+        (lambda _: {"phy": {"name": "psk", "sample_rate": 1e6}}, "another sample rate"),
+        (lambda _: {"phy": {"name": "psk", "sample_rate": 2e6, "options": {"modulation": "bpsk"}}}, "another phy"),
+        (lambda _: {"version": 0}, "another version"),
+    ],
+    ids=["key", "phy", "rate", "options", "version"],
+)
+def test_ends_that_do_not_match_hear_something(wrong: Wrong, said: str, tmp_path: Path) -> None:
+    other = wrong(tmp_path)
+    one, two = pair(tmp_path, other, **({"key": key(tmp_path, "fleet")} if "key" in other else {}))
+    with one, two:
+
+        def found() -> bool:
+            if "version" in other:  # which has no hellos
+                two.publish(bytes(304))
+            return any(said in line for line in heard_nobody(one.link.stats()))
+
+        wait_for(found, f"{said!r}")
+        assert one.link.stats()["peers"] == []
+
+
+def test_a_lone_end_says_nothing_is_there(tmp_path: Path) -> None:
+    one, two = pair(tmp_path, {})
+    two.link.stop()
+    with one:
+        wait_for(lambda: one.link.stats()["packets"]["out"] > 3, "some hellos")
+        assert heard_nobody(one.link.stats())[0].startswith("nothing")
+
+
+def test_bytes_that_are_no_packets_are_named(tmp_path: Path) -> None:
+    with SerialCable(tmp_path) as cable:
+        ends = [
+            {"name": "serial", "device": str(end), "framing": framing}
+            for end, framing in zip(cable.ends, ("cobs", "slip"), strict=True)
+        ]
+        phy = {"name": "modem", "options": {"bit_rate": 1e6}}
+        common = {"version": 1, "phy": phy}
+        with (
+            Robot(1, ends[0], state=str(tmp_path / "1"), **common) as one,
+            Robot(2, ends[1], state=str(tmp_path / "2"), **common),
+        ):
+            wait_for(lambda: "no packets" in " ".join(heard_nobody(one.link.stats())), "frames that are no packets")

@@ -1,0 +1,104 @@
+"""The recipe that stops a robot when its link is lost, with two links and a robot that drives."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("zmq", reason="needs pyzmq")
+
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.robot_link import RobotLink
+from gr_ros2.sim.motion import State
+from tests.docs.pages import blocks
+from tests.domains import domain
+from tests.radio.robots import config
+from tests.waiting import PATIENCE_S, wait_for
+
+TWIST = "geometry_msgs/msg/Twist"
+SPEED = 1.0
+
+
+class Wheels:
+    """A robot that obeys the last command, whatever its age."""
+
+    def __init__(self) -> None:
+        self.state, self._at, self._lock = State(0.0, 0.0, 0.0, 0.0, 0.0), time.monotonic(), threading.Lock()
+
+    def obey(self, payload: bytes) -> None:
+        (speed,) = struct.unpack_from("<d", payload, 4)
+        with self._lock:
+            self.state = self._now()._replace(speed=speed)
+
+    def _now(self) -> State:
+        now = time.monotonic()
+        moved, self._at = self.state.after(now - self._at), now
+        return moved
+
+    @property
+    def x(self) -> float:
+        with self._lock:
+            self.state = self._now()
+            return self.state.x
+
+
+@pytest.mark.parametrize("how", ["the operator's link is switched off", "the operator says nothing"])
+def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: str) -> None:
+    recipe: dict[str, Any] = {"__name__": "recipe"}
+    (block,) = (block for block in blocks("python") if block.page == "docs/how-to/stop-on-loss.md")
+    exec(block.text, recipe)
+    addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
+
+    def link(number: int, own: str, other: str) -> RobotLink:
+        values: dict[str, Any] = {"version": 1, "registry": "", "state": str(tmp_path / f"state-{number}")}
+        front_end = {"name": "zmq", "bind": own, "connect": [other]}
+        quick = {"period_s": 0.1, "silence_warn_s": 1.0, "silence_error_s": 2.5}
+        source = {"topics": ["cmd_vel"]} if number == 2 else {"topics": []}
+        return RobotLink(config(number, front_end, **values, ros_source=source, diagnostics=quick))
+
+    wheels, over = Wheels(), threading.Event()
+    drive = b"\0\1\0\0" + struct.pack("<6d", SPEED, 0, 0, 0, 0, 0)
+    with (
+        link(1, *addresses),
+        link(2, *reversed(addresses)) as operator,
+        MemoryMiddleware(domain_id=domain(1)) as robot,
+        MemoryMiddleware(domain_id=domain(2)) as desk,
+    ):
+        robot.subscribe("/robot_1/cmd_vel", TWIST, Qos(), wheels.obey)
+        arguments = (robot, 2, "/robot_1", 0.5, over.is_set)
+        guard = threading.Thread(target=recipe["watch"], args=arguments, daemon=True)
+        guard.start()
+        stick = desk.advertise("/robot_2/cmd_vel", TWIST, Qos())
+        silent = threading.Event()
+
+        def steer() -> None:
+            while not over.wait(0.1):
+                if not silent.is_set():
+                    stick.publish(drive)
+
+        pilot = threading.Thread(target=steer, daemon=True)
+        pilot.start()
+        try:
+            wait_for(lambda: wheels.x > SPEED, "the robot to drive")
+            if "switched off" in how:
+                operator.transmit(on=False)
+            else:
+                silent.set()
+            wait_for(lambda: wheels.state.speed == 0, "the robot to stop")
+            stood = wheels.x
+            time.sleep(1.0)
+            assert wheels.x == stood, "no late command moves it"
+            operator.transmit(on=True)
+            silent.clear()
+            wait_for(lambda: wheels.state.speed == SPEED, "the robot to drive again")
+        finally:
+            over.set()
+            guard.join(PATIENCE_S)
+            pilot.join(PATIENCE_S)
