@@ -125,6 +125,7 @@ class AirtimeClock(Generic[T]):
         while self._may_grant(now):
             self._unused += 1
             given += 1
+        if given:
             self.held, self._holding = self._holding, False
         return given
 

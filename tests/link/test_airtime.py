@@ -169,6 +169,12 @@ def test_credits_that_the_switch_or_the_limit_held_back_are_known() -> None:
     assert clock.grants(11.0) == 1
     assert not clock.held
 
+    both: AirtimeClock[str] = AirtimeClock(0.0)
+    both.switch(on=False)
+    both.switch(on=True)
+    assert both.grants(1.0) == 2
+    assert both.held
+
     limited: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0, limit=AirtimeLimit(AirtimeRule(0.01, window_s=200.0), 1.0))
     held = []
     now = 0.0
