@@ -100,7 +100,7 @@ class SendingSide:
         if now >= self._repeat_at:
             self._repeat(now)
         if messages.deadlines:
-            messages.expire(now, self.pace.interval)
+            messages.expire(now, self.pace.sure_interval(now))
         due: Sequence[Neighbour] = ()
         if self.settings.hears:
             due = [n for n in self._neighbours if n.inbox.reports.due(now) <= now]
@@ -186,7 +186,7 @@ class SendingSide:
 
     def _beacon(self, now: float) -> SentPacket | None:
         """What leaves while nobody is heard for long."""
-        self._messages.expire(now, self.pace.interval)
+        self._messages.expire(now, self.pace.sure_interval(now))
         if now < self._beacon_at:
             return None
         self._beacon_at = now + self.settings.beacon_s
