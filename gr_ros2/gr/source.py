@@ -55,7 +55,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
-    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave.
+    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave;
+    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
     graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
@@ -519,6 +520,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
+            if packets <= 0:
+                self._end.pace.paused()
             self._end.pace.credit(max(0, packets))
             self._live.wake()
 

@@ -53,6 +53,11 @@ class Pace:
         """The PHY can take this many further packets; the first call does what ``use_credit`` does."""
         self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
 
+    def paused(self) -> None:
+        """Sending was held back, by a limit of airtime or its switch: the time since the last packet left is not the
+        interval of the PHY, and a message must not be dropped as if it were."""
+        self._busy_since = inf
+
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit, whatever is submitted."""
