@@ -31,6 +31,7 @@ from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
@@ -476,14 +477,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
         qos = agreed(offers)
-        return self._messages.follow(
-            topic.topic_id,
+        publishers = PublisherQos(
             reliable=qos.reliability != "best_effort",
             latched=all(offer.durability == "transient_local" for offer in offers),
             depth=qos.depth,
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
         )
+        return self._messages.follow(topic.topic_id, publishers)
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
