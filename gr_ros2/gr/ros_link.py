@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -21,10 +21,11 @@ from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
+from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.settings.config import SinkConfig, SourceConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
@@ -102,11 +103,14 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self._start.close()
 
 
-def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: Any) -> RosLink:
+def make_link(
+    *, half_duplex: bool = False, any_length: bool = False, airtime_limit: str | Mapping[str, Any] = "", **values: Any
+) -> RosLink:
     """Make a link from the settings of both halves in one list, as GRC does.
 
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: see :class:`RosSource`
+    :param airtime_limit: how much the radio may send, as its block says: what the robot says about itself becomes rarer
     :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
@@ -122,4 +126,14 @@ def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: 
     source, sink = halves
     if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
         sink = replace(sink, robot_id=source.src_id())
-    return RosLink(source.registry, source, sink, half_duplex=half_duplex, any_length=any_length)
+    limits = airtime_from(airtime_limit)
+    limits.check_seal(encrypts=bool(source.key) and source.seal == "encrypt")
+    rule = limits.rule
+    return RosLink(
+        source.registry,
+        source,
+        sink,
+        half_duplex=half_duplex,
+        any_length=any_length,
+        airtime_share=1.0 if rule is None else sustained(rule),
+    )

@@ -109,7 +109,7 @@ class DeviceFrontEnd(FrontEnd):
         scale = chosen.level / sqrt(phy.burst_power())
         self._shaper = BurstShaper(self.layout, scale, phy.sample_rate, tagged=phy.any_length)
         self._blanker: Blanker | None = None
-        if chosen.half_duplex:
+        if chosen.half_duplex and self.transmits:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
         self._gaps, self._energy = GapCounter(), EnergyCounter()
         self._given, self._taken = _Progress(), _Progress()
@@ -118,7 +118,8 @@ class DeviceFrontEnd(FrontEnd):
         self._offset: float | None = None
         self._offset_at = 0.0
         with self.one_line():
-            self._transmitting = self._open_transmitter()
+            if self.transmits:
+                self._transmitting = self._open_transmitter()
             try:
                 self._receiving = self._open_receiver()
                 self._follow_clock()
@@ -179,14 +180,15 @@ class DeviceFrontEnd(FrontEnd):
 
     @property
     def sink(self) -> Any:
-        return self._shaper
+        return self._shaper if self.transmits else None
 
     @property
     def source(self) -> Any:
         return self._blanker or self._receiving
 
     def wire(self, graph: Any) -> None:
-        graph.connect(self._shaper, self._transmitting)
+        if self.transmits:
+            graph.connect(self._shaper, self._transmitting)
         graph.connect(self._receiving, self._gaps)
         if self._blanker is not None:
             graph.connect(self._receiving, self._blanker)
@@ -208,6 +210,8 @@ class DeviceFrontEnd(FrontEnd):
             self._follow_clock()
         if self._given.still_s(self._gaps.nitems_read(0), now) > SILENT_S:
             raise self._dead("no samples")
+        if self._transmitting is None:
+            return
         taken = self._transmitting.nitems_read(0)
         waiting = taken < self._shaper.nitems_written(0)
         if self._taken.still_s(taken if waiting else None, now) > SILENT_S + self.layout.total / self.phy.sample_rate:

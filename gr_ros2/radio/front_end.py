@@ -60,6 +60,7 @@ class FrontEnd(ABC):
     """The connection of one robot to the air.
 
     :param phy: PHY whose samples it carries, at its sample rate
+    :param transmits: whether it may send; if not, no transmitter is opened
     :param options: fields of ``Options``
     :raises ConfigError: for an option that is unknown or out of range, or a PHY without samples
     :raises RadioError: when the device, address or file cannot be opened
@@ -85,7 +86,7 @@ class FrontEnd(ABC):
     refuses: ClassVar[frozenset[str]] = frozenset()
     """Options of its base class that it does not support. GRC does not offer them."""
 
-    def __init__(self, phy: Phy, **options: Any) -> None:
+    def __init__(self, phy: Phy, *, transmits: bool = True, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
         if not self.carries(type(phy)):
             raise ConfigError(
@@ -97,7 +98,7 @@ class FrontEnd(ABC):
             )
         if not self.any_length:
             phy.pad_all()
-        self.phy = phy
+        self.phy, self.transmits = phy, transmits
 
     @classmethod
     def carries(cls, phy: type[Phy]) -> bool:

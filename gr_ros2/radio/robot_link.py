@@ -17,7 +17,7 @@ from functools import cached_property
 from math import inf
 from typing import Any
 
-from gr_ros2.core.errors import ConfigError, RadioError
+from gr_ros2.core.errors import RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import account_of, own_settings
@@ -32,6 +32,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, introduce, peers, ping
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import shortcut
@@ -45,27 +46,6 @@ _STOP_S, _RETRY_S = 10.0, 1.0
 STALLED_S = 10.0
 """s after which a thread that sends counts as stuck: longer than a busy computer makes it wait."""
 _log = logging.getLogger(__name__)
-
-
-def permitted(config: LinkConfig, front_end: type[FrontEnd]) -> bool:
-    """Whether a link may send.
-
-    :raises ConfigError: for a radio that would send without a word of permission, or without a key
-    """
-    if config.transmit is False or not front_end.has_radio:
-        return config.transmit is not False
-    on_air = f"front_end {front_end.name} sends {front_end.on_air(config.front_end_options)}"
-    if config.transmit is not True:
-        raise ConfigError(
-            f"{on_air}: say once that it may, with --transmit or transmit: true in the file (docs/how-to/radios.md, "
-            "Before you send); --listen-only only receives"
-        )
-    if not config.key and not config.open:
-        raise ConfigError(
-            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
-            "new FILE), or --open, open: true in the file"
-        )
-    return True
 
 
 class RobotLink(Flowgraph):
@@ -149,7 +129,7 @@ class RobotLink(Flowgraph):
 
         :raises RadioError: when it cannot be opened
         """
-        self.front_end = self._front_end_class(self.phy, **self.config.front_end_options)
+        self.front_end = self._front_end_class(self.phy, transmits=self.sends, **self.config.front_end_options)
         try:
             self.radio = Radio(
                 self.phy,
@@ -201,7 +181,8 @@ class RobotLink(Flowgraph):
             self._retry_at = self._clock() + _RETRY_S
             return
         self._retry_at = inf
-        self.radio.gate.transmit(on=transmits)
+        if not transmits:
+            self.radio.transmit(on=False)
         self._connect_radio()
         super().start()
         _log.warning("link %s: front end %s is back", self.config.name, self.front_end.name)
@@ -210,15 +191,18 @@ class RobotLink(Flowgraph):
     def _limit(self) -> AirtimeLimit | None:
         """What limits the airtime, with what earlier starts of this robot have sent."""
         rule = self.config.airtime.rule
-        if rule is None:
+        if rule is None or not self.sends:
             return None
-        file = AirtimeFile(account_of(self.config.ros_source))
+        file = AirtimeFile(account_of(self.config.ros_source.state, self.config.ros_source.src_id()))
         self._stack.callback(file.close)
         longest, now = self.front_end.airtime(), time.monotonic()
         return AirtimeLimit(rule, longest, now=now, spent=file.spent, save=file.save)
 
     def transmit(self, *, on: bool) -> None:
-        """Switch sending off, at once for all packets that have not reached the device, or on again."""
+        """Switch sending off, at once for all packets that have not reached the device, or on again.
+
+        :raises ConfigError: where it only receives
+        """
         self.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
 
