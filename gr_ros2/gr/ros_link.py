@@ -117,7 +117,7 @@ def make_link(
     any_length: bool = False,
     medium: str = "exclusive",
     airtime_s: float = 0.0,
-    guard_s: float = GUARD_S,
+    slot_guard_s: float = GUARD_S,
     **values: Any,
 ) -> RosLink:
     """Make a link from the settings of both halves in one list, as GRC does.
@@ -126,7 +126,7 @@ def make_link(
     :param any_length: see :class:`RosSource`
     :param medium: see :class:`gr_ros2.settings.config.AnyLink`
     :param airtime_s: of the longest packet, s; needed unless ``medium`` is exclusive
-    :param guard_s: silence between the packets of two robots, s: the timing error of the radio
+    :param slot_guard_s: silence between the packets of two robots, s: the timing error of the radio
     :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
@@ -151,6 +151,6 @@ def make_link(
         sink,
         half_duplex=half_duplex or shares,
         any_length=any_length,
-        access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=guard_s),
+        access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s),
         lead_s=LEAD_S,
     )

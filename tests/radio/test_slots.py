@@ -126,7 +126,7 @@ def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Acc
 
 def test_the_block_of_grc_has_slots_too(accesses: list[tuple[Access, float]]) -> None:
     values = {"namespace": "/robot_1", "middleware": "memory"}
-    link = make_link(medium="slots", airtime_s=0.02, guard_s=0.003, **values)
+    link = make_link(medium="slots", airtime_s=0.02, slot_guard_s=0.003, **values)
     link.close()
     ((_, slot_s),) = accesses
     assert slot_s == pytest.approx(0.023)
