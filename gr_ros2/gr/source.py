@@ -31,6 +31,7 @@ from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
@@ -54,7 +55,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
-    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave.
+    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave;
+    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
     graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
@@ -122,8 +124,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """When the sending thread last began to look for packets, s."""
         self._unread = False
         self._counters: Counter[str] = Counter()
-        self.emitted = 0
-        """Number of PDUs that have left."""
+        self.composed = self.emitted = 0
+        """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
         static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
@@ -197,6 +199,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             return inf
         awake = self._live.sleeps_until == -inf
         return max(0.0, now - (self._looked if awake else self._live.sleeps_until))
+
+    def due(self, now: float) -> bool:
+        """Whether a packet has to be composed by now. For an end that knows when its packets leave."""
+        with self._lock:
+            at = self._end.next_departure()
+            return at is not None and at <= now
 
     def rate(self) -> dict[str, str]:
         """With an adaptive rate, the name of the mcs of the newest packet as ``mcs``; otherwise nothing."""
@@ -475,14 +483,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
         qos = agreed(offers)
-        return self._messages.follow(
-            topic.topic_id,
+        publishers = PublisherQos(
             reliable=qos.reliability != "best_effort",
             latched=all(offer.durability == "transient_local" for offer in offers),
             depth=qos.depth,
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
         )
+        return self._messages.follow(topic.topic_id, publishers)
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
@@ -518,6 +526,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
+            if packets <= 0:
+                self._end.pace.paused()
             self._end.pace.credit(max(0, packets))
             self._live.wake()
 
@@ -541,6 +551,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             while self._running and len(packets) < _BATCH and (sent := self._end.next_packet(self.clock())) is not None:
                 packets.append(sent)
             if packets:
+                self.composed += len(packets)
                 self._mcs = packets[-1].mcs
                 self._room.notify_all()
             elif self._running:
