@@ -6,44 +6,36 @@ Invariant: a front end without a radio asks for nothing.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.settings.airtime import AirtimeConfig
 from gr_ros2.settings.fields import Auto
 
-if TYPE_CHECKING:
-    from gr_ros2.radio.config import LinkConfig
-    from gr_ros2.radio.front_end import FrontEnd
 
-
-def permitted(config: LinkConfig, front_end: type[FrontEnd]) -> bool:
-    """Whether a link may send.
-
-    :raises ConfigError: for a radio that would send without a word of permission, or without a key
-    """
-    sends = allowed(config.transmit, front_end, config.front_end_options)
-    if sends and front_end.has_radio and not config.key and not config.open:
-        raise ConfigError(
-            f"{_on_air(front_end, config.front_end_options)}, and there is no key: anybody could read, forge and "
-            "replay its packets; set key (gr-ros2 key new FILE), or --open, open: true in the file"
-        )
-    return sends
-
-
-def allowed(transmit: bool | Auto, front_end: type[FrontEnd], options: Mapping[str, Any]) -> bool:
+def permitted(
+    transmit: bool | Auto, front_end: type[FrontEnd], options: Mapping[str, Any], *, guarded: bool = True
+) -> bool:
     """Whether a front end may send.
 
     :param transmit: what its user has said: yes, no or nothing
     :param options: settings of the front end
-    :raises ConfigError: for a radio without a word
+    :param guarded: whether a key seals the packets, or its user has said that none is needed
+    :raises ConfigError: for a radio that would send without a word, or without a key
     """
     if transmit is False or not front_end.has_radio:
         return transmit is not False
+    on_air = f"front_end {front_end.name} sends {front_end.on_air(options)}"
     if transmit is not True:
         raise ConfigError(
-            f"{_on_air(front_end, options)}: say once that it may, with --transmit or transmit: true in the file or in "
-            "the block of GRC (docs/how-to/radios.md, Before you send); --listen-only or transmit: false only receives"
+            f"{on_air}: say once that it may, with --transmit or transmit: true in the file or in the block of GRC "
+            "(docs/how-to/radios.md, Before you send); --listen-only or transmit: false only receives"
+        )
+    if not guarded:
+        raise ConfigError(
+            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
+            "new FILE), or --open, open: true in the file"
         )
     return True
 
@@ -72,7 +64,3 @@ def check_band(airtime: AirtimeConfig, options: Mapping[str, Any], sample_rate: 
             f"{band.lowest_hz / 1e6:g} to {band.highest_hz / 1e6:g} MHz of airtime.band = {airtime.band!r}; set "
             "another frequency or band"
         )
-
-
-def _on_air(front_end: type[FrontEnd], options: Mapping[str, Any]) -> str:
-    return f"front_end {front_end.name} sends {front_end.on_air(options)}"

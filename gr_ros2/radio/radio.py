@@ -24,7 +24,7 @@ from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
-from gr_ros2.radio.permission import allowed, check_band
+from gr_ros2.radio.permission import check_band, permitted
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
 from gr_ros2.settings.config import ChannelConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO, Auto
@@ -221,7 +221,7 @@ def make_radio(
     impairments = build(ChannelConfig, channel or {}, "channel")
     limits = airtime_from(airtime_limit)
     kind: type[FrontEnd] = FRONT_ENDS.load(front_end)
-    sends = allowed(transmit, kind, options)
+    sends = permitted(transmit, kind, options)
     check_band(limits, options, modem.sample_rate if modem.has_samples else 0.0)
     with ExitStack() as undo:
         opened = kind(modem, transmits=sends, **options)

@@ -101,7 +101,9 @@ class RobotLink(Flowgraph):
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
         self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-        self.sends = permitted(config, self._front_end_class)
+        self.sends = permitted(
+            config.transmit, self._front_end_class, config.front_end_options, guarded=bool(config.key) or config.open
+        )
         """Whether it may send at all."""
         self._open_radio()
         self._stack.callback(self._close_radio)

@@ -25,7 +25,8 @@ MODEM = {"name": "modem", "options": {"bit_rate": 1e6}}
 
 def may_send(front_end: dict[str, Any], **values: Any) -> bool:
     link = config(1, front_end, **{"version": 1, "phy": MODEM, **values})
-    return permitted(link, FRONT_ENDS.load(link.front_end_name))
+    front_end_class = FRONT_ENDS.load(link.front_end_name)
+    return permitted(link.transmit, front_end_class, link.front_end_options, guarded=bool(link.key) or link.open)
 
 
 @pytest.mark.parametrize(
