@@ -194,16 +194,14 @@ class DeviceFrontEnd(FrontEnd):
             graph.connect(self._receiving, self._blanker)
         graph.connect(self.source, self._energy)
 
-    def _silence(self) -> float:
-        """How long nothing is sent after each burst, s."""
-        return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
-
-    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
-        samples = self.phy.on_mcs(mcs).airtime_samples(packet_len)
-        return self.layout.total_of(samples) / self.phy.sample_rate + self._silence()
+    @classmethod
+    def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:
+        samples = phy.on_mcs(mcs).airtime_samples(packet_len)
+        burst = BurstLayout(samples, chosen.lead, chosen.tail, chosen.multiple)
+        return burst.total / phy.sample_rate + _silence(chosen)
 
     def ahead(self) -> float:
-        return 0.0 if self._silence() else _LEAD_S
+        return 0.0 if _silence(self.options) else _LEAD_S
 
     def check(self, now: float) -> None:
         if self._offset is not None and now - self._offset_at > _FOLLOWED_S:
@@ -314,6 +312,11 @@ class DeviceFrontEnd(FrontEnd):
                 f"front_end {self.name}: args = {self.options.args!r}: {reason}; is the device plugged in, and free? "
                 f"{self.find_with} lists devices, args look like {self.example_args}"
             ) from error
+
+
+def _silence(chosen: DeviceOptions) -> float:
+    """How long nothing is sent after each burst, s."""
+    return chosen.guard_s + (chosen.turnaround_s if chosen.half_duplex else 0.0)
 
 
 class _Progress:

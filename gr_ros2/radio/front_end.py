@@ -149,7 +149,15 @@ class FrontEnd(ABC):
         :param packet_len: length of the packet, bytes; None: that of the longest
         :param mcs: with an adaptive rate, the MCS that it is sent with
         """
-        return self.phy.airtime(packet_len, mcs) + float(self.options.guard_s)
+        return self.airtime_with(self.phy, self.options, packet_len, mcs)
+
+    @classmethod
+    def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:
+        """What :meth:`airtime` says where a front end has these options, without one that is open.
+
+        :param chosen: an object of ``Options``
+        """
+        return phy.airtime(packet_len, mcs) + float(chosen.guard_s)
 
     def ahead(self) -> float | None:
         """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a
