@@ -277,7 +277,10 @@ class Slots:
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
-            robot.entered = slot
+            # Where all hear all, both announcements were lost. Where somebody is hidden, the slot more that an entry
+            # costs makes room for those who collide unheard.
+            if slot > robot.last + self._lately() or self._hidden_at >= slot - self._memory():
+                robot.entered = slot
         self._heard_at = max(self._heard_at, slot)
         for at in robot.ahead:
             if at not in ahead and self._taken.get(at) == src_id:
