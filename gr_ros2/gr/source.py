@@ -31,6 +31,7 @@ from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
@@ -54,7 +55,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
-    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave.
+    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave;
+    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
     graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
@@ -475,14 +477,14 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
         qos = agreed(offers)
-        return self._messages.follow(
-            topic.topic_id,
+        publishers = PublisherQos(
             reliable=qos.reliability != "best_effort",
             latched=all(offer.durability == "transient_local" for offer in offers),
             depth=qos.depth,
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
         )
+        return self._messages.follow(topic.topic_id, publishers)
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
@@ -518,6 +520,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
         with self._lock:
+            if packets <= 0:
+                self._end.pace.paused()
             self._end.pace.credit(max(0, packets))
             self._live.wake()
 

@@ -22,11 +22,12 @@ from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
 from gr_ros2.phy.threads import BlockThread
 
-_ONE = pmt.from_long(1)
+_ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
 
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
+    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come; 0: the limit or the
+    switch held the next one back).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
@@ -150,6 +151,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
+            if credits and self._clock.held:
+                self.message_port_pub(CREDIT, _HELD_BACK)
             for _ in range(credits):
                 self.message_port_pub(CREDIT, _ONE)
 

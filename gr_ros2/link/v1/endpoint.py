@@ -127,7 +127,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._sending.mode != "off" and self.window.unconfirmed(self._now)
+        mending = self._sending.repairs.mode != "off" and self.window.packets.unconfirmed(self._now)
         return self.messages.idle and not mending
 
     @property
@@ -221,7 +221,7 @@ class EndpointV1:
     def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = max(self._now, now)
-        self._sending.received()
+        self._sending.repairs.received()
         return self._receiving.receive(arrival, now)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:

@@ -42,7 +42,7 @@ from gr_ros2.core.errors import (
 )
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.repair import START
+from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
