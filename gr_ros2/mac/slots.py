@@ -132,6 +132,10 @@ class Slots:
 
     def block(self) -> bytes | None:
         """See :class:`gr_ros2.link.access.Access`."""
+        if not self._mine:  # asked ahead of the end of its silence: nobody is there whose slots it could take
+            assert self._since is not None
+            self.clock.start(self._since + LISTEN_S)
+            return None
         slot = self._mine.pop(0)
         self._sweep(slot)
         alone = self._alone(slot)
