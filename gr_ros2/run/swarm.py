@@ -22,7 +22,7 @@ from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, 
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.run.simulate import EventLoop
-from gr_ros2.run.swarm_traffic import OwnOnly, Relaying, Traffic
+from gr_ros2.run.swarm_traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.settings.config import ChannelConfig
 
 
@@ -125,7 +125,7 @@ class SwarmRobot:
         self.over = False
         self.left: list[tuple[float, bool]] = []
         """When each of its packets left, and whether it carried another robot's message."""
-        self.traffic: Traffic = Relaying(number) if config.relay else OwnOnly()
+        self.traffic: SwarmTraffic = ByGain(number) if config.relay else OwnOnly()
         self._config, self._until, self._on = config, until, on
         self._rng = rng
         self._ppm = 1 + (config.ppm * 1e-6 if number == 0 else rng.uniform(-1, 1) * config.ppm * 1e-6)

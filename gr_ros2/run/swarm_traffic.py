@@ -8,17 +8,16 @@ from __future__ import annotations
 from struct import Struct
 from typing import Protocol
 
-from gr_ros2.relay.gain import TOLD, Gains, Stream
-from gr_ros2.wire.control import NEWEST_LEN, Newest
+from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.wire.control import Newest, read_control, write_control
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import RELAYED_LEN, Relayed, read_relayed, write_relayed
-from gr_ros2.wire.v1 import RELAYED_TOPIC, Part, read_body, write_body
 
 _stamp = Struct(">d")
-_ROOM = 4 + RELAYED_LEN + _stamp.size + TOLD * NEWEST_LEN
+_MESSAGE_LEN = RELAYED_LEN + _stamp.size
 
 
-class Traffic(Protocol):
+class SwarmTraffic(Protocol):
     """The messages of one robot. Times in s of its own clock; when a message was made, by the swarm's clock.
 
     :ivar relays: whether the newest packet carries a message of another robot
@@ -49,7 +48,7 @@ class OwnOnly:
         return src_id, _stamp.unpack(content)[0]
 
 
-class Relaying:
+class ByGain:
     """Each packet carries the message that is worth most to those who hear the robot."""
 
     def __init__(self, src_id: int) -> None:
@@ -70,16 +69,15 @@ class Relaying:
         else:
             message = self._newest[stream.origin]
             message = message._replace(hops=min(message.hops + 1, 63))
-        return write_body([Part(RELAYED_TOPIC, write_relayed(message)), *self._gains.tells()], _ROOM)
+        return write_relayed(message) + b"".join(map(write_control, self._gains.tells()))
 
     def take(self, src_id: int, block: Block | None, content: bytes, now: float) -> tuple[int, float]:
         gains = self._gains
         if block is not None:
             gains.neighbour(src_id, now, [name for name in block.names if name != NOBODY], block.heard)
-        part, *told = read_body(content, _ROOM)
-        assert isinstance(part, Part)
-        message = read_relayed(part.payload)
-        for newest in told:
+        message, at = read_relayed(content[:_MESSAGE_LEN]), _MESSAGE_LEN
+        while at < len(content):
+            at, newest = read_control(content, at, len(content))
             assert isinstance(newest, Newest)
             gains.told(src_id, newest)
         if gains.message(src_id, Stream(message.origin, message.start, message.topic_id), message.number, now):
