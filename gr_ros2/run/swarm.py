@@ -21,8 +21,8 @@ from gr_ros2.mac import read_block
 from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.relay.traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.run.simulate import EventLoop
-from gr_ros2.run.swarm_traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.settings.config import ChannelConfig
 
 
