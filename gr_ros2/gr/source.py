@@ -111,8 +111,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """When the sending thread last began to look for packets, s."""
         self._unread = False
         self._counters: Counter[str] = Counter()
-        self.emitted = 0
-        """Number of PDUs that have left."""
+        self.composed = self.emitted = 0
+        """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
         self._port = PduPort(self)
         self.message_port_register_in(CREDIT)
@@ -162,6 +162,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             return inf
         awake = self._live.sleeps_until == -inf
         return max(0.0, now - (self._looked if awake else self._live.sleeps_until))
+
+    def due(self, now: float) -> bool:
+        """Whether a packet has to be composed by now. For an end that knows when its packets leave."""
+        with self._lock:
+            at = self._end.next_departure()
+            return at is not None and at <= now
 
     def rate(self) -> dict[str, str]:
         """With an adaptive rate, the name of the mcs of the newest packet as ``mcs``; otherwise nothing."""
@@ -279,6 +285,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             while self._running and len(packets) < _BATCH and (sent := self._end.next_packet(self.clock())) is not None:
                 packets.append(sent)
             if packets:
+                self.composed += len(packets)
                 self._mcs = packets[-1].mcs
                 self._room.notify_all()
             elif self._running:

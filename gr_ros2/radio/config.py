@@ -55,10 +55,6 @@ class LinkConfig(AnyLink):
     def _known(self) -> LinkConfig:
         if not self.registry and not self.version:
             raise ValueError("registry is missing, and version 0 needs the same one at every robot")
-        if self.medium != "exclusive":
-            raise ValueError(
-                f"medium = {self.medium!r}: a live link has no medium access yet; leave it out, or run a scenario"
-            )
         if "name" not in self.front_end:
             raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
         for key, name, table in (

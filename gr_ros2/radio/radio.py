@@ -76,7 +76,7 @@ class Radio(PacketPath, HierBlock):
             timed=front_end.clock_offset is not None,
             clock=front_end.clock,
         )
-        front_end.follow(self._at_rest)
+        front_end.follow(self.at_rest)
         self.msg_connect(self, "pdus", self._gate, "pdus")
         self.msg_connect(self._gate, "credit", self, "credit")
         last: Any = self._gate
@@ -92,7 +92,7 @@ class Radio(PacketPath, HierBlock):
             last = self._follow(last, self._loss)
         self._follow(last, self)
 
-    def _at_rest(self) -> int | None:
+    def at_rest(self) -> int | None:
         """How many packets the front end gets as samples, of those that have passed; None while one is due."""
         passed = self.gate.at_rest()
         return None if passed is None else passed - self.refused

@@ -8,6 +8,7 @@ that was opened. If opening fails half-way, everything is released too.
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -21,8 +22,11 @@ from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import account_of, own_settings
+from gr_ros2.link.access import Access
+from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
 from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.mac import access_of
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import configured
@@ -172,6 +176,8 @@ class RobotLink(Flowgraph):
         if self.sends:  # without credit, nothing leaves
             self.msg_connect(sends, "pdus", self.radio, "pdus")
             self.msg_connect(self.radio, "credit", sends, "credit")
+            if self._shares:
+                self.front_end.follow(self._at_rest)
         self.msg_connect(self.radio, "pdus", receives, "pdus")
 
     def _lose(self, error: RadioError) -> None:
@@ -230,10 +236,12 @@ class RobotLink(Flowgraph):
             self._sink_config(),
             middleware=graphs,
             reports=self.sends,
-            half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            half_duplex=self._shares or getattr(self.front_end.options, "half_duplex", False),
             any_length=self.phy.any_length,
             mcs_table=self.phy.mcs_table,
             airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
+            access=self._access() if self.sends else lambda _: None,
+            lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
             observer=observer,
             clock=self._clock,
         )
@@ -243,8 +251,32 @@ class RobotLink(Flowgraph):
         """What sends and receives; where the front end loops back, what receives."""
         self._blocks = both, both
 
+    @property
+    def _shares(self) -> bool:
+        """Whether other robots send on its channel."""
+        return self.config.medium != "exclusive"
+
+    def _access(self) -> Callable[[int], Access | None]:
+        """What decides when it sends. The guard between two robots is what its front end may be late by."""
+        airtime_s, seed = self.front_end.airtime(), secrets.randbits(32)
+        return access_of(self.config.medium, airtime_s, seed, guard_s=self.front_end.timing_error_s)
+
+    def _at_rest(self) -> int | None:
+        """As :meth:`Radio.at_rest`; None also while a packet is composed or has to be."""
+        if self.source.composed != self.radio.gate.arrived or self.source.due(self._clock()):
+            return None
+        return self.radio.at_rest()
+
     def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """A robot that receives its own packets has two endpoints: one sends and one receives."""
+        """A robot that receives its own packets has two endpoints: one sends and one receives.
+
+        :raises ConfigError: it should share its channel with others
+        """
+        if self._shares:
+            raise ConfigError(
+                f"medium = {self.config.medium!r}: front_end {self.front_end.name} reaches no other robot; leave it "
+                "out, or set another front_end"
+            )
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
         carried: dict[str, Any] = {"any_length": self.phy.any_length, "mcs_table": self.phy.mcs_table}

@@ -60,6 +60,8 @@ _MOST_STEP_S = 1.0
 """s by which one word of a medium process moves the clock at most."""
 _ANSWER_S = 0.5
 """s after which a time is not answered; the medium process sends it again."""
+_LOCKED_S = 0.001
+"""``timing_error_s`` in lock step, where the medium process tells when a burst began and begins it when asked."""
 MAX_SENDERS = 256
 """Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
 _MAX_PORT = 65535
@@ -159,6 +161,8 @@ class ZmqFrontEnd(FrontEnd):
         self._counters: Counter[str] = Counter()
         self._passed: Callable[[], int | None] = lambda: None
         self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
+        if self._medium_clock is not None:
+            self.timing_error_s = _LOCKED_S
         try:
             publisher = self._socket(zmq.PUB)
             open_socket(publisher.bind, "bind", self.options.bind)
@@ -199,7 +203,7 @@ class ZmqFrontEnd(FrontEnd):
         self._medium_clock.tick(medium, at)
         limit = time.monotonic() + _ANSWER_S
         while self._passed() != self._counters["bursts_out"]:
-            if time.monotonic() > limit:
+            if time.monotonic() > limit or self._sink.closed:
                 return
             time.sleep(_LOOK_S)
         self._sink.answer(at)
@@ -300,6 +304,11 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         with self._sending:
             if not self._socket.closed:  # by close(), while arrivals were about to answer
                 self._socket.send(header + samples, zmq.NOBLOCK)
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is sent any more."""
+        return bool(self._socket.closed)
 
     def close(self) -> None:
         """Send nothing from now on. Idempotent."""

@@ -110,7 +110,7 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
     offered = [parameter["id"] for parameter in loaded["parameters"]]
     wanted = {item.name for _, config in halves.values() for item in fields(config)}
     assert len(offered) == len(set(offered))
-    assert set(offered) == wanted | {"half_duplex", "any_length"}
+    assert set(offered) == wanted | {"half_duplex", "any_length", "medium", "airtime_s", "slot_guard_s"}
     values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
     assert (values["version"], values["compression"], values["repair"]) == ("1", '"auto"', '"auto"')
     for name in offered:

@@ -86,7 +86,7 @@ class SendingSide:
             return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", now)
         if now >= self._repeat_at:
             self._repeat(now)
-        messages.expire(now, self.pace.interval)
+        messages.expire(now, self.pace.sure_interval(now))
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
@@ -135,7 +135,7 @@ class SendingSide:
 
     def _beacon(self, now: float) -> SentPacket | None:
         """What leaves while nobody is heard for long."""
-        self._messages.expire(now, self.pace.interval)
+        self._messages.expire(now, self.pace.sure_interval(now))
         if now < self._beacon_at:
             return None
         self._beacon_at = now + self.settings.beacon_s
