@@ -186,7 +186,7 @@ def _live(running: RobotLink) -> LiveRun:
         duration_s=0.0,
         packet_len=running.config.packet_len,
         registry=running.registry,
-        topics={(source.src_id, topic.topic_id): name for name, topic in source.subscribed.items()},
+        topics={(source.src_id, topic.topic_id): name for name, topic in source.subscriptions.subscribed.items()},
         sources={source.src_id: source},
         links=(running.radio,),
         ledger=None,

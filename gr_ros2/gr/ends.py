@@ -27,7 +27,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
-from gr_ros2.link.v1.neighbours import Save
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect, robot_of

@@ -281,7 +281,7 @@ class RobotLink(Flowgraph):
     @property
     def registry(self) -> Registry:
         """The topics that are sent; it grows if they are looked for on the ROS graph."""
-        return self.source.registry
+        return self.source.subscriptions.registry
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
         """The participants of source and sink: one for both if they are on the same graph."""
