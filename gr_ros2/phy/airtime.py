@@ -68,6 +68,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._running = False
         self._looks_at = inf
         """When its thread began with what it does, or looks again at the latest, s."""
+        self.arrived = 0
+        """Packets that have come."""
         self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
@@ -140,6 +142,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
         with self._changed:
             self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            self.arrived += 1
             self._changed.notify_all()
 
     def _run(self) -> None:

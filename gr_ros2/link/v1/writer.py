@@ -50,6 +50,7 @@ class PacketWriter:
     :param observer: called with every packet
     :param shares: packets carry blocks for medium access
     :ivar block: that of the next packet
+    :ivar leave_at: s, when its burst has to begin; None for as soon as possible
     :ivar room: bytes of the longest body
     :ivar sealed: whether packets are sealed
     """
@@ -68,6 +69,7 @@ class PacketWriter:
         shares: bool = False,
     ) -> None:
         self.block = b""
+        self.leave_at: float | None = None
         self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
         self._packet_len = settings.packet_len
@@ -159,7 +161,9 @@ class PacketWriter:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        sent = SentPacket(data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs)
+        sent = SentPacket(
+            data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs, self.leave_at
+        )
         if self._observer is not None:
             self._observer(sent)
         return sent
