@@ -37,6 +37,7 @@ class AirtimeClock(Generic[T]):
     :raises ConfigError: for a negative airtime, lead or ahead
     :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``
     :ivar used: s of airtime of all packets taken
+    :ivar held: whether the credits given last had been held back by the limit or the switch
     """
 
     def __init__(
@@ -66,6 +67,9 @@ class AirtimeClock(Generic[T]):
         self._transmits = True
         self.refused: Counter[str] = Counter()
         self.used = 0.0
+        self.held = False
+        self._holding = False
+        """Whether the limit or the switch has held back the next credit."""
 
     def offer(self, packet: T, now: float, airtime: float | None = None, leave_at: float | None = None) -> float | None:
         """A packet arrives; it uses a credit if one is open.
@@ -104,6 +108,7 @@ class AirtimeClock(Generic[T]):
         """Let packets pass, or refuse those that wait and all that come."""
         self._transmits = on
         if not on:
+            self._holding = True
             self.refused["transmit_off"] += len(self._queue)
             self._queue.clear()
 
@@ -120,6 +125,8 @@ class AirtimeClock(Generic[T]):
         while self._may_grant(now):
             self._unused += 1
             given += 1
+        if given:
+            self.held, self._holding = self._holding, False
         return given
 
     def next_timeout(self, now: float) -> float | None:
@@ -146,7 +153,11 @@ class AirtimeClock(Generic[T]):
 
     def _may_grant(self, now: float) -> bool:
         at = self._next_grant(now)
-        return at is not None and at <= now and (self.limit is None or self.limit.reserve(now, self._airtime))
+        if at is None or self.limit is None:
+            return at is not None and at <= now
+        allowed = at <= now and self.limit.reserve(now, self._airtime)
+        self._holding |= not allowed and self._promised_until(now) - self._lead <= now
+        return allowed
 
     def _next_grant(self, now: float) -> float | None:
         """When the next credit may be granted, None if only an arrival or the switch can change that."""

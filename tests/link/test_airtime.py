@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import AirtimeClock
+from gr_ros2.link.airtime_limit import AirtimeLimit
+from gr_ros2.settings.airtime import AirtimeRule
 
 
 def packets(due: list[tuple[float, str]]) -> list[str]:
@@ -149,3 +151,39 @@ def test_a_packet_that_asks_for_a_time_begins_then_and_later_ones_behind_it() ->
     assert clock.offer("missed", 15.0, leave_at=14.5) == 15.0
     assert clock.due(11.999) == []
     assert clock.due(15.0) == [(12.0, "slot"), (13.0, "next"), (15.0, "missed")]
+
+
+def test_credits_that_the_switch_or_the_limit_held_back_are_known() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0)
+    assert clock.grants(0.0) == 1
+    assert not clock.held
+    clock.switch(on=False)
+    assert clock.grants(5.0) == 0
+    clock.switch(on=True)
+    clock.offer("first", 9.0)
+    clock.due(10.0)
+    assert clock.grants(10.0) == 1
+    assert clock.held
+    clock.offer("second", 10.0)
+    clock.due(11.0)
+    assert clock.grants(11.0) == 1
+    assert not clock.held
+
+    both: AirtimeClock[str] = AirtimeClock(0.0)
+    both.switch(on=False)
+    both.switch(on=True)
+    assert both.grants(1.0) == 2
+    assert both.held
+
+    limited: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0, limit=AirtimeLimit(AirtimeRule(0.01, window_s=200.0), 1.0))
+    held = []
+    now = 0.0
+    while len(held) < 5:
+        if limited.grants(now):
+            held.append(limited.held)
+            limited.offer("a packet", now)
+        again = limited.next_timeout(now)
+        assert again is not None
+        limited.due(again)
+        now = max(again, now + 1e-6)
+    assert held == [False, True, True, True, True]
