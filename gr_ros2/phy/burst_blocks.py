@@ -282,7 +282,7 @@ def _number(value: int) -> Any:
 
 
 class BurstSink(ReceiverBlock):
-    """Complex stream in; message ports out: `pdus`, packets whose CRC-32 is right, and `points`, what they look like."""
+    """Complex stream in; message ports out: `pdus`, packets whose CRC-32 is right, and `points`, how they look."""
 
     def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx")
