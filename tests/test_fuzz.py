@@ -28,6 +28,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import fuzz.framing
 import fuzz.kernels
 import fuzz.medium
+import fuzz.pings
 import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
@@ -45,6 +46,7 @@ HARNESSES = {
     "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
     "medium": (fuzz.medium.medium, fuzz.medium.corpus),
+    "pings": (fuzz.pings.pings, fuzz.pings.corpus),
     "wifi": (fuzz.wifi.wifi, fuzz.wifi.corpus),
 }
 COUNTS = {
@@ -61,6 +63,7 @@ COUNTS = {
     "dashboard": 300,
     "framing": 1_000,
     "kernels": 400,
+    "pings": 400,
     "wifi": 200,
 }
 if find_spec("bokeh") is not None:
