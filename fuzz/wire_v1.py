@@ -57,7 +57,9 @@ def corpus() -> list[bytes]:
         About(220, 1, 2, b"x"),
         Heard(1, bytes(4), 9),
     )
-    found.append(encode(PacketV1(Header(3, False, 2, 7), trials, RepairHeader(5, clear=True)), 120, BOOT)[: -v1.CRC_LEN])
+    found.append(
+        encode(PacketV1(Header(3, False, 2, 7), trials, RepairHeader(5, clear=True)), 120, BOOT)[: -v1.CRC_LEN]
+    )
     for mask in (1, 0xFF, 0x101, (1 << 127) - 3):
         repair = v1.read_repair_header(v1.write_repair_header(RepairHeader(9, mask, True)), 0, 20)
         combination = PacketV1(Header(3, False, 2, 7), (), repair, rng.randbytes(40))

@@ -22,18 +22,17 @@ from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
 from gr_ros2.phy.threads import BlockThread
 
-_ONE = pmt.from_long(1)
-
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come).
+    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come; it is the time in s at
+    which the air is free for it).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
     :param lead: s before the channel is free at which a credit is given
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
-    :param timed: see :class:`AirtimeClock`
+    :param timed, listens: see :class:`AirtimeClock`
     :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
@@ -50,12 +49,13 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         ahead: float | None = None,
         limit: AirtimeLimit | None = None,
         timed: bool = False,
+        listens: Callable[[], float] | None = None,
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed)
+        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed, listens=listens)
         self._now = clock
         self._left = 0
         """Packets that have passed or are about to."""
@@ -101,6 +101,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         with self._changed:
             clock, limit = self._clock, self._clock.limit
             told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
+            told["deferred"] = clock.deferred
             if limit is None:
                 return told
             now = self._now()
@@ -147,11 +148,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
+                free = self._clock.free
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
             for _ in range(credits):
-                self.message_port_pub(CREDIT, _ONE)
+                self.message_port_pub(CREDIT, pmt.from_double(free))
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""

@@ -6,6 +6,7 @@ direction waits for the other. Received samples can be impaired only if the chan
 
 from __future__ import annotations
 
+import random
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
 from gr_ros2.settings.config import ChannelConfig, build
 
+_LEAST_WAIT_S = 0.001
+"""s after which a channel that was not clear is listened to again, at least."""
+
 
 class Radio(PacketPath, HierBlock):
     """Message ports `pdus` in, `pdus` out and `credit` out (one message: one more packet may come).
@@ -33,6 +37,7 @@ class Radio(PacketPath, HierBlock):
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param limit: what limits the airtime; None = nothing
+    :param listens: whether each packet waits until nobody else is heard
     :param changeable: add a channel that can be changed while running, if the front end has no radio
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
@@ -48,6 +53,7 @@ class Radio(PacketPath, HierBlock):
         channel: ChannelConfig | None = None,
         record: str = "",
         limit: AirtimeLimit | None = None,
+        listens: bool = False,
         changeable: bool = False,
         instrumented: bool = False,
     ) -> None:
@@ -74,6 +80,7 @@ class Radio(PacketPath, HierBlock):
             ahead=front_end.ahead(),
             limit=limit,
             timed=front_end.clock_offset is not None,
+            listens=_Listener(front_end) if listens else None,
             clock=front_end.clock,
         )
         front_end.follow(self._at_rest)
@@ -157,6 +164,26 @@ class Radio(PacketPath, HierBlock):
     @property
     def _medium(self) -> str:
         return f"front_end {self.front_end.name}"
+
+
+class _Listener:
+    """s after which to listen again; 0 if the channel is clear. Of two robots that wait for the end of a third one's
+    packet, one begins first: the time is random, up to that of a packet.
+
+    :raises ConfigError: for a front end that cannot listen
+    """
+
+    def __init__(self, front_end: FrontEnd) -> None:
+        if front_end.busy is None:
+            raise ConfigError(
+                f"airtime.listen_before_send: front_end {front_end.name} measures no power where it sends, with these "
+                "settings; take a front end of an SDR with half_duplex: true and one frequency, or leave it out"
+            )
+        self._busy, self._rng = front_end.busy, random.Random()
+        self._most = max(front_end.airtime(), 2 * _LEAST_WAIT_S)
+
+    def __call__(self) -> float:
+        return self._rng.uniform(_LEAST_WAIT_S, self._most) if self._busy() else 0.0
 
 
 def make_radio(

@@ -114,10 +114,11 @@ class EndpointV1:
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
-    def submitted(self, topic_id: int, now: float) -> None:
+    def submitted(self, topic_id: int, now: float) -> bool:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self._now = max(self._now, now)
         self._hold.submitted(topic_id, now)
+        return self.pace.behind
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""

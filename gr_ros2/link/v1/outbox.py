@@ -162,13 +162,15 @@ class Filling:
     lifetimes: tuple[Lifetime, ...]
     qos: int
     used: int
+    since: float
+    """When the first of its messages that no ``max_rate`` holds back was submitted, s; infinite if there is none."""
 
 
 class Owner(Protocol):
     """What an outbox tells its endpoint."""
 
-    def submitted(self, topic_id: int, now: float) -> None:
-        """A message of a topic has come."""
+    def submitted(self, topic_id: int, now: float) -> bool:
+        """A message of a topic has come; returns whether the computer is too slow for what comes."""
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """The table of topics has changed.
@@ -275,7 +277,8 @@ class Outbox:
         line = self._lines.get(topic_id)
         if line is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
-        self._owner.submitted(topic_id, now)
+        if self._owner.submitted(topic_id, now) and line.topic.is_topic and not line.kept:
+            self._drop(list(line.queue.shed(now)))
         self._turns.join(topic_id)
         serial = self._serial
         self._serial += 1
@@ -546,7 +549,8 @@ class Outbox:
                 self._left(message, line, now)
         self._turns.sent(self._holder)
         stats.entries += len(picks)
-        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used)
+        free = (message.submitted for message, _ in picks if not self._lines[message.topic_id].topic.options.max_rate)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, min(free, default=inf))
 
     def _left(self, message: Message, line: _Line, now: float) -> None:
         """A message has left whole: older messages that it replaces are over."""

@@ -210,6 +210,7 @@ class SendingSide:
 
     def _new(self, filling: Filling, due: Sequence[Neighbour], now: float) -> SentPacket:
         """A source packet, with a report where there is room for one."""
+        self.pace.waited(filling.since, now)
         entries = filling.parts
         free = self._writer.room - filling.used
         for neighbour in due:
