@@ -65,7 +65,8 @@ def slow_computer() -> list[Row]:
     for topic in slow.result.topics:
         dropped.update(topic.ledger)
     fates = ", ".join(f"{count} {row}" for row, count in dropped.most_common())
-    had = f"{slow.cores:.2f} of a core, {free.cores:.2f} are needed"
+    inside = max(topic.age_s.mean or 0.0 for topic in slow.result.topics if topic.sent > 1)
+    had = f"in the link alone {inside:.2f} s; {slow.cores:.2f} of a core, {free.cores:.2f} are needed"
     what = "a third of the processor: "
     return [
         _worst(f"{what}oldest mean age", slow.ages, free.ages, MOST_AGE_S, had),

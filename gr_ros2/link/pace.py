@@ -41,8 +41,8 @@ class Pace:
         """Since when the PHY could have sent what the newest credit asks for; infinite if it does not say so."""
         self._idle, self._window = 0.0, -inf
         """s for which the PHY was idle although a message waited, since the begin of the window."""
-        self.behind = False
-        """Whether it was so for more than half of a window: the computer is too slow, not the air."""
+        self._slow = False
+        """Whether it was so for more than half of the last window."""
         self.change(packet_rate)
 
     def change(self, packet_rate: float | Auto) -> None:
@@ -108,8 +108,13 @@ class Pace:
         """A message leaves that could have left since then, as far as it is known here."""
         self._idle += max(0.0, now - max(since, self._ready, self.slot))
         if now - self._window >= _WINDOW_S:
-            self.behind = self._idle > (now - self._window) / 2
+            self._slow = self._idle > (now - self._window) / 2
             self._idle, self._window = 0.0, now
+
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow, not the air."""
+        stuck = bool(self._credits) and now - max(self._ready, self.slot) > _WINDOW_S
+        return self._slow or stuck
 
     def left(self, now: float, *, waiting: bool) -> None:
         """A packet left.

@@ -97,7 +97,7 @@ def test_an_air_that_is_too_slow_drops_at_the_bound_of_the_queue() -> None:
 def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_computer_is() -> None:
     source = robot(queue="fifo")
     overloaded(source, airtime=0.005, seconds=3.0)
-    assert source.end.pace.behind
+    assert source.end.pace.behind(3.0)
     leave(source, 4.0)
     before = source.end.sent.refused.copy()
     left = 0
@@ -109,6 +109,26 @@ def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_compute
         left += 0 if sent is None else sum(isinstance(part, Part) for part in sent.packet.entries)
     assert left >= 50
     assert source.end.sent.refused == before
+
+
+def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> None:
+    source = robot(queue="fifo")
+    leave(source, 0.0)
+    source.end.pace.credit(1, ready=0.0)
+    for tick in range(200):
+        source.end.messages.submit(0, bytes(45), 1.0 + tick / 50)
+    assert set(refused(source.end)) == {"overload"}
+    assert source.end.messages.queued() == {0: 26}
+
+
+def test_a_robot_that_nobody_hears_is_not_too_slow() -> None:
+    rows = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
+    source = Robot(1, Registry(rows), hears=True, beacon_s=1.0)
+    leave(source, 0.0)
+    source.end.pace.credit(1, ready=0.0)
+    for tick in range(200):
+        source.end.messages.submit(0, bytes(45), 5.0 + tick / 50)
+    assert set(refused(source.end)) == {"queue_bound"}
 
 
 def test_messages_that_max_rate_holds_back_do_not_wait_for_the_computer() -> None:

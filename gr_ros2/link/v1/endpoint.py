@@ -118,7 +118,7 @@ class EndpointV1:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self._now = max(self._now, now)
         self._hold.submitted(topic_id, now)
-        return self.pace.behind
+        return self._sending.behind(now)
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""

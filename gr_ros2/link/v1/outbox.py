@@ -137,6 +137,11 @@ class _Line:
         return self.latched or self.topic.options.keep_s > 0
 
     @property
+    def is_stream(self) -> bool:
+        """Whether its messages are useless when newer ones have come, should the computer be too slow for all."""
+        return self.topic.is_topic and not self.kept and not self.topic.options.max_rate
+
+    @property
     def kept_depth(self) -> int:
         """How many messages late robots and late subscribers get.
 
@@ -277,7 +282,7 @@ class Outbox:
         line = self._lines.get(topic_id)
         if line is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
-        if self._owner.submitted(topic_id, now) and line.topic.is_topic and not line.kept:
+        if self._owner.submitted(topic_id, now) and line.is_stream:
             self._drop(list(line.queue.shed(now)))
         self._turns.join(topic_id)
         serial = self._serial

@@ -131,6 +131,10 @@ class SendingSide:
         early = [n for n in self._neighbours if n.inbox.reports.helps] if self.settings.hears else ()
         return self._report(early, now) if early else None
 
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow."""
+        return self.pace.behind(now) and not self._alone(now)
+
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""
         if self._alone(now):
